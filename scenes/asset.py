@@ -1,0 +1,37 @@
+"""An asset of the databank, and an actor: an asset that goes somewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from scenes.checks import check_tensor
+from scenes.gaussians import Gaussians, SplatModel
+from scenes.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Asset:
+    """Splats of one object: origin at the base centre of its box, x forward, z up; `size` `[3]` length, width, height in metres."""
+
+    gaussians: Gaussians
+    size: torch.Tensor
+    label: str
+    model: SplatModel = field(default_factory=SplatModel)
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        object.__setattr__(self, "size", torch.as_tensor(self.size, dtype=torch.float64))
+        check_tensor("size", self.size, (3,), torch.float64)
+        if not (self.size > 0).all():
+            raise ValueError(f"size must be positive metres, got {self.size.tolist()}")
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An asset on a trajectory of its own frame; `track` names it in the log and in the scene."""
+
+    asset: Asset
+    trajectory: Trajectory
+    track: str

@@ -1,0 +1,29 @@
+"""Shape, dtype and value checks with messages that say what was expected and what came."""
+
+import torch
+
+
+def check_tensor(name: str, value, shape: tuple, dtype: torch.dtype | None = None) -> None:
+    """Raise ValueError unless `value` is a tensor of `shape`; a str in `shape` matches any size."""
+    if not isinstance(value, torch.Tensor):
+        raise ValueError(f"{name} must be a torch tensor, got {type(value).__name__}")
+    fits = value.ndim == len(shape) and all(isinstance(s, str) or s == n for s, n in zip(shape, value.shape, strict=True))
+    if not fits:
+        wanted = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+        raise ValueError(f"{name} must have shape ({wanted}), got {tuple(value.shape)}")
+    if dtype is not None and value.dtype != dtype:
+        raise ValueError(f"{name} must be {dtype}, got {value.dtype}")
+
+
+def nearest(name: str, options) -> str:
+    """' Did you mean x?' for the option closest in spelling to `name`, or ''."""
+    import difflib
+
+    close = difflib.get_close_matches(name, list(options), n=1, cutoff=0.4)
+    return f" Did you mean {close[0]}?" if close else ""
+
+
+def unknown(kind: str, name: str, where: str, options) -> str:
+    """The house's sentence for a name that does not exist: what, where, what there is, the nearest."""
+    have = ", ".join(options) or "nothing"
+    return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'

@@ -1,0 +1,147 @@
+"""Gaussian splats, splats placed in the world, and the model they were trained with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+
+from scenes.checks import check_tensor
+from scenes.poses import as_pose
+
+SH_COUNTS = (1, 4, 9, 16)
+PROJECTIONS = ("ut", "ewa")
+RESPONSES = ("conic", "ray")
+
+
+@dataclass(frozen=True)
+class SplatModel:
+    """How the splats turn into pixels: stored with them, since trained splats fit only the model that trained them.
+
+    projection: "ut" (unscented transform) or "ewa" (Zwicker et al. 2001); response: "conic" (2D) or "ray" (3D, 3DGUT);
+    dilation: px^2 added to both 2D variances; antialias: opacity compensated for that dilation (Mip-Splatting's 2D filter).
+    """
+
+    projection: str = "ut"
+    response: str = "conic"
+    dilation: float = 0.3
+    antialias: bool = False
+
+    def __post_init__(self):
+        if self.projection not in PROJECTIONS:
+            raise ValueError(f"projection must be one of {', '.join(PROJECTIONS)}, got {self.projection!r}")
+        if self.response not in RESPONSES:
+            raise ValueError(f"response must be one of {', '.join(RESPONSES)}, got {self.response!r}")
+        if not self.dilation >= 0:
+            raise ValueError(f"dilation must be at least 0 px^2, got {self.dilation}")
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussian splats in a local frame (Kerbl et al. 2023). float32, one device; N may be 0.
+
+    means `[N, 3]` metres; quats `[N, 4]` wxyz of any positive length; log_scales `[N, 3]` ln metres;
+    logit_opacities `[N]`; sh `[N, K, 3]` with K in 1, 4, 9, 16.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+    logit_opacities: torch.Tensor
+    sh: torch.Tensor
+
+    def __post_init__(self):
+        check_tensor("means", self.means, ("N", 3), torch.float32)
+        n = self.means.shape[0]
+        check_tensor("quats", self.quats, (n, 4), torch.float32)
+        check_tensor("log_scales", self.log_scales, (n, 3), torch.float32)
+        check_tensor("logit_opacities", self.logit_opacities, (n,), torch.float32)
+        check_tensor("sh", self.sh, (n, "K", 3), torch.float32)
+        if self.sh.shape[1] not in SH_COUNTS:
+            raise ValueError(f"sh must have 1, 4, 9 or 16 coefficients, got {self.sh.shape[1]}")
+        devices = {str(t.device) for t in self.tensors().values()}
+        if len(devices) > 1:
+            raise ValueError(f"all fields must be on one device, got {', '.join(sorted(devices))}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    @property
+    def sh_degree(self) -> int:
+        return SH_COUNTS.index(self.sh.shape[1])
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """The five fields by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def map(self, change) -> Gaussians:
+        """A copy with `change(tensor)` in place of every field."""
+        return replace(self, **{name: change(t) for name, t in self.tensors().items()})
+
+    def to(self, device) -> Gaussians:
+        return self.map(lambda t: t.to(device))
+
+    def detach(self) -> Gaussians:
+        return self.map(torch.Tensor.detach)
+
+    def select(self, which: torch.Tensor) -> Gaussians:
+        """The splats that a boolean mask or an index tensor names."""
+        return self.map(lambda t: t[which])
+
+    def with_sh_count(self, count: int) -> Gaussians:
+        """The same splats with `count` SH coefficients: cut, or padded with zeros."""
+        n, k, _ = self.sh.shape
+        sh = self.sh[:, :count] if count <= k else torch.cat([self.sh, self.sh.new_zeros(n, count - k, 3)], 1)
+        return replace(self, sh=sh)
+
+    def invalid(self) -> torch.Tensor:
+        """Mask `[N]` of splats with a value that is not finite or a quaternion of length zero."""
+        bad = torch.zeros(len(self), dtype=torch.bool, device=self.device)
+        for t in self.tensors().values():
+            bad |= ~torch.isfinite(t).reshape(len(self), -1).all(1)
+        return bad | (self.quats.abs().amax(1) == 0)
+
+    def validate(self, where: str = "splats") -> None:
+        """Raise ValueError naming the first splat and field that is not finite or not a rotation."""
+        for name, t in self.tensors().items():
+            bad = (~torch.isfinite(t)).reshape(len(self), -1).any(1)
+            if bad.any():
+                first = int(bad.nonzero()[0])
+                raise ValueError(f"{where}: splat {first} has a {name} that is not finite ({t[first].flatten().tolist()[:4]}); {int(bad.sum())} such splats in all")
+        zero = self.quats.abs().amax(1) == 0 if len(self) else self.quats.new_zeros(0, dtype=torch.bool)
+        if zero.any():
+            raise ValueError(f"{where}: splat {int(zero.nonzero()[0])} has a quaternion of length zero; {int(zero.sum())} such splats in all")
+
+    @staticmethod
+    def empty(sh_count: int = 1, device="cpu") -> Gaussians:
+        z = lambda *s: torch.zeros(*s, device=device)  # noqa: E731
+        return Gaussians(z(0, 3), z(0, 4), z(0, 3), z(0), z(0, sh_count, 3))
+
+    @staticmethod
+    def cat(parts: list[Gaussians]) -> Gaussians:
+        """All splats of `parts` in order, with as many SH coefficients as the largest has."""
+        if not parts:
+            return Gaussians.empty()
+        count = max(p.sh.shape[1] for p in parts)
+        parts = [p.with_sh_count(count) for p in parts]
+        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Gaussians at a pose: `world_from_local` float64 `[4, 4]`; an end pose where it moves during the shutter."""
+
+    gaussians: Gaussians
+    world_from_local: torch.Tensor
+    world_from_local_end: torch.Tensor | None = None
+    instance: int = 0
+
+    def __post_init__(self):
+        for name in ("world_from_local", "world_from_local_end"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_pose(getattr(self, name)))
+                check_tensor(name, getattr(self, name), (4, 4), torch.float64)

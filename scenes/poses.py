@@ -1,0 +1,94 @@
+"""Rigid poses as float64 `[..., 4, 4]` matrices: quaternions, inverse, interpolation."""
+
+import numpy as np
+import torch
+
+
+def as_pose(value) -> torch.Tensor:
+    """A float64 pose `[..., 4, 4]` from a tensor or anything numpy reads; the last row must be 0 0 0 1."""
+    pose = value if isinstance(value, torch.Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
+    if pose.shape[-2:] != (4, 4):
+        raise ValueError(f"a pose must have shape (..., 4, 4), got {tuple(pose.shape)}")
+    return pose.to(torch.float64)
+
+
+def matrix_from_quat(quat: torch.Tensor) -> torch.Tensor:
+    """Rotation `[..., 3, 3]` from quaternions wxyz `[..., 4]` of any positive length."""
+    w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quat.shape[:-1], 3, 3)
+
+
+def quat_from_matrix(rotation: torch.Tensor) -> torch.Tensor:
+    """Unit quaternions wxyz `[..., 4]`, w >= 0, from rotations `[..., 3, 3]` (Shepperd's method: the largest term leads)."""
+    m = rotation
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    squares = torch.stack([trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
+    candidates = torch.stack(
+        [
+            torch.stack([1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
+            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + 2 * m[..., 0, 0] - trace, m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),
+            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0], 1 + 2 * m[..., 1, 1] - trace, m[..., 1, 2] + m[..., 2, 1]], -1),
+            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], 1 + 2 * m[..., 2, 2] - trace], -1),
+        ],
+        -2,
+    )
+    lead = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    quat = candidates.gather(-2, lead).squeeze(-2)
+    quat = quat / quat.norm(dim=-1, keepdim=True)
+    return torch.where(quat[..., :1] < 0, -quat, quat)
+
+
+def pose_from(quat, translation) -> torch.Tensor:
+    """Pose `[..., 4, 4]` from a quaternion wxyz `[..., 4]` and a translation `[..., 3]`."""
+    quat, translation = (torch.as_tensor(v, dtype=torch.float64) for v in (quat, translation))
+    top = torch.cat([matrix_from_quat(quat), translation[..., None]], -1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=top.device).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)
+
+
+def translation(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> torch.Tensor:
+    """The pose that only moves."""
+    return pose_from([1.0, 0.0, 0.0, 0.0], [x, y, z])
+
+
+def yaw(angle: float) -> torch.Tensor:
+    """The pose that turns by `angle` radians about z, counter-clockwise seen from above."""
+    return pose_from([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)], [0.0, 0.0, 0.0])
+
+
+def yaw_of(pose: torch.Tensor) -> torch.Tensor:
+    """Heading in radians of the pose's x axis in the xy plane."""
+    return torch.atan2(pose[..., 1, 0], pose[..., 0, 0])
+
+
+def inverse(pose: torch.Tensor) -> torch.Tensor:
+    """The inverse of rigid poses `[..., 4, 4]`, exact up to rounding (no general matrix inverse)."""
+    back = pose[..., :3, :3].transpose(-1, -2)
+    top = torch.cat([back, -back @ pose[..., :3, 3:]], -1)
+    return torch.cat([top, pose[..., 3:, :]], -2)
+
+
+def slerp(a: torch.Tensor, b: torch.Tensor, u) -> torch.Tensor:
+    """Spherical interpolation of quaternions wxyz along the shorter arc; `u` outside [0, 1] extrapolates (Shoemake 1985)."""
+    a, b = a / a.norm(dim=-1, keepdim=True), b / b.norm(dim=-1, keepdim=True)
+    u = torch.as_tensor(u, dtype=a.dtype, device=a.device)[..., None]
+    b = torch.where((a * b).sum(-1, keepdim=True) < 0, -b, b)
+    # atan2 of the half chord keeps full precision at small angles, where acos(dot) loses half the digits
+    angle = 2 * torch.atan2((b - a).norm(dim=-1, keepdim=True), (b + a).norm(dim=-1, keepdim=True))
+    small = angle < 1e-12
+    safe = torch.where(small, torch.ones_like(angle), angle)
+    wa = torch.where(small, 1 - u, torch.sin((1 - u) * safe) / torch.sin(safe))
+    wb = torch.where(small, u.expand_as(wa), torch.sin(u * safe) / torch.sin(safe))
+    return wa * a + wb * b
+
+
+def interpolate(a: torch.Tensor, b: torch.Tensor, u) -> torch.Tensor:
+    """Pose between `a` (u = 0) and `b` (u = 1): slerp of the rotation, lerp of the position."""
+    u = torch.as_tensor(u, dtype=torch.float64, device=a.device)
+    quat = slerp(quat_from_matrix(a[..., :3, :3]), quat_from_matrix(b[..., :3, :3]), u)
+    return pose_from(quat, a[..., :3, 3] + u[..., None] * (b[..., :3, 3] - a[..., :3, 3]))

@@ -1,0 +1,62 @@
+"""A reconstructed drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from scenes.asset import Actor
+from scenes.camera import Camera, RigCamera
+from scenes.checks import unknown
+from scenes.gaussians import Placed, SplatModel
+from scenes.ground import Ground
+from scenes.sky import Sky
+from scenes.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Background, actors, sky, ground, and the ego body with its cameras. Instance ids: background 0, `actors[i]` i + 1.
+
+    `meta` is json-like: name, source, licence, attribution, geodetic origin, what the body frame is, ...
+    """
+
+    background: Placed
+    actors: tuple[Actor, ...]
+    sky: Sky | None
+    ego: Trajectory
+    rig: dict[str, RigCamera]
+    model: SplatModel = field(default_factory=SplatModel)
+    ground: Ground | None = None
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        object.__setattr__(self, "actors", tuple(self.actors))
+        tracks = [a.track for a in self.actors]
+        if len(set(tracks)) != len(tracks):
+            raise ValueError(f"actor tracks must differ, but {next(t for t in tracks if tracks.count(t) > 1)!r} stands twice")
+
+    def rig_camera(self, name: str) -> RigCamera:
+        """The rig's camera of that name; ValueError naming the nearest where there is none."""
+        if name not in self.rig:
+            raise ValueError(unknown("camera", name, str(self.meta.get("name", "the scene")), self.rig))
+        return self.rig[name]
+
+    def camera(self, name: str, time_us: int, ego: Trajectory | None = None) -> Camera:
+        """The named camera at a time, on the recorded path or on another one, as `ego.shifted(lateral=2)`."""
+        return self.rig_camera(name).at((ego or self.ego).at(time_us), time_us)
+
+    def frame_times(self, name: str) -> torch.Tensor:
+        """When the named camera took its frames, int64 `[F]`; the body's times where the log does not say."""
+        times = self.rig_camera(name).times_us
+        return times if len(times) else self.ego.times_us
+
+    def placed(self, time_us: int) -> list[Placed]:
+        """Background and the actors that exist at a time, each at its pose and under its instance id."""
+        actors = [
+            Placed(a.asset.gaussians, a.trajectory.at(time_us), instance=i + 1)
+            for i, a in enumerate(self.actors)
+            if a.trajectory.covers(time_us)
+        ]
+        return [self.background, *actors]

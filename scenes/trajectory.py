@@ -1,0 +1,62 @@
+"""A body's pose over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from scenes.checks import check_tensor
+from scenes.poses import as_pose, interpolate, translation
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of a body: `times_us` int64 `[T]`, rising strictly; `world_from_body` float64 `[T, 4, 4]`; T >= 1.
+
+    One pose stands still and covers all times. Otherwise the trajectory covers its time span and half a step beyond
+    either end, extrapolated, since a camera's clock rarely agrees with the annotations' to the microsecond.
+    """
+
+    times_us: torch.Tensor
+    world_from_body: torch.Tensor
+
+    def __post_init__(self):
+        object.__setattr__(self, "times_us", torch.as_tensor(self.times_us, dtype=torch.int64))
+        object.__setattr__(self, "world_from_body", as_pose(self.world_from_body))
+        check_tensor("times_us", self.times_us, ("T",), torch.int64)
+        t = self.times_us.shape[0]
+        if t == 0:
+            raise ValueError("a trajectory must have at least one pose, got none")
+        check_tensor("world_from_body", self.world_from_body, (t, 4, 4), torch.float64)
+        if t > 1 and not (self.times_us.diff() > 0).all():
+            raise ValueError(f"times_us must rise strictly, but entry {int((self.times_us.diff() <= 0).nonzero()[0]) + 1} does not")
+
+    def __len__(self) -> int:
+        return self.times_us.shape[0]
+
+    def span_us(self) -> tuple[int, int]:
+        """First and last covered time, half a step beyond the poses; int64's ends where the body stands still."""
+        if len(self) == 1:
+            return -(2**63), 2**63 - 1
+        t = self.times_us
+        return int(t[0] - (t[1] - t[0]) // 2), int(t[-1] + (t[-1] - t[-2]) // 2)
+
+    def covers(self, time_us: int) -> bool:
+        first, last = self.span_us()
+        return first <= int(time_us) <= last
+
+    def at(self, time_us: int) -> torch.Tensor:
+        """`world_from_body` `[4, 4]` at a time: slerp and lerp between neighbours. ValueError where not covered."""
+        if not self.covers(time_us):
+            first, last = self.span_us()
+            raise ValueError(f"time {int(time_us)} us is outside the trajectory, which covers {first} to {last} us")
+        if len(self) == 1:
+            return self.world_from_body[0]
+        later = int(torch.searchsorted(self.times_us, int(time_us)).clamp(1, len(self) - 1))
+        t0, t1 = int(self.times_us[later - 1]), int(self.times_us[later])
+        return interpolate(self.world_from_body[later - 1], self.world_from_body[later], (int(time_us) - t0) / (t1 - t0))
+
+    def shifted(self, lateral: float = 0.0, vertical: float = 0.0, forward: float = 0.0) -> Trajectory:
+        """Every pose moved by metres along its own body axes: forward x, left y, up z."""
+        return replace(self, world_from_body=self.world_from_body @ translation(forward, lateral, vertical))
