@@ -1,0 +1,68 @@
+"""What a render gives back, and how exactly it is computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+
+from scenes.camera import Camera
+from scenes.checks import nearest
+
+OUTPUTS = ("rgb", "alpha", "depth", "normal", "flow_prev", "flow_next", "instance", "need")
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How far the picture may be from the exact sum over all splats.
+
+    alpha_cutoff: contributions below it are skipped; alpha_max: no splat is more opaque;
+    termination: a pixel is finished when this much light still passes.
+    """
+
+    alpha_cutoff: float = 1 / 255
+    alpha_max: float = 0.999
+    termination: float = 1e-4
+
+    def __post_init__(self):
+        for name in ("alpha_cutoff", "termination"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
+        if not 0 < self.alpha_max <= 1:
+            raise ValueError(f"alpha_max must be above 0 and at most 1, got {self.alpha_max}")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The view of one camera. What was not asked for is None and was not computed.
+
+    rgb `[H, W, 3]` display-referred, premultiplied over black where no background was given, not clamped above 1;
+    alpha `[H, W]`; depth `[H, W]` z in metres, inf where alpha is 0; normal `[H, W, 3]`;
+    flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame; instance `[H, W]` int32;
+    need `[H, W]` how much a pixel asks for repair, 0 to 1.
+    """
+
+    camera: Camera
+    rgb: torch.Tensor | None = None
+    alpha: torch.Tensor | None = None
+    depth: torch.Tensor | None = None
+    normal: torch.Tensor | None = None
+    flow_prev: torch.Tensor | None = None
+    flow_next: torch.Tensor | None = None
+    instance: torch.Tensor | None = None
+    need: torch.Tensor | None = None
+
+    def outputs(self) -> dict[str, torch.Tensor]:
+        """The outputs that were computed, by name."""
+        have = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "camera"}
+        return {name: value for name, value in have.items() if value is not None}
+
+
+def check_outputs(outputs) -> tuple[str, ...]:
+    """`outputs` as a tuple of known names; ValueError naming the nearest otherwise."""
+    if isinstance(outputs, str):
+        raise ValueError(f'outputs must be a tuple of names, got the string "{outputs}"; write ("{outputs}",)')
+    for name in outputs:
+        if name not in OUTPUTS:
+            raise ValueError(f'output "{name}" does not exist; there are {", ".join(OUTPUTS)}.{nearest(name, OUTPUTS)}')
+    return tuple(outputs)
