@@ -13,17 +13,3 @@ def check_tensor(name: str, value, shape: tuple, dtype: torch.dtype | None = Non
         raise ValueError(f"{name} must have shape ({wanted}), got {tuple(value.shape)}")
     if dtype is not None and value.dtype != dtype:
         raise ValueError(f"{name} must be {dtype}, got {value.dtype}")
-
-
-def nearest(name: str, options) -> str:
-    """' Did you mean x?' for the option closest in spelling to `name`, or ''."""
-    import difflib
-
-    close = difflib.get_close_matches(name, list(options), n=1, cutoff=0.4)
-    return f" Did you mean {close[0]}?" if close else ""
-
-
-def unknown(kind: str, name: str, where: str, options) -> str:
-    """The house's sentence for a name that does not exist: what, where, what there is, the nearest."""
-    have = ", ".join(options) or "nothing"
-    return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'

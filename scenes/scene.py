@@ -8,9 +8,9 @@ import torch
 
 from scenes.asset import Actor
 from scenes.camera import Camera, RigCamera
-from scenes.checks import unknown
 from scenes.gaussians import Placed, SplatModel
 from scenes.ground import Ground
+from scenes.names import unknown
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
 

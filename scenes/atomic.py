@@ -1,0 +1,71 @@
+"""Files and folders that appear whole or not at all: written beside their target, then renamed."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path in the target's folder, with its suffix; it becomes `path` when the block ends.
+
+    On any exception (Ctrl-C and a full disk too) it is removed and `path` stays as it was. Whether an existing file
+    may be replaced is the caller's question. Raises FileNotFoundError where the target's folder does not exist.
+    """
+    path = Path(path)
+    need_folder(path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    partial = Path(name)
+    try:
+        yield partial
+        partial.chmod(0o666 & ~_umask())  # mkstemp's 0600 would outlive the rename
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Path]:
+    """Yield an empty temporary folder beside the target; it becomes `path` when the block ends.
+
+    An existing target raises FileExistsError, or with `replace` gives way once the new folder is complete. On any
+    exception the temporary folder is removed and `path` stays as it was.
+    """
+    path = Path(path)
+    need_folder(path)
+    if path.exists() and not replace:
+        raise FileExistsError(f"{path} exists already")
+    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield partial
+        partial.chmod(0o777 & ~_umask())
+        if path.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent)) / path.name
+            os.rename(path, old)
+            try:
+                os.rename(partial, path)
+            except OSError:
+                os.rename(old, path)
+                raise
+            finally:
+                shutil.rmtree(old.parent, ignore_errors=True)
+        else:
+            os.rename(partial, path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def need_folder(path: Path) -> None:
+    """Raise FileNotFoundError unless the folder that `path` would stand in exists."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
