@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 
 from scenes.camera import Camera
-from scenes.checks import nearest
+from scenes.names import nearest
 
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "flow_prev", "flow_next", "instance", "need")
 
