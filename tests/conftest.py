@@ -1,0 +1,38 @@
+"""Fixtures of the whole house: the shared data where there is any, and a made-up street."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+def shared_root() -> Path:
+    return Path(os.environ.get("SIDESTEP_SHARED") or REPOSITORY.parent / "shared")
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of shared data; tests that need it are skipped where it is absent."""
+    root = shared_root()
+    if not (root / "data").is_dir():
+        pytest.skip(f"needs the shared data: no folder {root / 'data'}; set SIDESTEP_SHARED to the folder that holds data/")
+    return root / "data"
+
+
+@pytest.fixture(scope="session")
+def pandaset(shared) -> Path:
+    """Drive 002 in PandaSet's layout."""
+    drive = shared / "pandaset" / "002"
+    if not drive.is_dir():
+        pytest.skip(f"needs PandaSet drive 002: no folder {drive}")
+    return drive
+
+
+@pytest.fixture(scope="session")
+def street():
+    """A made-up street, two cameras of 96x54, eight frames; a Scene in memory."""
+    import street as made
+
+    return made.street()
