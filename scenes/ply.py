@@ -1,0 +1,182 @@
+"""3D Gaussian splat PLY files, as Kerbl et al.'s code writes them and every other tool reads them.
+
+x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: all of red's, all of green's, all of blue's), opacity (logit),
+scale_0..2 (ln), rot_0..3 (wxyz); binary little-endian floats. The reader takes any order, number type and byte order, more
+properties and ASCII. It maps the file: what the header claims is checked against its size before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from scenes.atomic import atomic_file
+from scenes.gaussians import SH_COUNTS, Gaussians
+
+_MAX_HEADER = 1 << 20
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_FIELDS = {
+    "means": ("x", "y", "z"),
+    "dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacity": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+
+
+@dataclass
+class _Element:
+    """An element of the header: how many records, and each property's name and numpy type ("list" for lists)."""
+
+    name: str
+    count: int
+    properties: dict[str, str]
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """The splats of a 3DGS PLY file, bit for bit. ValueError where it is not one, is not whole, or holds a value that is not finite."""
+    gaussians = read_ply(path)
+    gaussians.validate(str(path))
+    return gaussians
+
+
+def read_ply(path: str | os.PathLike) -> Gaussians:
+    """As `load_ply`, but values are taken as they come: for `Gaussians.invalid` to look at."""
+    path = Path(path)
+    order, elements, offset = _read_header(path)
+    rest = _check_splats(path, elements)
+    vertices = _read_vertices(path, order, elements, offset)
+    columns = {name: _columns(vertices, names) for name, names in _FIELDS.items()}
+    n, k = len(vertices), 1 + rest // 3
+    higher = _columns(vertices, [f"f_rest_{i}" for i in range(rest)]).reshape(n, 3, k - 1).transpose(0, 2, 1)
+    sh = np.concatenate([columns["dc"][:, None], higher], 1)
+    return Gaussians(
+        *(torch.from_numpy(a) for a in (columns["means"], columns["quats"], columns["scales"], columns["opacity"][:, 0], sh))
+    )
+
+
+def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
+    """Write splats as Kerbl et al.'s code does. Reading them back is bit-equal."""
+    n, k, _ = gaussians.sh.shape
+    g = gaussians.detach().to("cpu")
+    rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
+    names = ["x", "y", "z", "nx", "ny", "nz", *_FIELDS["dc"], *rest, "opacity", *_FIELDS["scales"], *_FIELDS["quats"]]
+    higher = g.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
+    parts = [g.means, torch.zeros(n, 3), g.sh[:, 0], higher, g.logit_opacities[:, None], g.log_scales, g.quats]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}", *(f"property float {name}" for name in names), "end_header"]
+    with atomic_file(path) as partial, open(partial, "wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(torch.cat(parts, 1).numpy().astype("<f4", copy=False).data)
+
+
+def _read_header(path: Path) -> tuple[str, list[_Element], int]:
+    """Byte order, elements, and where the data starts."""
+    with open(path, "rb") as file:
+        head = file.read(_MAX_HEADER)
+    if not head.startswith((b"ply\n", b"ply\r\n")):
+        raise ValueError(f"{path} is not a PLY file: it does not start with the line ply")
+    end = head.find(b"end_header")
+    stop = head.find(b"\n", end)
+    if end < 0 or stop < 0:
+        raise ValueError(f"{path} is truncated or corrupt: its header has no end_header")
+    order, elements = None, []
+    for number, line in enumerate(head[:end].decode("latin-1").splitlines()[1:], 2):
+        words = line.split()
+        try:
+            match words:
+                case [] | ["comment" | "obj_info", *_]:
+                    pass
+                case ["format", kind, "1.0"]:
+                    order = _FORMATS[kind]
+                case ["element", name, count] if count.isdigit():
+                    elements.append(_Element(name, int(count), {}))
+                case ["property", "list", _, _, name]:
+                    _add_property(elements, name, "list")
+                case ["property", kind, name]:
+                    _add_property(elements, name, _TYPES[kind])
+                case _:
+                    raise KeyError(line)
+        except (KeyError, IndexError) as error:
+            raise ValueError(f"{path}: line {number} of the header is not PLY 1.0: {line[:60]!r}") from error
+    if order is None:
+        raise ValueError(f"{path}: the header has no format line")
+    return order, elements, stop + 1
+
+
+def _add_property(elements: list[_Element], name: str, kind: str) -> None:
+    if name in elements[-1].properties:
+        raise KeyError(name)
+    elements[-1].properties[name] = kind
+
+
+def _check_splats(path: Path, elements: list[_Element]) -> int:
+    """The number of f_rest properties; ValueError saying what the file is instead where it holds no splats."""
+    names = {e.name: e.properties for e in elements}
+    vertex = names.get("vertex", {})
+    if "packed_position" in vertex:
+        raise ValueError(f"{path} is a compressed splat PLY (SuperSplat, PlayCanvas), which is not read yet; export it as an uncompressed PLY")
+    missing = [name for group in _FIELDS.values() for name in group if vertex.get(name, "list") == "list"]
+    if missing:
+        what = "a mesh" if "face" in names else "not a Gaussian splat file"
+        raise ValueError(f"{path} is {what}: its vertices lack {', '.join(missing)}")
+    rest = [name for name in vertex if name.startswith("f_rest_")]
+    if len(rest) not in [3 * (k - 1) for k in SH_COUNTS] or any(vertex.get(f"f_rest_{i}", "list") == "list" for i in range(len(rest))):
+        raise ValueError(f"{path} has {len(rest)} f_rest properties; SH of degree 0 to 3 has f_rest_0 to f_rest_8, 23 or 44, or none")
+    return len(rest)
+
+
+def _read_vertices(path: Path, order: str, elements: list[_Element], offset: int) -> np.ndarray:
+    """The vertex records as a structured array, mapped from the file where it is binary."""
+    at = next(i for i, e in enumerate(elements) if e.name == "vertex")
+    vertex, before, last = elements[at], elements[:at], at == len(elements) - 1
+    if any("list" in e.properties.values() for e in [*before, vertex]):
+        raise ValueError(f"{path} has list properties before or in its vertices, which is not a Gaussian splat file's layout")
+    if order == "=":
+        return _read_ascii(path, vertex, sum(e.count for e in before), last, offset)
+    kind = _record(vertex, order)
+    start = offset + sum(e.count * _record(e, order).itemsize for e in before)
+    stop, size = start + vertex.count * kind.itemsize, path.stat().st_size
+    if stop > size:
+        raise ValueError(f"{path} is truncated: its header claims {vertex.count} splats, {stop} bytes in all, but it has {size}")
+    if last and stop < size:
+        raise ValueError(f"{path} is corrupt: its header claims {vertex.count} splats, {stop} bytes in all, but it has {size}")
+    return np.memmap(path, kind, "r", start, (vertex.count,)) if vertex.count else np.zeros(0, kind)
+
+
+def _read_ascii(path: Path, vertex: _Element, skip: int, last: bool, offset: int) -> np.ndarray:
+    with open(path, "rb") as file:
+        file.seek(offset)
+        lines = file.read().split(b"\n")
+    lines = [line for line in lines if line.strip()][skip:]
+    if len(lines) < vertex.count or (last and len(lines) > vertex.count):
+        raise ValueError(f"{path} is truncated or corrupt: its header claims {vertex.count} splats, but it has {len(lines)} lines of them")
+    rows = [line.split() for line in lines[: vertex.count]]
+    wrong = next((i for i, row in enumerate(rows) if len(row) != len(vertex.properties)), None)
+    if wrong is not None:
+        raise ValueError(f"{path} is corrupt: splat {wrong} has {len(rows[wrong])} values for {len(vertex.properties)} properties")
+    try:
+        values = np.array(rows, np.float64).reshape(vertex.count, len(vertex.properties))
+    except ValueError as error:
+        raise ValueError(f"{path} is corrupt: {error}") from error
+    return np.rec.fromarrays(list(values.T), dtype=np.dtype([(name, "f8") for name in vertex.properties]))
+
+
+def _record(element: _Element, order: str) -> np.dtype:
+    return np.dtype([(name, order + kind) for name, kind in element.properties.items()])
+
+
+def _columns(vertices: np.ndarray, names) -> np.ndarray:
+    """float32 `[N, len(names)]`."""
+    out = np.empty((len(vertices), len(names)), np.float32)
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which `validate` names
+        for i, name in enumerate(names):
+            out[:, i] = vertices[name]
+    return out
