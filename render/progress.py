@@ -1,0 +1,125 @@
+"""Long work tells how far it is: a bar on a terminal, a plain line every few seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+PLAIN_SECONDS = 5.0
+BAR_SECONDS = 0.1
+BAR_WIDTH = 24
+
+
+class Progress:
+    """Counts steps of one piece of work and says so on stderr.
+
+    with Progress("fit", total=3000) as steps:
+        for ...: steps.step(note="28.1 dB")
+    """
+
+    def __init__(self, label: str, total: int | None = None, stream=None):
+        self.label, self.total, self.note, self.done = label, total, "", 0
+        self.stream = stream or sys.stderr
+        self.bar = self.stream.isatty()
+        self.start = time.monotonic()
+        self.said = self.start
+        self._said_count = -1
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, kind, value, trace) -> None:
+        self._say()
+        if self.bar:
+            self.stream.write("\n")
+            self.stream.flush()
+
+    def step(self, count: int = 1, note: str | None = None) -> None:
+        """`count` more steps are done; `note` stands behind the count until the next note."""
+        self.done += count
+        self.note = self.note if note is None else note
+        if time.monotonic() - self.said >= (BAR_SECONDS if self.bar else PLAIN_SECONDS):
+            self._say()
+
+    def line(self) -> str:
+        """The state in words: label, count, rate or time left, note."""
+        spent = time.monotonic() - self.start
+        of = f"/{self.total}" if self.total else ""
+        parts = [f"{self.label} {self.done}{of}"]
+        if self.total and 0 < self.done < self.total:
+            parts.append(f"{_clock(spent * (self.total - self.done) / self.done)} left")
+        elif self.done:
+            parts.append(_clock(spent))
+        return "  ".join(parts + ([self.note] if self.note else []))
+
+    def _say(self) -> None:
+        self.said = time.monotonic()
+        if self.bar:
+            filled = round(BAR_WIDTH * min(1.0, self.done / self.total)) if self.total else 0
+            bar = f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] " if self.total else ""
+            self.stream.write(f"\r\x1b[K{bar}{self.line()}")
+        elif self.done != self._said_count:
+            self._said_count = self.done
+            self.stream.write(self.line() + "\n")
+        self.stream.flush()
+
+
+def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """`items` one by one, counted; `total` where `items` has no length."""
+    if total is None and hasattr(items, "__len__"):
+        total = len(items)
+    with Progress(label, total) as steps:
+        for item in items:
+            yield item
+            steps.step()
+
+
+class Stopwatch:
+    """Where the time goes, by stage. Stages nest, and the inner one's time is not counted to the outer one."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self._running: list[str] = []
+        self._since = 0.0
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self._switch()
+        self._running.append(name)
+        self.seconds.setdefault(name, 0.0)
+        try:
+            yield
+        finally:
+            self._switch()
+            self._running.pop()
+
+    def during(self, name: str, items: Iterable[T]) -> Iterator[T]:
+        """`items` one by one; the making of each counts to the stage."""
+        source = iter(items)
+        while True:
+            with self.stage(name):
+                try:
+                    item = next(source)
+                except StopIteration:
+                    return
+            yield item
+
+    def milliseconds(self, count: int) -> dict[str, float]:
+        """Mean milliseconds of each stage over `count` frames."""
+        return {name: round(1000 * s / max(count, 1), 3) for name, s in self.seconds.items()}
+
+    def _switch(self) -> None:
+        now = time.perf_counter()
+        if self._running:
+            self.seconds[self._running[-1]] += now - self._since
+        self._since = now
+
+
+def _clock(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"

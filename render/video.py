@@ -1,0 +1,156 @@
+"""Image and video files: rgb `[H, W, 3]` float32, 0..1, in and out. PIL and PyAV are loaded when first used."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from scenes.atomic import atomic_file
+from scenes.checks import check_tensor
+
+CONTAINERS = (".mp4", ".mkv", ".mov")
+BT709 = 1  # the code point of ITU-R BT.709 in H.264, for primaries, transfer and matrix alike
+
+
+def to_bytes(rgb: torch.Tensor) -> np.ndarray:
+    """uint8 `[H, W, 3]` of an image `[H, W, 3]`, clamped to 0..1 and rounded."""
+    check_tensor("an image", rgb, ("H", "W", 3))
+    return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+def from_bytes(pixels: np.ndarray) -> torch.Tensor:
+    """float32 `[H, W, 3]` in 0..1 of uint8 pixels `[H, W, 3]`."""
+    return torch.from_numpy(np.array(pixels)).to(torch.float32) / 255
+
+
+def read_image(path: str | os.PathLike) -> torch.Tensor:
+    """An image file as `[H, W, 3]` float32 0..1, turned as its EXIF says. ValueError where it cannot be decoded."""
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return from_bytes(np.asarray(ImageOps.exif_transpose(image).convert("RGB")))
+    except FileNotFoundError:
+        raise
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise ValueError(f"{path} cannot be decoded as an image: {error}") from error
+
+
+def write_image(path: str | os.PathLike, rgb: torch.Tensor) -> None:
+    """Write `[H, W, 3]` as PNG or JPEG, whichever the name ends in; the file appears whole or not at all."""
+    from PIL import Image
+
+    with atomic_file(path) as partial:
+        Image.fromarray(to_bytes(rgb)).save(partial, **({"quality": 92} if partial.suffix.lower() in (".jpg", ".jpeg") else {}))
+
+
+class Video:
+    """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1.
+
+    fps: frames a second; width, height: pixels; count: frames as the file claims, None where it does not say.
+    Raises ValueError where the file is no video, has no frames, or breaks off in the middle.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"no such video: {path}")
+        with self._open() as container:
+            if not container.streams.video:
+                raise ValueError(f"{path} holds no video stream")
+            stream = container.streams.video[0]
+            self.width, self.height = stream.codec_context.width, stream.codec_context.height
+            self.fps = float(stream.average_rate or stream.guessed_rate or 25)
+            self.count = stream.frames or None
+
+    def __iter__(self) -> Iterator[torch.Tensor]:
+        from av.error import FFmpegError
+
+        decoded = 0
+        with self._open() as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            try:
+                for frame in container.decode(stream):
+                    yield from_bytes(frame.to_ndarray(format="rgb24"))
+                    decoded += 1
+            except FFmpegError as error:
+                raise ValueError(f"{self.path} cannot be decoded after frame {decoded}: {error.strerror}") from error
+        if decoded == 0:
+            raise ValueError(f"{self.path} has no frames that can be decoded")
+
+    def _open(self):
+        import av
+        from av.error import FFmpegError
+
+        av.logging.set_level(av.logging.PANIC)  # a broken file is our error to report, once
+        try:
+            return av.open(str(self.path))
+        except FFmpegError as error:
+            raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}") from error
+
+
+def read_video(path: str | os.PathLike) -> Video:
+    """Open a video; see Video."""
+    return Video(path)
+
+
+class VideoWriter:
+    """Writes H.264 in yuv420p, BT.709, frame by frame; the file appears whole when the block ends, or not at all.
+
+    with VideoWriter("out.mp4", fps=10, width=640, height=360) as video:
+        video.write(rgb)
+
+    Sizes that are odd gain a repeated last row or column, since 4:2:0 has none. A block that wrote no frame raises ValueError.
+    """
+
+    def __init__(self, path: str | os.PathLike, fps: float, width: int, height: int, crf: int = 18):
+        if Path(path).suffix.lower() not in CONTAINERS:
+            raise ValueError(f"{path} must end in {', '.join(CONTAINERS)} to be written as video")
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        self.path, self.fps, self.width, self.height, self.crf, self.count = Path(path), fps, width, height, crf, 0
+        self._stack = ExitStack()
+
+    def __enter__(self) -> VideoWriter:
+        import av
+
+        with ExitStack() as stack:
+            partial = stack.enter_context(atomic_file(self.path))
+            options = {"movflags": "+faststart"} if self.path.suffix.lower() in (".mp4", ".mov") else {}
+            self._container = stack.enter_context(av.open(str(partial), "w", options=options))
+            rate = Fraction(self.fps).limit_denominator(1_000_000)
+            self._stream = self._container.add_stream("libx264", rate=rate, options={"crf": str(self.crf), "preset": "veryfast"})
+            context = self._stream.codec_context
+            context.width, context.height, context.pix_fmt = self.width + self.width % 2, self.height + self.height % 2, "yuv420p"
+            context.color_primaries = context.color_trc = context.colorspace = BT709
+            context.color_range = 1
+            self._stack = stack.pop_all()
+        return self
+
+    def write(self, rgb: torch.Tensor) -> None:
+        """Add one frame `[height, width, 3]`."""
+        import av
+        from av.video.reformatter import Colorspace
+
+        check_tensor("a video frame", rgb, (self.height, self.width, 3))
+        pixels = np.pad(to_bytes(rgb), ((0, self.height % 2), (0, self.width % 2), (0, 0)), mode="edge")
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
+        frame.pts = self.count
+        self._container.mux(self._stream.encode(frame))
+        self.count += 1
+
+    def __exit__(self, kind, value, trace) -> None:
+        if kind is not None:
+            self._stack.__exit__(kind, value, trace)  # closes the container and removes the partial file
+            return
+        with self._stack:
+            if self.count == 0:
+                raise ValueError(f"no frames came for {self.path}; nothing was written")
+            self._container.mux(self._stream.encode(None))
