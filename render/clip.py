@@ -1,0 +1,95 @@
+"""A clip: one camera of a scene along a path, frame by frame, in constant memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from render.frame import DEFAULT, render_frame
+from render.frame_types import Frame, RenderConfig, check_outputs
+from scenes.camera import Camera
+from scenes.scene import Scene
+from scenes.trajectory import Trajectory
+
+
+def render_clip(
+    scene: Scene,
+    camera: str,
+    shift: float | Trajectory = 0.0,
+    times_us: Sequence[int] | torch.Tensor | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    outputs: tuple[str, ...] = ("rgb",),
+    shadows: bool = True,
+    config: RenderConfig = DEFAULT,
+) -> Iterator[Frame]:
+    """The frames that a camera of the rig takes along a path; a stream, one frame in memory at a time.
+
+    shift: metres to the left of the recorded path (negative: right), or any other path of the body.
+    times_us: when; the camera's own frame times by default. width, height: pixels, the camera's own by default.
+    The first frame has no flow_prev and the last no flow_next: they are None.
+    Raises ValueError, before the first frame, for an unknown camera or output, no times, or a time off the path.
+    """
+    cameras = clip_cameras(scene, camera, shift, times_us, width, height)
+    outputs = check_outputs(outputs)
+    return _frames(scene, cameras, outputs, shadows, config)
+
+
+def clip_cameras(
+    scene: Scene,
+    camera: str,
+    shift: float | Trajectory = 0.0,
+    times_us: Sequence[int] | torch.Tensor | None = None,
+    width: int | None = None,
+    height: int | None = None,
+) -> list[Camera]:
+    """The cameras of a clip; see `render_clip`."""
+    rig_camera = scene.rig_camera(camera)
+    if (width is None) != (height is None):
+        raise ValueError("width and height go together; give both or neither")
+    if width is not None and height is not None:
+        rig_camera = rig_camera.resized(width, height)
+    ego = shift if isinstance(shift, Trajectory) else scene.ego.shifted(lateral=shift)
+    times = scene.frame_times(camera) if times_us is None else torch.as_tensor(times_us, dtype=torch.int64)
+    if len(times) == 0:
+        raise ValueError(f"a clip of {camera} needs at least one frame, got no times")
+    return [rig_camera.at(ego.at(int(t)), int(t)) for t in times]
+
+
+def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | None = None, fps: float | None = None) -> torch.Tensor:
+    """int64 `[F]`: the camera's frame times from `start_us` after its first one, for `duration_us`; evenly at `fps` where given.
+
+    ValueError where nothing is left, naming what the camera has.
+    """
+    have = scene.frame_times(camera)
+    first, last = int(have[0]), int(have[-1])
+    begin = first + start_us
+    end = last if duration_us is None else min(begin + duration_us - 1, last)
+    times = have[(have >= begin) & (have <= end)] if fps is None else _evenly(begin, end, fps)
+    if len(times) == 0:
+        span = f"{(last - first) / 1e6:.3g}s"
+        asked = f"--start {start_us / 1e6:g}s" + ("" if duration_us is None else f" --duration {duration_us / 1e6:g}s")
+        raise ValueError(f"{asked} leaves no frame: {camera} has {len(have)} frames over {span}; start before that and last at least 100ms")
+    return times
+
+
+def frame_rate(times_us: torch.Tensor) -> float:
+    """Frames a second of a clip with these times: by the median step, 10 for a single frame."""
+    return 10.0 if len(times_us) < 2 else 1e6 / float(times_us.diff().double().median())
+
+
+def _evenly(begin: int, end: int, fps: float) -> torch.Tensor:
+    if not fps > 0:
+        raise ValueError(f"--fps must be positive, got {fps:g}")
+    count = int((end - begin) * fps / 1e6) + 1 if end >= begin else 0
+    return begin + (torch.arange(count, dtype=torch.float64) * 1e6 / fps).round().long()
+
+
+def _frames(scene: Scene, cameras: list[Camera], outputs: tuple[str, ...], shadows: bool, config: RenderConfig) -> Iterator[Frame]:
+    last = len(cameras) - 1
+    for i, camera in enumerate(cameras):
+        wanted = tuple(o for o in outputs if not (o == "flow_prev" and i == 0) and not (o == "flow_next" and i == last))
+        previous = cameras[i - 1] if i > 0 else None
+        following = cameras[i + 1] if i < last else None
+        yield render_frame(scene, camera, wanted, previous, following, shadows, config)

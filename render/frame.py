@@ -1,0 +1,108 @@
+"""A frame: the splats of a scene at a camera's time, then contact shadows, the sky behind them, and the camera's exposure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+
+from render.frame_types import Frame, RenderConfig, check_outputs
+from render.rasterize import rasterize
+from render.shadow import cast, shadow_casters
+from scenes.camera import Camera
+from scenes.scene import Scene
+from scenes.sky import Sky
+
+SKY_SHOWS = 1 / 512  # where less light than this passes the splats, the sky changes no 8-bit value
+DEFAULT = RenderConfig()
+
+
+def render_frame(
+    scene: Scene,
+    camera: Camera,
+    outputs: tuple[str, ...] = ("rgb",),
+    previous: Camera | None = None,
+    following: Camera | None = None,
+    shadows: bool = True,
+    config: RenderConfig = DEFAULT,
+) -> Frame:
+    """Background and actors at `camera.time_us`, contact shadows of inserted assets, the sky, and last the camera's exposure.
+
+    previous, following: the cameras that flow_prev and flow_next lead to; needed exactly where those are asked for.
+    Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky.
+    Raises ValueError for an output that does not exist and for a flow without its other camera.
+    """
+    outputs = check_outputs(outputs)
+    others = {"prev": previous, "next": following}
+    for way, other in others.items():
+        if f"flow_{way}" in outputs and other is None:
+            raise ValueError(f"flow_{way} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
+    flow_to = {way: (scene.placed(c.time_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs}
+
+    casters = shadow_casters(scene, camera) if shadows and "rgb" in outputs else []
+    needed = set(outputs)
+    if "rgb" in needed or flow_to:
+        needed.add("alpha")
+    if casters:
+        needed |= {"depth", "instance"}
+    placed = scene.placed(camera.time_us)
+    frame = rasterize(placed, camera, outputs=tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
+
+    changed: dict[str, torch.Tensor] = {}
+    if "rgb" in outputs:
+        rgb = cast(frame, casters) if casters else frame.rgb
+        if scene.sky is not None:
+            rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
+        if camera.exposure is not None:
+            rgb = expose(rgb, camera.exposure)
+        changed["rgb"] = rgb
+    for way, (_, other) in flow_to.items():
+        name = f"flow_{way}"
+        changed[name] = with_sky_flow(getattr(frame, name), frame.alpha, camera, other)
+    dropped = {name: None for name in needed - set(outputs)}
+    return replace(frame, **changed, **dropped)
+
+
+def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:
+    """Premultiplied `rgb` `[H, W, 3]` over the sky, looked up only where `alpha` `[H, W]` lets light pass."""
+    through = alpha.detach() < 1 - SKY_SHOWS
+    if not through.any():
+        return rgb
+    behind = sky.colour(world_directions(camera)[through]) * (1 - alpha[through])[..., None]
+    return rgb.index_put((through,), behind, accumulate=True)
+
+
+def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
+    """rgb' = E[:, :3] rgb + E[:, 3] for an affine colour `[3, 4]`."""
+    exposure = exposure.to(rgb)
+    if torch.equal(exposure, torch.eye(3, 4).to(exposure)):
+        return rgb
+    return rgb @ exposure[:, :3].T + exposure[:, 3]
+
+
+def with_sky_flow(flow: torch.Tensor, alpha: torch.Tensor, camera: Camera, other: Camera) -> torch.Tensor:
+    """`flow` `[H, W, 2]` with the sky's own flow where alpha < 0.5: the sky moves by rotation only.
+
+    A direction that lies behind the other camera is sent far off its image.
+    """
+    through = alpha.detach() < 0.5
+    if not through.any():
+        return flow
+    turned = world_directions(camera)[through].double() @ other.world_from_cam[:3, :3].to(alpha.device)
+    turned = torch.cat([turned[:, :2], turned[:, 2:].clamp_min(1e-6)], 1)
+    here = camera.pixel_centres().to(alpha.device)[through]
+    return flow.index_put((through,), (other.lens.project(turned) - here).to(flow))
+
+
+def world_directions(camera: Camera) -> torch.Tensor:
+    """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length."""
+    rays = _rays(type(camera.lens), tuple(camera.lens.params().tolist()), camera.width, camera.height)
+    return rays @ camera.world_from_cam[:3, :3].detach().to(torch.float32).T
+
+
+@lru_cache(maxsize=16)
+def _rays(lens_type: type, params: tuple[float, ...], width: int, height: int) -> torch.Tensor:
+    """float32 `[H, W, 3]` directions in the camera: the same for every frame of a clip."""
+    camera = Camera(lens_type(*params), width, height, torch.eye(4, dtype=torch.float64))
+    return camera.lens.unproject(camera.pixel_centres()).to(torch.float32)

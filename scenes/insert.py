@@ -1,0 +1,166 @@
+"""An asset of the databank becomes an actor of a scene: on the ground, facing its heading, moving as told."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+
+import torch
+
+from scenes.asset import Actor, Asset
+from scenes.placement import Placement, Waypoint, read_waypoints
+from scenes.poses import yaw_of
+from scenes.scene import Scene
+from scenes.trajectory import Trajectory
+
+STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
+
+
+@dataclass(frozen=True)
+class Inserted:
+    """The scene with the new actor, that actor, and what the user should know about its place."""
+
+    scene: Scene
+    actor: Actor
+    warnings: tuple[str, ...]
+
+
+def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | None = None) -> Inserted:
+    """Put an asset into a scene.
+
+    start_us: the time of the clip's first frame, to whose body pose the placement is relative; the drive's first by default.
+    The actor gets a track of its own, and `meta["inserted"]` lists it. ValueError where the time is off the path or the
+    trajectory file is bad.
+    """
+    start_us = int(scene.ego.times_us[0]) if start_us is None else start_us
+    body = scene.ego.at(start_us)
+    if placement.trajectory is not None:
+        times, xy, headings = _along(read_waypoints(placement.trajectory), body, start_us)
+    else:
+        times, xy, headings = _straight(scene, placement, body, start_us)
+
+    poses, warnings = [], []
+    for point, heading in zip(xy, headings, strict=True):
+        poses.append(standing_pose(scene, point, float(heading), asset.size))
+    beyond = max(outside_ground(scene, point) for point in xy)
+    if scene.ground is None:
+        warnings.append(f"{placement.asset}: the scene has no ground, so its height is that of the lowest splats around it")
+    elif beyond > 0:
+        warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
+    if asset.model != scene.model:
+        warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
+    actor = Actor(asset, Trajectory(times, torch.stack(poses)), _track(scene, placement.asset))
+    meta = {**scene.meta, "inserted": [*scene.meta.get("inserted", ()), actor.track]}
+    return Inserted(replace(scene, actors=(*scene.actors, actor), meta=meta), actor, tuple(warnings))
+
+
+def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:
+    """`world_from_asset` `[4, 4]` at a world point `[2]`, heading in radians, on the plane that fits the ground under its footprint."""
+    forward = torch.tensor([math.cos(heading), math.sin(heading)], dtype=torch.float64)
+    left = torch.stack([-forward[1], forward[0]])
+    spread = torch.linspace(-0.4, 0.4, 5, dtype=torch.float64)
+    u, v = torch.meshgrid(spread, spread, indexing="ij")
+    along, across = (u * size[0]).reshape(-1), (v * size[1]).reshape(-1)
+    heights = ground_heights(scene, xy + along[:, None] * forward + across[:, None] * left)
+    # the grid is symmetric about its centre, so the least-squares plane separates into a mean and two slopes
+    rise, bank = (along * heights).sum() / (along * along).sum(), (across * heights).sum() / (across * across).sum()
+    x_axis = torch.cat([forward, rise[None]])
+    x_axis = x_axis / x_axis.norm()
+    y_axis = torch.cat([left, bank[None]])
+    z_axis = torch.linalg.cross(x_axis, y_axis)
+    z_axis = z_axis / z_axis.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([x_axis, torch.linalg.cross(z_axis, x_axis), z_axis], 1)
+    pose[:2, 3], pose[2, 3] = xy, heights.mean()
+    return pose
+
+
+def ground_heights(scene: Scene, xy: torch.Tensor) -> torch.Tensor:
+    """World heights `[N]` float64 of the ground at points `[N, 2]`; without a ground, the low end of the splats within 3 m."""
+    if scene.ground is not None:
+        return scene.ground.height(xy)
+    placed = scene.background
+    means = placed.gaussians.means.double() @ placed.world_from_local[:3, :3].T + placed.world_from_local[:3, 3]
+    around = (means[:, :2] - xy.mean(0)).norm(dim=-1) < 3
+    if not around.any():
+        raise ValueError("the scene has neither a ground nor splats at that place; put the asset nearer to the recorded street")
+    return means[around, 2].quantile(0.1).expand(len(xy))
+
+
+def outside_ground(scene: Scene, xy: torch.Tensor) -> float:
+    """Metres by which a world point `[2]` lies outside the scene's ground; 0 inside, and where there is no ground."""
+    if scene.ground is None:
+        return 0.0
+    rows, columns = scene.ground.heights.shape
+    low = torch.tensor(scene.ground.origin, dtype=torch.float64)
+    high = low + scene.ground.cell * torch.tensor([columns - 1, rows - 1], dtype=torch.float64)
+    return float(torch.maximum(low - xy, xy - high).clamp_min(0).norm())
+
+
+def _straight(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Times, world points `[T, 2]` and headings `[T]` of an asset that stands, or goes straight on over the whole drive."""
+    heading = yaw_of(body) + placement.yaw
+    origin = _world(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))
+    if placement.speed == 0:
+        return torch.tensor([start_us]), origin, heading[None]
+    first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
+    count = max(2, -(-(last - first) // STEP_US) + 1)
+    times = torch.linspace(first, max(last, first + STEP_US), count, dtype=torch.float64).round().long()
+    gone = placement.speed * (times - start_us).double() / 1e6
+    xy = origin + gone[:, None] * torch.stack([torch.cos(heading), torch.sin(heading)])
+    return times, xy, heading.expand(count)
+
+
+def _along(points: list[Waypoint], body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Times, world points and headings along waypoints, with poses between them at most STEP_US apart."""
+    t = torch.tensor([p.time_us for p in points], dtype=torch.float64)
+    xy = torch.tensor([[p.x, p.y] for p in points], dtype=torch.float64)
+    yaws = [p.yaw for p in points if p.yaw is not None]
+    turn = torch.tensor(yaws, dtype=torch.float64) if yaws else _direction(xy)
+    shorter = (turn.diff() + torch.pi) % (2 * torch.pi) - torch.pi
+    turn = torch.cat([turn[:1], turn[0] + shorter.cumsum(0)])
+
+    at = [torch.tensor([len(points) - 1.0], dtype=torch.float64)]
+    for i, step in enumerate(t.diff().tolist()):
+        count = math.ceil(step / STEP_US)
+        at.insert(-1, i + torch.arange(count, dtype=torch.float64) / count)
+    where = torch.cat(at)
+    low = where.floor().long().clamp_max(len(points) - 2)
+    u = where - low
+
+    def between(values: torch.Tensor) -> torch.Tensor:
+        return torch.lerp(values[low], values[low + 1], u if values.ndim == 1 else u[:, None])
+
+    return start_us + between(t).round().long(), _world(body, between(xy)), yaw_of(body) + between(turn)
+
+
+def _direction(xy: torch.Tensor) -> torch.Tensor:
+    """Where the path goes at each point `[T, 2]`, radians; where it stands, the last direction it had (at first, the first it gets)."""
+    step = torch.cat([xy[1:2] - xy[:1], xy[2:] - xy[:-2], xy[-1:] - xy[-2:-1]])
+    angles = torch.atan2(step[:, 1], step[:, 0])
+    moving = step.norm(dim=-1) > 1e-3
+    last = angles[moving][0] if moving.any() else torch.zeros((), dtype=torch.float64)
+    kept = []
+    for angle, moves in zip(angles, moving, strict=True):
+        last = angle if moves else last
+        kept.append(last)
+    return torch.stack(kept)
+
+
+def _world(body: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
+    """World points `[N, 2]` of points forward and left of a body, level with the world: its pitch and roll do not tilt the street."""
+    heading = yaw_of(body)
+    forward = torch.stack([torch.cos(heading), torch.sin(heading)])
+    left = torch.stack([-forward[1], forward[0]])
+    return body[:2, 3] + xy[:, :1] * forward + xy[:, 1:] * left
+
+
+def _track(scene: Scene, asset: str) -> str:
+    """A track name that the scene does not have yet and that USD takes: car/0003 becomes car_0003, car_0003_2, ..."""
+    base = "inserted_" + re.sub(r"\W", "_", asset)
+    taken = {actor.track for actor in scene.actors}
+    number = 1
+    while (name := base if number == 1 else f"{base}_{number}") in taken:
+        number += 1
+    return name

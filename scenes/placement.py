@@ -1,0 +1,103 @@
+"""Where an asset goes, as people write it: "car/0003@12m,3.5m,yaw=5deg,speed=8m/s". Pure Python: the front door needs it at once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from scenes.names import nearest
+from scenes.units import angle, length, speed
+
+KEYS = ("yaw", "speed", "trajectory")
+COLUMNS = ("time_s", "x_m", "y_m", "yaw_deg")
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An asset of the databank and its place, relative to the unshifted body at the clip's first frame.
+
+    x, y: metres forward and left of the body; yaw: radians to the left of its heading; speed: metres a second along the
+    asset's own heading; trajectory: a CSV file of the same frame (see `read_waypoints`), in place of all these.
+    """
+
+    asset: str
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    speed: float = 0.0
+    trajectory: Path | None = None
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Microseconds after the clip's first frame; metres forward and left of the body there; radians left of its heading, or None."""
+
+    time_us: int
+    x: float
+    y: float
+    yaw: float | None
+
+
+def parse_at(text: str) -> tuple[float, float]:
+    """"20m,-3.5m" as metres forward and left. ValueError with the fix otherwise."""
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise ValueError(f'"{text}" is not a place; write metres forward and left of the body, as 20m,-3.5m')
+    return length(parts[0]), length(parts[1])
+
+
+def parse_placement(text: str) -> Placement:
+    """"ID@X,Y[,yaw=5deg][,speed=8m/s]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
+    asset, at, rest = text.rpartition("@")
+    if not at or not asset:
+        raise ValueError(f'"{text}" does not say what goes where; write ID@X,Y as car/0003@12m,3.5m (metres forward, left)')
+    parts = rest.split(",")
+    place = [p for p in parts if "=" not in p]
+    given: dict[str, str] = {}
+    for key, _, value in (p.partition("=") for p in parts if "=" in p):
+        if key not in KEYS:
+            raise ValueError(f'"{text}" has the unknown key "{key}"; there are {", ".join(KEYS)}.{nearest(key, KEYS)}')
+        given[key] = value
+    if "trajectory" in given:
+        if place or len(given) > 1:
+            raise ValueError(f'"{text}" gives a place and a trajectory; a trajectory says it all: {asset}@trajectory={given["trajectory"]}')
+        return Placement(asset, trajectory=Path(given["trajectory"]))
+    x, y = parse_at(",".join(place))
+    return Placement(asset, x, y, angle(given.get("yaw", "0deg")), speed(given.get("speed", "0m/s")))
+
+
+def read_waypoints(path: Path) -> list[Waypoint]:
+    """A CSV trajectory: a header `time_s,x_m,y_m` or `time_s,x_m,y_m,yaw_deg`, then two or more rows with rising times.
+
+    time_s: seconds after the clip's first frame; x_m, y_m: metres forward and left of the unshifted body there; yaw_deg:
+    degrees to the left of its heading; without that column the asset faces where it goes.
+    Raises ValueError naming file, line and fix; FileNotFoundError.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a text file") from error
+    rows = [(number, [cell.strip() for cell in line.split(",")]) for number, line in enumerate(lines, 1) if line.strip()]
+    header = rows[0][1] if rows else []
+    if tuple(header) not in (COLUMNS, COLUMNS[:3]):
+        raise ValueError(f'{path} must begin with the header time_s,x_m,y_m or time_s,x_m,y_m,yaw_deg, got "{",".join(header)}"')
+    points: list[Waypoint] = []
+    for number, cells in rows[1:]:
+        if len(cells) != len(header):
+            raise ValueError(f"{path}, line {number}: {len(cells)} values for {len(header)} columns ({','.join(header)})")
+        values = []
+        for name, cell in zip(header, cells, strict=True):
+            try:
+                values.append(float(cell))
+            except ValueError:
+                values.append(math.nan)
+            if not math.isfinite(values[-1]):
+                raise ValueError(f'{path}, line {number}: {name} is "{cell}", which is not a finite number')
+        point = Waypoint(round(values[0] * 1e6), values[1], values[2], math.radians(values[3]) if len(values) > 3 else None)
+        if points and point.time_us <= points[-1].time_us:
+            raise ValueError(f"{path}, line {number}: time_s must rise, but {cells[0]} follows {points[-1].time_us / 1e6:g}")
+        points.append(point)
+    if len(points) < 2:
+        raise ValueError(f"{path} has {len(points)} rows below its header; a trajectory needs at least 2")
+    return points
