@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from render.frame import DEFAULT, render_frame
-from render.frame_types import Frame, RenderConfig, check_outputs
+from render.frame_types import Frame, RenderConfig
+from render.outputs import check_outputs
 from scenes.camera import Camera
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory

@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import torch
 
-from render.frame_types import Frame, RenderConfig, check_outputs
+from render.frame_types import Frame, RenderConfig
+from render.outputs import check_outputs
 from render.rasterize import rasterize
 from render.shadow import cast, shadow_casters
 from scenes.camera import Camera
@@ -97,7 +98,8 @@ def with_sky_flow(flow: torch.Tensor, alpha: torch.Tensor, camera: Camera, other
 
 def world_directions(camera: Camera) -> torch.Tensor:
     """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length."""
-    rays = _rays(type(camera.lens), tuple(camera.lens.params().tolist()), camera.width, camera.height)
+    params = tuple(camera.lens.params().tolist())
+    rays = _rays(type(camera.lens), params, camera.width, camera.height)  # type: ignore[arg-type]  # mypy hashes the instance
     return rays @ camera.world_from_cam[:3, :3].detach().to(torch.float32).T
 
 

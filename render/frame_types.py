@@ -6,10 +6,9 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from render.outputs import OUTPUTS as OUTPUTS
+from render.outputs import check_outputs as check_outputs
 from scenes.camera import Camera
-from scenes.names import nearest
-
-OUTPUTS = ("rgb", "alpha", "depth", "normal", "flow_prev", "flow_next", "instance", "need")
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,3 @@ class Frame:
         """The outputs that were computed, by name."""
         have = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "camera"}
         return {name: value for name, value in have.items() if value is not None}
-
-
-def check_outputs(outputs) -> tuple[str, ...]:
-    """`outputs` as a tuple of known names; ValueError naming the nearest otherwise."""
-    if isinstance(outputs, str):
-        raise ValueError(f'outputs must be a tuple of names, got the string "{outputs}"; write ("{outputs}",)')
-    for name in outputs:
-        if name not in OUTPUTS:
-            raise ValueError(f'output "{name}" does not exist; there are {", ".join(OUTPUTS)}.{nearest(name, OUTPUTS)}')
-    return tuple(outputs)

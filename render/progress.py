@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -70,7 +70,7 @@ class Progress:
 
 def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
     """`items` one by one, counted; `total` where `items` has no length."""
-    if total is None and hasattr(items, "__len__"):
+    if total is None and isinstance(items, Sized):
         total = len(items)
     with Progress(label, total) as steps:
         for item in items:
@@ -81,7 +81,7 @@ def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterat
 class Stopwatch:
     """Where the time goes, by stage. Stages nest, and the inner one's time is not counted to the outer one."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._running: list[str] = []
         self._since = 0.0

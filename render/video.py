@@ -47,7 +47,7 @@ def write_image(path: str | os.PathLike, rgb: torch.Tensor) -> None:
     from PIL import Image
 
     with atomic_file(path) as partial:
-        Image.fromarray(to_bytes(rgb)).save(partial, **({"quality": 92} if partial.suffix.lower() in (".jpg", ".jpeg") else {}))
+        Image.fromarray(to_bytes(rgb)).save(partial, quality=92)  # for JPEG; PNG takes no notice
 
 
 class Video:

@@ -1,0 +1,17 @@
+"""The pictures a render can give, by name. Pure Python: the front door checks names before anything heavy loads."""
+
+from collections.abc import Iterable
+
+from scenes.names import nearest
+
+OUTPUTS = ("rgb", "alpha", "depth", "normal", "flow_prev", "flow_next", "instance", "need")
+
+
+def check_outputs(outputs: Iterable[str]) -> tuple[str, ...]:
+    """`outputs` as a tuple of known names; ValueError naming the nearest otherwise."""
+    if isinstance(outputs, str):
+        raise ValueError(f'outputs must be a tuple of names, got the string "{outputs}"; write ("{outputs}",)')
+    for name in outputs:
+        if name not in OUTPUTS:
+            raise ValueError(f'output "{name}" does not exist; there are {", ".join(OUTPUTS)}.{nearest(name, OUTPUTS)}')
+    return tuple(outputs)
