@@ -1,0 +1,181 @@
+"""Training samples: crops of stored pairs and of photos, altered afresh each time they are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.isp import alter, random_isp
+from enhance.masks import random_mask
+from enhance.shards import PairSet, Shard, Window
+
+KIND_WEIGHTS = {"underfit": 0.4, "isp": 0.42, "clean": 0.18}
+MASK_KNOWN = 0.5  # how often training tells the network where the instances are
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (NaN where not told), flow, visible."""
+
+    input: torch.Tensor
+    target: torch.Tensor
+    region: torch.Tensor
+    mask: torch.Tensor
+    flow: torch.Tensor
+    visible: torch.Tensor
+
+
+class Photos:
+    """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
+
+    def __init__(self, paths: tuple[str | Path, ...], stride: int = 8, width: int = 960):
+        self.frames: list[np.ndarray] = []
+        for path in map(Path, paths):
+            before = len(self.frames)
+            self.frames += [_shrink(frame, width) for frame in _frames(path, stride)]
+            if len(self.frames) == before:
+                raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PHOTO_SUFFIXES)} or a video")
+
+    def window(self, rng: np.random.Generator, frames: int, size: int) -> Window:
+        """A crop that pans by whole pixels over one photo: `frames` frames whose flow is exact."""
+        photo = self.frames[rng.integers(len(self.frames))]
+        zoom = min(float(rng.choice([1.0, 1.0, 1.5, 2.0])), min(photo.shape[:2]) / size)
+        n = int(size * zoom)
+        step = rng.integers(-6, 7, 2) if frames > 1 else np.zeros(2, int)
+        room = (np.array(photo.shape[:2]) - n) // frames
+        step = np.clip(step, -room, room)
+        span = np.abs(step) * (frames - 1)
+        first = rng.integers(np.array(photo.shape[:2]) - n - span + 1) + np.where(step < 0, span, 0)
+        crops = [photo[y : y + n, x : x + n] for y, x in (first + t * step for t in range(frames))]
+        rgb = torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float() / 255
+        if n != size:
+            rgb = F.interpolate(rgb, (size, size), mode="area")
+        scale = size / n
+        flow = torch.tensor(step[::-1] * scale, dtype=torch.float32)[None, :, None, None].repeat(frames, 1, size, size)
+        flow[0] = torch.nan
+        seen = torch.ones(frames, 1, size, size)
+        seen[0] = 0
+        return Window(rgb, rgb, torch.zeros_like(seen), torch.zeros(frames, 1, size, size, dtype=torch.int16), flow, seen)
+
+
+class Sampler:
+    """Draws samples. The draw depends on the seed and the step alone, so a resumed training sees what an unbroken one sees."""
+
+    def __init__(self, pairs: PairSet | None, photos: Photos | None, seed: int):
+        if pairs is None and photos is None:
+            raise ValueError("there is nothing to train on: give pairs, photos or both")
+        self.pairs, self.photos, self.seed = pairs, photos, seed
+        self.shards = {kind: pairs.of(kind, "train") if pairs else [] for kind in KIND_WEIGHTS}
+        if pairs and not any(self.shards.values()) and photos is None:
+            raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')
+
+    def rng(self, step: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, step])
+
+    def images(self, step: int, count: int, size: int) -> torch.Tensor:
+        """Crops for the autoencoder `[count, 3, size, size]`: targets and inputs, some with other colours."""
+        rng = self.rng(step)
+        windows = [self._window(rng, ("clean", "isp", "underfit")[rng.integers(3)], 1, size) for _ in range(count)]
+        images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
+        return torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images])
+
+    def batch(self, step: int, count: int, frames: int, size: int) -> Sample:
+        """`count` clips of `frames` frames."""
+        rng = self.rng(step)
+        drawn = [self._sample(rng, frames, size) for _ in range(count)]
+        return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
+
+    def _sample(self, rng: np.random.Generator, frames: int, size: int) -> Sample:
+        kinds = [k for k in KIND_WEIGHTS if k != "underfit" or self.shards["underfit"]]
+        weights = np.array([KIND_WEIGHTS[k] for k in kinds])
+        kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
+        w = self._window(rng, kind, frames, size)
+        objects = (w.instance > 0).float()
+        if kind == "isp":
+            region = self._moving_mask(rng, w)
+            damaged, told = alter(w.target, region, random_isp(rng)), torch.maximum((region > 0.5).float(), objects)
+            if rng.random() < 0.25:
+                told = (region > 0.5).float()
+        elif kind == "underfit":
+            damaged, region, told = w.input, torch.ones_like(w.region), objects
+            if rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
+                alien = self._moving_mask(rng, w)
+                damaged, told = alter(damaged, alien, random_isp(rng)), torch.maximum((alien > 0.5).float(), objects)
+        else:
+            damaged, region = w.target, torch.zeros_like(w.region)
+            told = objects if objects.any() and rng.random() < 0.5 else (self._moving_mask(rng, w) > 0.5).float()
+        damaged = (damaged * 255).round() / 255
+        mask = told if rng.random() < MASK_KNOWN else torch.full_like(told, torch.nan)
+        return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
+
+    def _window(self, rng: np.random.Generator, kind: str, frames: int, size: int) -> Window:
+        shards = [s for s in self.shards[kind] or [x for of in self.shards.values() for x in of] if s.frames >= frames]
+        if not shards and self.photos is None:
+            raise ValueError(f"no training clip has {frames} frames; make pairs of longer clips")
+        if self.photos is not None and (not shards or (kind != "underfit" and rng.random() < 0.4)):
+            return self.photos.window(rng, frames, size)
+        return _crop(rng, shards[rng.integers(len(shards))], frames, size)
+
+    def _moving_mask(self, rng: np.random.Generator, w: Window) -> torch.Tensor:
+        """A region `[T, 1, h, w]` that follows the content: instances where there are some, else a shape carried along the flow."""
+        frames, _, h, width = w.instance.shape
+        ids = [int(i) for i in w.instance.unique() if i > 0]
+        chosen = [i for i in ids if rng.random() < 0.6]
+        if chosen and rng.random() < 0.6:
+            mask = torch.isin(w.instance, torch.tensor(chosen, dtype=w.instance.dtype)).float()
+            return F.avg_pool2d(mask, 3, 1, 1) if rng.random() < 0.5 else mask
+        shape = torch.from_numpy(random_mask(rng, h, width))[None, None]
+        masks = [shape]
+        for t in range(1, frames):
+            drift = torch.nan_to_num(w.flow[t]).mean((1, 2))
+            masks.append(torch.roll(masks[-1], (-round(float(drift[1])), -round(float(drift[0]))), (-2, -1)))
+        return torch.cat(masks)
+
+
+def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int) -> Window:
+    h, w = min(size, shard.height), min(size, shard.width)
+    start, top, left = (int(rng.integers(n + 1)) for n in (shard.frames - frames, shard.height - h, shard.width - w))
+    window = shard.window(start, frames, top, left, h, w)
+    if (h, w) == (size, size):
+        return window
+    pad = (0, size - w, 0, size - h)
+    return Window(
+        **{name: F.pad(getattr(window, name), pad, mode="replicate") for name in ("input", "target", "region")},
+        instance=F.pad(window.instance, pad, value=-1),
+        flow=F.pad(window.flow, pad, value=torch.nan),
+        visible=F.pad(window.visible, pad),
+    )
+
+
+def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:
+    if rng.random() < 0.5:
+        return sample
+    turned = {f.name: getattr(sample, f.name).flip(-1) for f in fields(Sample)}
+    turned["flow"] = turned["flow"] * torch.tensor([-1.0, 1.0])[:, None, None]
+    return Sample(**turned)
+
+
+def _frames(path: Path, stride: int):
+    from render.video import read_image, read_video
+
+    if path.is_dir():
+        for file in sorted(path.iterdir()):
+            if file.suffix.lower() in PHOTO_SUFFIXES:
+                yield read_image(file)
+    else:
+        for i, frame in enumerate(read_video(path)):
+            if i % stride == 0:
+                yield frame
+
+
+def _shrink(frame: torch.Tensor, width: int) -> np.ndarray:
+    """Bytes `[h, width, 3]`; a photo is never enlarged."""
+    h, w = frame.shape[:2]
+    if w > width:
+        frame = F.interpolate(frame.permute(2, 0, 1)[None], (round(h * width / w), width), mode="area")[0].permute(1, 2, 0)
+    return (frame * 255).round().to(torch.uint8).numpy()

@@ -1,0 +1,145 @@
+"""Pairs on disk: one safetensors file a clip with a json file beside it, read by crops without loading the whole.
+
+`<folder>/<kind>/<name>.safetensors` holds, for a clip of T consecutive frames of one camera:
+
+input     uint8 `[T, H, W, 3]`    the damaged frames
+target    uint8 `[T, H, W, 3]`    what they should be
+region    uint8 `[T, H, W]`       where they were damaged, 0..255
+instance  uint8 `[T, H, W]`       rendered instance id, 255 where none
+flow      float16 `[T, H, W, 2]`  exact flow to the previous frame, pixels; NaN in the first frame and where unknown
+visible   uint8 `[T, H, W]`       1 where the previous frame shows the same point
+
+and `<name>.json` says kind, split ("train" or "held out"), camera, times, seed and what was done.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from scenes.atomic import atomic_file
+from scenes.checks import check_tensor
+
+KINDS = ("underfit", "isp", "clean")
+FIELDS = {
+    "input": torch.uint8,
+    "target": torch.uint8,
+    "region": torch.uint8,
+    "instance": torch.uint8,
+    "flow": torch.float16,
+    "visible": torch.uint8,
+}
+
+
+@dataclass(frozen=True)
+class Window:
+    """A crop in space and time of a clip, as float32 tensors ready for the network.
+
+    input, target  `[T, 3, h, w]` in 0..1
+    region         `[T, 1, h, w]` in 0..1
+    instance       `[T, 1, h, w]` int16, -1 where none
+    flow           `[T, 2, h, w]` pixels to the previous frame, NaN where unknown
+    visible        `[T, 1, h, w]` 0 or 1
+    """
+
+    input: torch.Tensor
+    target: torch.Tensor
+    region: torch.Tensor
+    instance: torch.Tensor
+    flow: torch.Tensor
+    visible: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One stored clip: where it is, its size, and its metadata."""
+
+    path: Path
+    frames: int
+    height: int
+    width: int
+    meta: dict
+
+    def window(
+        self, start: int = 0, frames: int | None = None, top: int = 0, left: int = 0, height: int | None = None, width: int | None = None
+    ) -> Window:
+        """A part of the clip; only what is asked for is read from disk."""
+        from safetensors import safe_open
+
+        t = slice(start, start + (frames or self.frames - start))
+        y, x = slice(top, top + (height or self.height - top)), slice(left, left + (width or self.width - left))
+        with safe_open(self.path, "pt") as file:
+            part = {name: file.get_slice(name)[t, y, x] for name in FIELDS}
+        colour = {name: part[name].permute(0, 3, 1, 2).float() / 255 for name in ("input", "target")}
+        instance = part["instance"][:, None].to(torch.int16)
+        flow = part["flow"].permute(0, 3, 1, 2).float()
+        flow[0] = torch.nan  # the frame before the window is not part of it
+        visible = part["visible"][:, None].float()
+        visible[0] = 0
+        return Window(
+            **colour,
+            region=part["region"][:, None].float() / 255,
+            instance=torch.where(instance == 255, -1, instance),
+            flow=flow,
+            visible=visible,
+        )
+
+
+def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:
+    """Store one clip; the json file is written last, so a shard without one is unfinished and is made again."""
+    from safetensors.torch import save_file
+
+    for name, dtype in FIELDS.items():
+        check_tensor(name, tensors[name], ("T", "H", "W", {"flow": 2}.get(name, 3)) if tensors[name].ndim == 4 else ("T", "H", "W"), dtype)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    t, h, w = tensors["region"].shape
+    with atomic_file(path) as half:
+        save_file({name: tensors[name].contiguous() for name in FIELDS}, str(half))
+    with atomic_file(path.with_suffix(".json")) as half:
+        Path(half).write_text(json.dumps({"frames": t, "height": h, "width": w, **meta}, indent=1))
+
+
+class PairSet:
+    """All finished shards of a pairs folder, or of several."""
+
+    def __init__(self, *folders: str | Path):
+        self.shards: list[Shard] = []
+        for folder in map(Path, folders):
+            if not folder.is_dir():
+                raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE -o {folder}")
+            for file in sorted(folder.glob("*/*.json")):
+                self.shards.append(_read_meta(file))
+        if not self.shards:
+            raise ValueError(
+                f"no pairs in {', '.join(map(str, folders))}; make some with: sidestep pairs SCENE -o {folders[0] if folders else 'pairs'}"
+            )
+
+    def of(self, kind: str | None = None, split: str | None = None) -> list[Shard]:
+        return [s for s in self.shards if (kind is None or s.meta["kind"] == kind) and (split is None or s.meta["split"] == split)]
+
+
+def _read_meta(file: Path) -> Shard:
+    try:
+        meta = json.loads(file.read_text())
+        shard = Shard(file.with_suffix(".safetensors"), int(meta["frames"]), int(meta["height"]), int(meta["width"]), meta)
+        known = meta["kind"] in KINDS and meta["split"] in ("train", "held out")
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} is not a pair's description ({error}); delete it and run sidestep pairs again") from error
+    if not known:
+        raise ValueError(
+            f'{file} has kind "{meta["kind"]}" and split "{meta["split"]}"; known are {", ".join(KINDS)} and "train", "held out"'
+        )
+    if not shard.path.is_file():
+        raise FileNotFoundError(
+            f"{shard.path} is missing although {file.name} describes it; delete {file.name} and run sidestep pairs again"
+        )
+    return shard
+
+
+def to_bytes(image: torch.Tensor | np.ndarray) -> torch.Tensor:
+    """Floats in 0..1 to uint8 by rounding."""
+    return (torch.as_tensor(image).clamp(0, 1) * 255).round().to(torch.uint8)

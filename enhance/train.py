@@ -1,0 +1,274 @@
+"""Training: first the autoencoder on single images, then, with its encoder frozen, the enhancer on pairs.
+
+The enhancer's batches alternate: images without history, and clips that the network walks through with its own earlier
+outputs as history, of any length from 0 to K, so that it never sees a history better than the one it will make itself.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.autoencoder import STRIDE, Autoencoder
+from enhance.losses import PatchPerceptual, pixel_loss, temporal_loss
+from enhance.net import Net, NetConfig
+from enhance.precision import autocast
+from enhance.samples import Photos, Sample, Sampler
+from enhance.shards import PairSet
+from enhance.warp import carry
+from enhance.weights_file import save_net
+from scenes.atomic import atomic_file
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train."""
+
+    autoencoder: float = 0.25
+    """Share of the budget for the autoencoder."""
+    crop: int = 192
+    """Side of training crops in pixels, a multiple of 16."""
+    images: int = 8
+    """Crops in an image batch."""
+    clips: int = 3
+    """Clips in a temporal batch."""
+    frames: int = 4
+    """Frames of a training clip."""
+    rate: float = 8e-4
+    """Highest learning rate."""
+    latent: float = 0.1
+    """Weight of the distance of the enhanced latent to the target's."""
+    perceptual: float = 0.03
+    """Weight of the perceptual distance on a random patch."""
+    temporal: float = 1.0
+    """Weight of the warp error in temporal batches."""
+
+    def __post_init__(self):
+        if self.crop % 16 or self.crop < 32:
+            raise ValueError(f"crop must be a multiple of 16 from 32, got {self.crop}")
+
+
+class _Run:
+    """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
+
+    def __init__(self, config: TrainConfig, net: NetConfig, minutes: float | None, steps: int | None, seed: int):
+        torch.manual_seed(seed)
+        self.config, self.minutes, self.steps, self.seed = config, minutes, steps, seed
+        self.autoencoder = Autoencoder().to(memory_format=torch.channels_last)
+        self.net = Net(net).to(memory_format=torch.channels_last)
+        self.average = Net(net)
+        self.step = {"autoencoder": 0, "enhancer": 0}
+        self.seconds = {"autoencoder": 0.0, "enhancer": 0.0}
+        self.optimiser = {
+            "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
+            "enhancer": torch.optim.AdamW(
+                [p for n, p in self.net.named_parameters() if not n.startswith("encoder.")], betas=(0.9, 0.98), weight_decay=1e-2
+            ),
+        }
+
+    def parts(self) -> dict:
+        return {"autoencoder": self.autoencoder, "net": self.net, "average": self.average} | {
+            f"optimiser {k}": v for k, v in self.optimiser.items()
+        }
+
+    def save(self, path: Path) -> None:
+        state = {name: part.state_dict() for name, part in self.parts().items()}
+        with atomic_file(path) as half:
+            torch.save({"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds, **state}, half)
+
+    def load(self, path: Path) -> None:
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            for name, part in self.parts().items():
+                part.load_state_dict(state[name])
+            self.step, self.seconds = state["step"], state["seconds"]
+        except (KeyError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
+        if state["seed"] != self.seed:
+            raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
+
+    def done(self, stage: str) -> float:
+        """How much of a stage's budget is spent, from 0 to 1."""
+        share = self.config.autoencoder if stage == "autoencoder" else 1 - self.config.autoencoder
+        if self.steps is not None:
+            return min(1.0, self.step[stage] / max(share * self.steps, 1))
+        return min(1.0, self.seconds[stage] / 60 / max(share * self.minutes, 1e-9))
+
+
+def train(
+    pairs: str | Path | PairSet | None,
+    out: str | Path,
+    minutes: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    resume: bool = False,
+    progress: Callable[[float, str], None] | None = None,
+    photos: tuple[str | Path, ...] = (),
+    about: dict | None = None,
+    config: TrainConfig | None = None,
+    net: NetConfig | None = None,
+    save_every: float = 60.0,
+) -> Path:
+    """Train on pairs and further photos; returns `out/enhancer.safetensors`.
+
+    minutes, steps  the budget of both stages together: exactly one of the two. With steps a run repeats exactly.
+    seed      of the first weights and of every sample drawn
+    out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
+    photos    folders of images and videos, for the autoencoder, colour changes and clean frames
+    about     written into the weights' header: licence and attribution of the data
+    progress  called with the share done, 0..1, and a line of words
+
+    Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
+    """
+    if (minutes is None) == (steps is None):
+        raise ValueError("give the training budget either as minutes or as steps")
+    if not (minutes or steps or 0) > 0:
+        raise ValueError(f"the training budget must be positive, got {minutes or steps}")
+    out = Path(out)
+    checkpoint = out / "checkpoint.pt"
+    if checkpoint.exists() and not resume:
+        raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
+    pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
+    sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed)
+    run = _Run(config or TrainConfig(), net or NetConfig(), minutes, steps, seed)
+    if resume and checkpoint.exists():
+        run.load(checkpoint)
+    out.mkdir(parents=True, exist_ok=True)
+    report = _Reporter(run, progress)
+    try:
+        _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
+        if run.step["enhancer"] == 0:
+            run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+            run.average.load_state_dict(run.net.state_dict())
+        run.net.encoder.requires_grad_(False)
+        perceptual = PatchPerceptual(run.net.encoder)
+        _stage(run, "enhancer", lambda step: _enhancer_step(run, sampler, perceptual, step), checkpoint, save_every, report)
+    except KeyboardInterrupt:
+        run.save(checkpoint)
+        raise
+    run.save(checkpoint)
+    weights = out / "enhancer.safetensors"
+    made = {"seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
+    save_net(run.average, weights, {**(about or {}), **made})
+    return weights
+
+
+def _stage(run: _Run, name: str, step: Callable[[int], float], checkpoint: Path, save_every: float, report: _Reporter) -> None:
+    saved = time.monotonic()
+    while run.done(name) < 1:
+        start = time.monotonic()
+        _set_rate(run, name)
+        loss = step(run.step[name])
+        run.step[name] += 1
+        run.seconds[name] += time.monotonic() - start
+        report(name, loss)
+        if time.monotonic() - saved > save_every:
+            run.save(checkpoint)
+            saved = time.monotonic()
+
+
+def _set_rate(run: _Run, stage: str) -> None:
+    """Warm up over 100 steps, then half a cosine down to a hundredth."""
+    highest = run.config.rate * (2.5 if stage == "autoencoder" else 1)
+    rate = highest * min(1.0, (run.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * run.done(stage)))
+    for group in run.optimiser[stage].param_groups:
+        group["lr"] = float(rate)
+
+
+def _autoencoder_step(run: _Run, sampler: Sampler, step: int) -> float:
+    size = max(32, run.config.crop * 2 // 3 // 16 * 16)
+    x = sampler.images(2 * step, 2 * run.config.images, size).contiguous(memory_format=torch.channels_last)
+    torch.manual_seed(run.seed * 1_000_003 + step)
+    with autocast(x.device):
+        y, latent = run.autoencoder(x, noise=0.05)
+    loss = autoencoder_loss(y.float(), x, latent.float())
+    _update(run, "autoencoder", [loss], run.autoencoder.parameters())
+    return float(loss.detach())
+
+
+def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+    """Absolute error of the image, of its 4 x 4 means and of its gradients, and latents pulled to zero mean and unit variance."""
+    d = y - x
+    slopes = (d[..., 1:] - d[..., :-1]).abs().mean() + (d[..., 1:, :] - d[..., :-1, :]).abs().mean()
+    spread = latent.mean((0, 2, 3)).square().mean() + (latent.var((0, 2, 3)) - 1).square().mean()
+    return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
+
+
+def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
+    c = run.config
+    temporal = step % 2 == 1 and c.frames > 1
+    rng = np.random.default_rng([run.seed, 7, step])
+    sample = sampler.batch(2 * step + 1, c.clips if temporal else c.images, c.frames if temporal else 1, c.crop)
+    losses = rollout_losses(run.net, sample, perceptual, c, rng)
+    total = _update(run, "enhancer", losses, run.net.parameters())
+    decay = min(0.998, (1 + run.step["enhancer"]) / (10 + run.step["enhancer"]))
+    with torch.no_grad():
+        for mean, now in zip(run.average.parameters(), run.net.parameters(), strict=True):
+            mean.lerp_(now, 1 - decay)
+    return total
+
+
+def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: TrainConfig, rng: np.random.Generator):
+    """Walk through the clips; yields each frame's loss when that frame is done, so that its graph can be freed at once.
+
+    The history has a random longest length and is, in one clip of four, left unmoved, as in a plain video without flow.
+    """
+    b, frames = sample.input.shape[:2]
+    longest = int(rng.integers(0, net.config.history + 1)) if frames > 1 else 0
+    moved = rng.random() < 0.75
+    h, w = (side // STRIDE for side in sample.input.shape[-2:])
+    latents, valid = sample.input.new_zeros(b, 0, net.embed.in_channels, h, w), sample.input.new_zeros(b, 0, 1, h, w)
+    previous = None
+    for t in range(frames):
+        if t and moved:
+            latents, valid = carry(latents, valid, sample.flow[:, t], STRIDE)
+        with autocast(sample.input.device):
+            out = net(sample.input[:, t], sample.mask[:, t], latents, valid)
+            with torch.no_grad():
+                wanted = net.encoder(sample.target[:, t].contiguous(memory_format=torch.channels_last))
+            seen = perceptual(out.rgb, sample.target[:, t], rng)
+        loss = pixel_loss(out.rgb, sample.target[:, t], sample.region[:, t]) + c.perceptual * seen
+        loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
+        if previous is not None:
+            loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])
+        previous = out.rgb.detach()
+        latents = torch.cat([out.latent.detach()[:, None], latents], 1)[:, :longest]
+        valid = torch.cat([torch.ones_like(out.latent[:, None, :1]).detach(), valid], 1)[:, :longest]
+        yield loss / frames
+
+
+def _update(run: _Run, stage: str, losses, parameters) -> float:
+    optimiser, total = run.optimiser[stage], 0.0
+    optimiser.zero_grad()
+    for loss in losses:
+        loss.backward()
+        total += float(loss.detach())
+    if not np.isfinite(total):
+        raise ValueError(f"the {stage}'s loss is {total} at step {run.step[stage]}; check the pairs for damaged files, or lower the rate")
+    torch.nn.utils.clip_grad_norm_([p for p in parameters if p.grad is not None], 1.0)
+    optimiser.step()
+    return total
+
+
+class _Reporter:
+    """Tells `progress` the smoothed loss, a few times a minute."""
+
+    def __init__(self, run: _Run, progress: Callable[[float, str], None] | None):
+        self.run, self.progress, self.loss, self.told = run, progress, {}, 0.0
+
+    def __call__(self, stage: str, loss: float) -> None:
+        self.loss[stage] = 0.98 * self.loss.get(stage, loss) + 0.02 * loss
+        if self.progress is None or (time.monotonic() - self.told < 5 and self.run.done(stage) < 1):
+            return
+        self.told = time.monotonic()
+        share = self.run.config.autoencoder
+        done = share * self.run.done("autoencoder") + (1 - share) * (self.run.done("enhancer") if stage == "enhancer" else 0)
+        self.progress(done, f"{stage}: step {self.run.step[stage]}, loss {self.loss[stage]:.4f}")
