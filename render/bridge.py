@@ -1,0 +1,206 @@
+"""The only torch.autograd.Function: torch tensors in, Warp kernels, torch tensors out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from render.frame_types import RenderConfig
+from render.kernels.composite import composite, composite_gradient
+from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
+from render.kernels.project import project, project_backward
+from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, lanes
+from render.launch import run, run_blocks, stream, view
+from render.order import TileLists, tile_lists
+from scenes.gaussians import SplatModel
+
+NEAR = 0.1
+"""Metres in front of the camera within which a splat's centre is not drawn."""
+
+POSE_CHUNK = 64
+"""Splats whose pose gradient one CPU thread item sums before it writes."""
+
+FIELDS = 5
+"""Tensors of one `Gaussians`."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What stays the same during one call: image size, model, config, outputs, instance ids."""
+
+    width: int
+    height: int
+    model: SplatModel
+    config: RenderConfig
+    depth: bool
+    instance: bool
+    instances: tuple[int, ...]
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // TILE)
+
+    @property
+    def tiles_y(self) -> int:
+        return -(-self.height // TILE)
+
+    @property
+    def pitch(self) -> int:
+        """Tiles of a stored row: odd, so that the 16 rows of a tile do not fall into one cache set on wide images."""
+        return self.tiles_x | 1
+
+    @property
+    def cutoff(self) -> float:
+        return max(self.config.alpha_cutoff, 1e-10)
+
+    @property
+    def squarings(self) -> int:
+        return 3 if self.cutoff >= 1 / 400 else 5
+
+    @property
+    def alpha_max(self) -> float:
+        return min(self.config.alpha_max, 1 - 1e-6)
+
+    def planes(self, count: int, device) -> torch.Tensor:
+        """Row-major planes `[count, rows, pitch * 16]`, not initialised: the kernels write every pixel of every tile."""
+        return torch.empty(count, self.tiles_y * TILE, self.pitch * TILE, device=device)
+
+    def crop(self, planes: torch.Tensor) -> torch.Tensor:
+        return planes[..., : self.height, : self.width]
+
+
+def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
+    v = View()
+    v.fx, v.fy, v.cx, v.cy = (float(x) for x in lens)
+    half_x, half_y = 0.15 * settings.width / v.fx, 0.15 * settings.height / v.fy  # the 0.3 of 1.3 tan, on either side
+    v.clamp_left, v.clamp_right = -v.cx / v.fx - half_x, (settings.width - v.cx) / v.fx + half_x
+    v.clamp_top, v.clamp_bottom = -v.cy / v.fy - half_y, (settings.height - v.cy) / v.fy + half_y
+    v.width, v.height, v.tiles_x, v.tiles_y = settings.width, settings.height, settings.tiles_x, settings.tiles_y
+    v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
+    v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
+    return v
+
+
+def _pose(cam_from_local: torch.Tensor, eye: torch.Tensor, instance: int) -> Pose:
+    p = Pose()
+    rows = cam_from_local.tolist()
+    p.rotation = wp.mat33(*(x for row in rows for x in row[:3]))
+    p.translation = wp.vec3(*(row[3] for row in rows))
+    p.eye = wp.vec3(*eye.tolist())
+    p.instance = float(instance)
+    return p
+
+
+def _arrays(fields) -> list:
+    means, quats, log_scales, logits, sh = fields
+    return [view(means, wp.vec3), view(quats, wp.vec4), view(log_scales, wp.vec3), view(logits, float), view(sh, wp.vec3)]
+
+
+class Rasterize(torch.autograd.Function):
+    """(settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, z sum, instance."""
+
+    @staticmethod
+    def forward(ctx, settings: Settings, cam_from_local, lens, *fields):
+        groups = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
+        sizes = [g[0].shape[0] for g in groups]
+        bases = [sum(sizes[:i]) for i in range(len(sizes))]
+        device = fields[0].device
+        n = sum(sizes)
+        records = torch.empty(n, RECORD, device=device)
+        keys, counts = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
+        poses = cam_from_local.detach().cpu()
+        eyes = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
+        with stream(device):
+            uniforms = []
+            for p, group in enumerate(groups):
+                uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
+                uniforms.append(uniform)
+                run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
+            lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y)
+            planes, last = _composite(settings, lists, records)
+        ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
+        ctx.records, ctx.counts, ctx.last, ctx.final_t = records, counts, last, planes[0]
+        ctx.pose_dtype, ctx.lens_dtype = cam_from_local.dtype, lens.dtype
+        rgb = settings.crop(planes[1:4])
+        alpha = 1 - settings.crop(planes[0])
+        z = settings.crop(planes[4]) if settings.depth else None
+        instance = None
+        if settings.instance:
+            instance = torch.where(alpha < 0.5, -1, settings.crop(planes[5])).to(torch.int32)
+            ctx.mark_non_differentiable(instance)
+        return rgb, alpha, z, instance
+
+    @staticmethod
+    def backward(ctx, g_rgb, g_alpha, g_z, _g_instance):
+        settings, lists, device = ctx.settings, ctx.lists, ctx.records.device
+        total = lists.ids.shape[0]
+        grads = settings.planes(5 if settings.depth else 4, device).zero_()
+        settings.crop(grads[:3]).copy_(g_rgb)
+        settings.crop(grads[3]).copy_(g_alpha).neg_().mul_(settings.crop(ctx.final_t))  # alpha = 1 - T
+        if settings.depth:
+            settings.crop(grads[4]).copy_(g_z)
+        slots = torch.empty(total, GRADIENTS, device=device)
+        outputs: list = []
+        g_uniform = []
+        with stream(device):
+            _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t.clone(), slots)
+            base = 0
+            for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
+                out = [torch.empty_like(f) for f in group]
+                chunk = POSE_CHUNK if device.type == "cpu" else 1
+                parts = -(-size // chunk)
+                shared = torch.empty(parts, UNIFORM_GRADIENTS, device=device)
+                args = [*_arrays(group), *uniform, size, chunk, view(ctx.counts, int), view(lists.first_slot, int), view(slots, float)]
+                run(project_backward, parts, [*args, *_arrays(out), view(shared, float)], device)
+                outputs += out
+                g_uniform.append(shared)
+                base += size
+        if not any(ctx.needs_input_grad[1:3]):
+            return None, None, None, *outputs
+        sums = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
+        g_pose = sums.new_zeros(len(sums), 4, 4)
+        g_pose[:, :3, :3] = sums[:, :9].reshape(-1, 3, 3)
+        g_pose[:, :3, 3] = sums[:, 9:12]
+        return None, g_pose.to(ctx.pose_dtype), sums[:, 12:].sum(0).to(ctx.lens_dtype), *outputs
+
+
+def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
+    return [view(p.view(p.shape[0], settings.pitch, TILE), lanes) for p in planes]
+
+
+def _composite(settings: Settings, lists: TileLists, records: torch.Tensor):
+    """Planes (T, r, g, b[, z][, instance, best weight]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
+    device = records.device
+    planes = settings.planes(4 + 3 * int(settings.depth or settings.instance), device)
+    args = [view(lists.starts, int), view(lists.ids, int), view(records, float), settings.tiles_x, settings.alpha_max, settings.config.termination]
+    tiles = settings.tiles_x * settings.tiles_y
+    if device.type == "cuda":
+        last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
+        extra = [view(planes[min(i, len(planes) - 1)], float) for i in range(7)]
+        kernel = composite_blocks(settings.depth, settings.instance, TILE)
+        run_blocks(kernel, tiles, TILE * TILE, [*args, *extra, view(last, int)], device)
+        return planes, last
+    last = torch.empty(planes.shape[1], settings.pitch, dtype=torch.int32)
+    rows = _lane_planes(settings, planes)
+    extra = [rows[min(i, len(rows) - 1)] for i in range(7)]
+    run(composite(settings.depth, settings.instance, settings.squarings), tiles, [*args, *extra, view(last, int)], device)
+    return planes, last
+
+
+def _composite_backward(settings: Settings, lists: TileLists, records, grads, last, t_run, slots) -> None:
+    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, z])."""
+    device = records.device
+    args = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float), settings.tiles_x, settings.alpha_max]
+    tiles = settings.tiles_x * settings.tiles_y
+    if device.type == "cuda":
+        planes = [view(p, float) for p in (*grads[:3], grads[-1], grads[3])]
+        r, g, b, z, rest = planes
+        kernel = composite_blocks_gradient(settings.depth, TILE)
+        run_blocks(kernel, tiles, TILE * TILE, [*args, r, g, b, z, view(last, int), view(t_run, float), rest, view(slots, float)], device)
+        return
+    r, g, b, rest, *z = _lane_planes(settings, grads)
+    kernel = composite_gradient(settings.depth, settings.squarings)
+    run(kernel, tiles, [*args, r, g, b, z[0] if z else r, view(last, int), _lane_planes(settings, t_run[None])[0], rest, view(slots, float)], device)

@@ -1,0 +1,61 @@
+"""Shared by all kernels: the tile, lane vectors, uniforms, and the layout of a projected splat."""
+
+import warp as wp
+
+# Warp's default limits SLP vectorisation to depth four, which costs 1.6x on the composite kernels; without SLP it is 3x.
+OPTIONS = {
+    "enable_backward": False,
+    "cpu_compiler_flags": "-march=native -mllvm=-inline-threshold=9000 -mprefer-vector-width=512 -ffp-contract=fast",
+}
+
+TILE = 16
+lanes = wp.types.vector(length=TILE, dtype=wp.float32)
+
+RECORD = 16
+"""Floats of a projected splat: one cache line. With dx, dy the pixel's offset from (X, Y), the exponent is
+s = (K (dx - M dy))^2 + H dy^2: the conic as a product of conditionals, which does not cancel for needles as
+a dx^2 + 2 b dx dy + c dy^2 does, and gives a row's exact extent by one square root."""
+X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, CS, K2H, INV_C = (wp.constant(i) for i in range(RECORD))
+
+GRADIENTS = 10
+"""Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
+G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i) for i in range(GRADIENTS))
+
+UNIFORM_GRADIENTS = 16
+"""Floats of the gradient shared by all splats of an instance: rotation (row major), translation, fx, fy, cx, cy."""
+
+SLACK = wp.constant(0.01)  # px: extents are widened by this, so that rounding never drops a pixel that the exponent admits
+
+
+@wp.struct
+class View:
+    """A camera and how to draw: everything that is the same for all splats."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    clamp_left: float  # EWA evaluates its Jacobian no further out than these x/z, y/z (Kerbl et al. 2023: 1.3 tan of half the view)
+    clamp_right: float
+    clamp_top: float
+    clamp_bottom: float
+    width: int
+    height: int
+    tiles_x: int
+    tiles_y: int
+    dilation: float
+    near: float
+    log_cutoff: float  # ln(1 / alpha cutoff)
+    unscented: int
+    antialias: int
+    sh_count: int
+
+
+@wp.struct
+class Pose:
+    """cam_from_local of one instance, and the eye in its local frame."""
+
+    rotation: wp.mat33
+    translation: wp.vec3
+    eye: wp.vec3
+    instance: float

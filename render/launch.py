@@ -1,0 +1,76 @@
+"""The only place that launches kernels: device, stream, and bands of work on CPU threads.
+
+Warp runs a CPU launch as one serial loop and releases the GIL, so bands on a thread pool scale. Bands write disjoint memory, which
+makes the result the same bits on any number of threads.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import cache
+
+import torch
+import warp as wp
+
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+
+BANDS = 16
+"""Bands of tiles a launch is cut into: enough to even out a busy part of the image, few enough to cost nothing."""
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="sidestep-render")
+
+
+def run(kernel: wp.Kernel, count: int, args: list, device: torch.device, bands: int = BANDS) -> None:
+    """Launch `kernel` over `count` work items; its last parameter, `first`, is the index of a band's first item."""
+    if count == 0:
+        return
+    if device.type == "cuda":
+        wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
+        return
+    threads = torch.get_num_threads()
+    bands = 1 if threads == 1 else min(bands, count)
+    edges = [count * b // bands for b in range(bands + 1)]
+
+    def band(b: int) -> None:
+        wp.launch(kernel, dim=edges[b + 1] - edges[b], inputs=[*args, edges[b]], device="cpu")
+
+    if bands == 1:
+        band(0)
+    else:
+        _ready(kernel)
+        list(_pool(threads).map(band, range(bands)))
+
+
+@cache
+def _ready(kernel: wp.Kernel) -> None:
+    """Compile before the threads start: they would all wait on one compiler."""
+    wp.init()
+    kernel.module.load("cpu")
+
+
+def run_blocks(kernel: wp.Kernel, blocks: int, block_dim: int, args: list, device: torch.device) -> None:
+    """Launch a kernel in which a block of threads shares one work item (CUDA; a block is one thread on the CPU)."""
+    if blocks:
+        wp.launch_tiled(kernel, dim=[blocks], inputs=args, block_dim=block_dim, device=wp.device_from_torch(device))
+
+
+def stream(device: torch.device):
+    """Run what is launched inside on torch's current CUDA stream, so that both see each other's results in order."""
+    if device.type != "cuda":
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+
+
+_WARP_TYPES = {float: wp.float32, int: wp.int32}
+
+
+def view(tensor: torch.Tensor, dtype) -> object:
+    """A torch tensor as a Warp array of `dtype`, no copy, no Python object: what `run` takes."""
+    return wp.from_torch(tensor.detach(), dtype=_WARP_TYPES.get(dtype, dtype), return_ctype=True)
+
+
+def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int) -> None:
+    """Stable radix sort of the first `count` int32 pairs in place; both tensors hold room for `2 * count`."""
+    wp.utils.radix_sort_pairs(wp.from_torch(keys, dtype=wp.int32), wp.from_torch(values, dtype=wp.int32), count)

@@ -1,0 +1,77 @@
+"""Depth order and the tiles' lists: from projected records to what compositing reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from render.kernels.bin import count_chunks, emit_chunks, emit_pairs
+from render.kernels.project import CULLED
+from render.launch import run, sort_pairs, view
+
+CHUNKS = 8
+"""Chunks of the depth order that are counted and emitted side by side on CPU threads."""
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """What every tile composites, front to back. All int32.
+
+    starts `[tiles + 1]`, ids `[I]` (record of each entry), slot_of `[I]` (its gradient slot), first_slot `[N]` (where a record's
+    slots begin; they lie side by side, so that a record's gradient is one contiguous sum in fixed order).
+    """
+
+    starts: torch.Tensor
+    ids: torch.Tensor
+    slot_of: torch.Tensor
+    first_slot: torch.Tensor
+
+
+def depth_order(keys: torch.Tensor) -> torch.Tensor:
+    """Indices int32 of the records that are not culled, by rising depth, ties by index."""
+    visible = torch.nonzero(keys != int(CULLED)).flatten().to(torch.int32)
+    n = visible.shape[0]
+    pair = keys.new_empty(2, 2 * n)
+    pair[0, :n] = keys[visible]
+    pair[1, :n] = visible
+    if n:
+        sort_pairs(pair[0], pair[1], n)
+    return pair[1, :n]
+
+
+def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int) -> TileLists:
+    """Sort the visible records by depth once, then deal them to tiles with a stable counting pass."""
+    device, tiles = records.device, tiles_x * tiles_y
+    order = depth_order(keys)
+    visible = order.shape[0]
+    ends = counts[order].cumsum(0)
+    total = int(ends[-1]) if visible else 0
+    if total >= 2**31:
+        raise ValueError(f"{total} splat-tile intersections do not fit one pass (2^31); render a smaller image or fewer, smaller splats")
+    first_slot = torch.empty_like(counts)
+    first_slot[order] = (ends - counts[order]).to(torch.int32)
+    ids = torch.empty(total, dtype=torch.int32, device=device)
+    slot_of = torch.empty(total, dtype=torch.int32, device=device)
+    starts = torch.zeros(tiles + 1, dtype=torch.int32, device=device)
+    if total and device.type == "cpu":
+        chunk = -(-visible // CHUNKS)
+        histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
+        args = [view(records, float), view(order, int), visible, chunk, tiles_x, tiles_y]
+        run(count_chunks, CHUNKS, [*args, view(histogram, int)], device)
+        by_tile = histogram.t().reshape(-1)
+        after = by_tile.cumsum(0, dtype=torch.int32)
+        starts[1:] = after[CHUNKS - 1 :: CHUNKS]
+        cursor = (after - by_tile).reshape(tiles, CHUNKS).t().contiguous()
+        run(emit_chunks, CHUNKS, [*args, view(first_slot, int), view(cursor, int), view(ids, int), view(slot_of, int)], device)
+    elif total:
+        pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
+        owner = torch.empty(total, dtype=torch.int32, device=device)
+        args = [view(records, float), view(order, int), tiles_x, tiles_y, view(first_slot, int)]
+        run(emit_pairs, visible, [*args, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
+        sort_pairs(pair[0], pair[1], total)
+        slot_of = pair[1, :total].clone()
+        ids = owner[slot_of.long()]
+        edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+        starts = torch.searchsorted(pair[0, :total].contiguous(), edges).to(torch.int32)
+    return TileLists(starts, ids, slot_of, first_slot)
