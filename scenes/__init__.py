@@ -33,8 +33,13 @@ _HOME = {
     "Ground": "ground",
     "Scene": "scene",
     "Databank": "databank",
+    "Entry": "databank",
     "load": "files",
+    "load_dropping": "files",
     "save": "files",
+    "add_edit": "usd_edit",
+    "describe": "report",
+    "validate": "report",
 }
 
 __all__ = sorted(_HOME)

@@ -81,7 +81,8 @@ class RigCamera:
 
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
         """The camera of a body at a pose."""
-        return Camera(self.lens, self.width, self.height, world_from_body @ self.body_from_cam, time_us=int(time_us), exposure=self.exposure)
+        world_from_cam = world_from_body @ self.body_from_cam
+        return Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure)
 
     def resized(self, width: int, height: int) -> RigCamera:
         """The same camera with an image of another size."""

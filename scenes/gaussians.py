@@ -100,21 +100,29 @@ class Gaussians:
 
     def invalid(self) -> torch.Tensor:
         """Mask `[N]` of splats with a value that is not finite or a quaternion of length zero."""
-        bad = torch.zeros(len(self), dtype=torch.bool, device=self.device)
+        bad = (self.quats == 0).all(1)
         for t in self.tensors().values():
-            bad |= ~torch.isfinite(t).reshape(len(self), -1).all(1)
-        return bad | (self.quats.abs().amax(1) == 0)
+            bad = bad | _not_finite(t)
+        return bad
 
     def validate(self, where: str = "splats") -> None:
         """Raise ValueError naming the first splat and field that is not finite or not a rotation."""
         for name, t in self.tensors().items():
-            bad = (~torch.isfinite(t)).reshape(len(self), -1).any(1)
+            bad = _not_finite(t)
             if bad.any():
                 first = int(bad.nonzero()[0])
-                raise ValueError(f"{where}: splat {first} has a {name} that is not finite ({t[first].flatten().tolist()[:4]}); {int(bad.sum())} such splats in all")
-        zero = self.quats.abs().amax(1) == 0 if len(self) else self.quats.new_zeros(0, dtype=torch.bool)
+                values = t[first].flatten()
+                value = float(values[~torch.isfinite(values)][0])
+                raise ValueError(f"{where}: splat {first} has {value} in {name}, which must be finite; {int(bad.sum())} such splats in all")
+        zero = (self.quats == 0).all(1)
         if zero.any():
-            raise ValueError(f"{where}: splat {int(zero.nonzero()[0])} has a quaternion of length zero; {int(zero.sum())} such splats in all")
+            first = int(zero.nonzero()[0])
+            raise ValueError(f"{where}: splat {first} has a quaternion of length zero in quats; {int(zero.sum())} such splats in all")
+
+    def checked(self, where: str = "splats") -> Gaussians:
+        """These splats, after `validate`."""
+        self.validate(where)
+        return self
 
     @staticmethod
     def empty(sh_count: int = 1, device="cpu") -> Gaussians:
@@ -129,6 +137,12 @@ class Gaussians:
         count = max(p.sh.shape[1] for p in parts)
         parts = [p.with_sh_count(count) for p in parts]
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+
+
+def _not_finite(field: torch.Tensor) -> torch.Tensor:
+    """Mask `[N]` of splats with a value of `field` `[N, ...]` that is not finite."""
+    bad = ~torch.isfinite(field)
+    return bad.flatten(1).any(1) if field.ndim > 1 else bad
 
 
 @dataclass(frozen=True)

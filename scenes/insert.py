@@ -30,7 +30,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     """Put an asset into a scene.
 
     start_us: the time of the clip's first frame, to whose body pose the placement is relative; the drive's first by default.
-    The actor gets a track of its own, and `meta["inserted"]` lists it. ValueError where the time is off the path or the
+    The actor gets a track of its own and `inserted` in its asset's meta. ValueError where the time is off the path or the
     trajectory file is bad.
     """
     start_us = int(scene.ego.times_us[0]) if start_us is None else start_us
@@ -50,9 +50,9 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
     if asset.model != scene.model:
         warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
-    actor = Actor(asset, Trajectory(times, torch.stack(poses)), _track(scene, placement.asset))
-    meta = {**scene.meta, "inserted": [*scene.meta.get("inserted", ()), actor.track]}
-    return Inserted(replace(scene, actors=(*scene.actors, actor), meta=meta), actor, tuple(warnings))
+    marked = replace(asset, meta={**asset.meta, "inserted": True})
+    actor = Actor(marked, Trajectory(times, torch.stack(poses)), _track(scene, placement.asset))
+    return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
 
 
 def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:

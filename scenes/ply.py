@@ -8,6 +8,7 @@ properties and ASCII. It maps the file: what the header claims is checked agains
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,15 +42,11 @@ class _Element:
     properties: dict[str, str]
 
 
-def load_ply(path: str | os.PathLike) -> Gaussians:
-    """The splats of a 3DGS PLY file, bit for bit. ValueError where it is not one, is not whole, or holds a value that is not finite."""
-    gaussians = read_ply(path)
-    gaussians.validate(str(path))
-    return gaussians
+def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
+    """The splats of a 3DGS PLY file, bit for bit. ValueError where it is not one or not whole.
 
-
-def read_ply(path: str | os.PathLike) -> Gaussians:
-    """As `load_ply`, but values are taken as they come: for `Gaussians.invalid` to look at."""
+    `clean(gaussians, where)` answers for the values: by default those that are not finite are refused by splat and field.
+    """
     path = Path(path)
     order, elements, offset = _read_header(path)
     rest = _check_splats(path, elements)
@@ -58,9 +55,8 @@ def read_ply(path: str | os.PathLike) -> Gaussians:
     n, k = len(vertices), 1 + rest // 3
     higher = _columns(vertices, [f"f_rest_{i}" for i in range(rest)]).reshape(n, 3, k - 1).transpose(0, 2, 1)
     sh = np.concatenate([columns["dc"][:, None], higher], 1)
-    return Gaussians(
-        *(torch.from_numpy(a) for a in (columns["means"], columns["quats"], columns["scales"], columns["opacity"][:, 0], sh))
-    )
+    fields = columns["means"], columns["quats"], columns["scales"], columns["opacity"][:, 0], sh
+    return clean(Gaussians(*(torch.from_numpy(np.ascontiguousarray(f)) for f in fields)), str(path))
 
 
 def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
@@ -122,7 +118,7 @@ def _check_splats(path: Path, elements: list[_Element]) -> int:
     names = {e.name: e.properties for e in elements}
     vertex = names.get("vertex", {})
     if "packed_position" in vertex:
-        raise ValueError(f"{path} is a compressed splat PLY (SuperSplat, PlayCanvas), which is not read yet; export it as an uncompressed PLY")
+        raise ValueError(f"{path} is a compressed splat PLY (PlayCanvas, SuperSplat), which is not read; export it uncompressed")
     missing = [name for group in _FIELDS.values() for name in group if vertex.get(name, "list") == "list"]
     if missing:
         what = "a mesh" if "face" in names else "not a Gaussian splat file"

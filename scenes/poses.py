@@ -5,7 +5,7 @@ import torch
 
 
 def as_pose(value) -> torch.Tensor:
-    """A float64 pose `[..., 4, 4]` from a tensor or anything numpy reads; the last row must be 0 0 0 1."""
+    """A float64 pose `[..., 4, 4]` from a tensor or anything numpy reads; that it is rigid is the caller's word."""
     pose = value if isinstance(value, torch.Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
     if pose.shape[-2:] != (4, 4):
         raise ValueError(f"a pose must have shape (..., 4, 4), got {tuple(pose.shape)}")
@@ -26,14 +26,18 @@ def matrix_from_quat(quat: torch.Tensor) -> torch.Tensor:
 def quat_from_matrix(rotation: torch.Tensor) -> torch.Tensor:
     """Unit quaternions wxyz `[..., 4]`, w >= 0, from rotations `[..., 3, 3]` (Shepperd's method: the largest term leads)."""
     m = rotation
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    squares = torch.stack([trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    trace = xx + yy + zz
+    # 4 times the products of the quaternion's terms
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    squares = torch.stack([trace, xx, yy, zz], -1)
     candidates = torch.stack(
         [
-            torch.stack([1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
-            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + 2 * m[..., 0, 0] - trace, m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),
-            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0], 1 + 2 * m[..., 1, 1] - trace, m[..., 1, 2] + m[..., 2, 1]], -1),
-            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], 1 + 2 * m[..., 2, 2] - trace], -1),
+            torch.stack([1 + trace, wx, wy, wz], -1),
+            torch.stack([wx, 1 + 2 * xx - trace, xy, xz], -1),
+            torch.stack([wy, xy, 1 + 2 * yy - trace, yz], -1),
+            torch.stack([wz, xz, yz, 1 + 2 * zz - trace], -1),
         ],
         -2,
     )

@@ -1,0 +1,136 @@
+"""The databank: a folder of assets with an index.
+
+databank/index.json  assets/<class>/<number>/{asset.usdc,asset.json,thumb.png}
+
+An asset's id is "<class>/<number>", as car/0003. index.json lists every entry; asset.json holds the same entry beside the asset.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path, PurePosixPath
+
+from scenes.asset import Asset
+from scenes.atomic import atomic_file, atomic_folder
+from scenes.gaussians import Gaussians
+from scenes.names import unknown
+
+FORMAT = "sidestep databank"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the index says of one asset: `size` is length, width, height in metres; paths are relative to the databank."""
+
+    id: str
+    label: str
+    size: tuple[float, float, float]
+    splats: int
+    views: int | None
+    licence: str
+    attribution: str
+    source: str
+    asset: str
+    thumb: str | None
+
+
+class Databank:
+    """A databank folder. It need not exist until something is added."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+
+    def entries(self) -> list[Entry]:
+        """All entries, by id. FileNotFoundError where there is no databank, ValueError where its index is corrupt."""
+        index = self.path / "index.json"
+        if not index.is_file():
+            raise FileNotFoundError(f"{self.path} is not a databank: it has no index.json; add an asset to make one")
+        try:
+            data = json.loads(index.read_text(encoding="utf-8"))
+            if data["format"] != FORMAT or data["version"] != VERSION:
+                raise ValueError(f"format {data['format']!r} version {data['version']}, not {FORMAT!r} version {VERSION}")
+            entries = [_entry(record) for record in data["entries"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{index} is corrupt: {type(error).__name__} {error}") from error
+        return sorted(entries, key=lambda e: e.id)
+
+    def entry(self, id: str) -> Entry:
+        """The entry of an id; ValueError naming the nearest where there is none."""
+        entries = {e.id: e for e in self.entries()}
+        if id not in entries:
+            raise ValueError(unknown("asset", id, str(self.path), entries))
+        return entries[id]
+
+    def load(self, id: str, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Asset:
+        """The asset of an id, with the id in its meta. FileNotFoundError naming the file where one is missing."""
+        from scenes.usd_splats import load_asset
+
+        entry = self.entry(id)
+        file = self.path / entry.asset
+        if not file.is_file():
+            raise FileNotFoundError(f"asset {id} of {self.path} lacks its file {file}; restore it, or remove the entry from index.json")
+        asset = load_asset(file, clean)
+        return replace(asset, meta={**asset.meta, "id": id})
+
+    def add(self, asset: Asset, thumb_png: bytes | None = None, half: bool = False) -> str:
+        """Store an asset under the next free number of its class and return the id. It appears whole or not at all.
+
+        Of `asset.meta`, licence, attribution, source and views go into the index.
+        """
+        from scenes.usd_splats import save_asset, to_json
+
+        asset.gaussians.validate(f"asset {asset.label!r}")
+        self.path.mkdir(parents=True, exist_ok=True)
+        entries = self.entries() if (self.path / "index.json").exists() else []
+        kind = slug(asset.label)
+        folder = self.path / "assets" / kind
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [e.id for e in entries] + [f"{kind}/{p.name}" for p in folder.iterdir()]  # a killed add leaves a folder without an entry
+        numbers = [int(m[1]) for name in names if (m := re.fullmatch(rf"{kind}/(\d+)", name))]
+        id = f"{kind}/{max(numbers, default=0) + 1:04d}"
+        home, meta = PurePosixPath("assets", id), asset.meta
+        views = meta.get("views")
+        entry = Entry(
+            id=id,
+            label=asset.label,
+            size=_metres(asset.size.tolist()),
+            splats=len(asset.gaussians),
+            views=None if views is None else int(views),
+            licence=str(meta.get("licence", "")),
+            attribution=str(meta.get("attribution", "")),
+            source=str(meta.get("source", "")),
+            asset=str(home / "asset.usdc"),
+            thumb=None if thumb_png is None else str(home / "thumb.png"),
+        )
+        with atomic_folder(self.path / home) as partial:
+            save_asset(partial / "asset.usdc", asset, half)
+            (partial / "asset.json").write_text(to_json({**asdict(entry), "meta": meta}, "the asset's meta"), encoding="utf-8")
+            if thumb_png is not None:
+                (partial / "thumb.png").write_bytes(thumb_png)
+        index = {"format": FORMAT, "version": VERSION, "entries": [asdict(e) for e in [*entries, entry]]}
+        with atomic_file(self.path / "index.json") as partial:
+            partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
+        return id
+
+
+def slug(label: str) -> str:
+    """The class folder of a label: "Car" -> car, "Pedestrian with Object" -> pedestrian-with-object."""
+    return re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "thing"
+
+
+def _metres(size: Sequence[float]) -> tuple[float, float, float]:
+    length, width, height = (float(v) for v in size)
+    return length, width, height
+
+
+def _entry(record: dict) -> Entry:
+    entry = Entry(**{f.name: record[f.name] for f in fields(Entry)})
+    for path in filter(None, (entry.asset, entry.thumb)):
+        if PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts:
+            raise ValueError(f"{entry.id} has the path {path}, which leaves the databank")
+    return replace(entry, size=_metres(entry.size))

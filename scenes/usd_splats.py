@@ -1,0 +1,186 @@
+"""Splats and assets as USD: a ParticleField3DGaussianSplat (UsdVol, in usd-core from 26.3) under an Xform.
+
+USD keeps activated values: scale and opacity linear, quaternions normalised, SH coefficients per particle with the constant one
+first. Logits are clamped to +-15 on the way. A float file returns them within 1 ulp; a half one keeps float positions, since half
+ones lose centimetres, and 3 digits of everything else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
+from scenes.asset import Asset
+from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
+from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
+
+LOGIT_LIMIT = 15.0
+EXTENT_SIGMAS = 3.0
+_SPLATS = "ParticleField3DGaussianSplat"
+_HALF_TINY, _HALF_MAX = 2.0**-14, 65504.0
+Clean = Callable[[Gaussians, str], Gaussians]
+
+
+def save_gaussians(path: Path, gaussians: Gaussians, model: SplatModel | None = None, half: bool = False) -> None:
+    """Write splats, and the model they were trained with, as one USD file."""
+    with new_stage(path, "Splats") as stage:
+        root = UsdGeom.Xform.Define(stage, "/Splats")
+        set_own_data(root.GetPrim(), kind="splats")
+        author_splats(stage, "/Splats/Gaussians", gaussians, model, half)
+
+
+def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
+    """The splats of a USD file that has exactly one splat prim, not under a transform."""
+    stage, _ = open_stage(path)
+    prim = only_splats(stage.GetPseudoRoot(), path)
+    if UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
+        raise ValueError(f"{path}: {prim.GetPath()} stands under a transform, which splats alone cannot carry; apply it before export")
+    return clean(read_splats(prim), str(path))
+
+
+def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
+    """Write an asset as one USD file: its splats under an Xform that carries size, label and metadata."""
+    with new_stage(path, "Asset") as stage:
+        root = UsdGeom.Xform.Define(stage, "/Asset").GetPrim()
+        size = Vt.DoubleArray(asset.size.tolist())
+        set_own_data(root, kind="asset", label=asset.label, size=size, meta=to_json(asset.meta, "the asset's meta"))
+        author_splats(stage, "/Asset/Gaussians", asset.gaussians, asset.model, half)
+
+
+def load_asset(path: Path, clean: Clean = Gaussians.checked) -> Asset:
+    """The asset that `save_asset` wrote. ValueError where the file holds something else."""
+    stage, _ = open_stage(path)
+    root = stage.GetDefaultPrim()
+    if not root or own_data(root).get("kind") != "asset":
+        raise ValueError(f"{path} is not an asset: its default prim carries no label and size")
+    return read_asset(root, path, clean)
+
+
+def read_asset(root: Usd.Prim, path: Path, clean: Clean) -> Asset:
+    """The asset that a prim is, or refers to."""
+    data, prim = own_data(root), only_splats(root, path)
+    try:
+        meta, size, label = json.loads(data["meta"]), torch.tensor(list(data["size"]), dtype=torch.float64), data["label"]
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {root.GetPath()} is not an asset: it lacks {error}") from error
+    return Asset(clean(read_splats(prim), f"{path}, {root.GetPath()}"), size, label, read_model(prim), meta)
+
+
+def author_splats(stage: Usd.Stage, where: str, gaussians: Gaussians, model: SplatModel | None, half: bool) -> None:
+    """Define a splat prim at a path of the stage."""
+    g = {name: t.detach().cpu().numpy().astype(np.float64) for name, t in gaussians.tensors().items()}
+    n, k = len(gaussians), gaussians.sh.shape[1]
+    scales = np.exp(g["log_scales"]).clip(*((_HALF_TINY, _HALF_MAX) if half else (np.finfo("f4").tiny, np.finfo("f4").max)))
+    opacities = 1 / (1 + np.exp(-g["logit_opacities"].clip(-LOGIT_LIMIT, LOGIT_LIMIT)))
+    # scaled by the largest term first, so that denormal quaternions keep their direction
+    quats = g["quats"] / np.abs(g["quats"]).max(1, keepdims=True)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    sh = g["sh"].reshape(n * k, 3)
+    splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, where)
+    splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(g["means"].astype(np.float32)))
+    xyzw = np.ascontiguousarray(quats[:, [1, 2, 3, 0]])
+    if half:
+        sh = sh.clip(-_HALF_MAX, _HALF_MAX)
+        splats.CreateOrientationshAttr(Vt.QuathArray.FromNumpy(xyzw.astype(np.float16)))
+        splats.CreateScaleshAttr(Vt.Vec3hArray.FromNumpy(scales.astype(np.float16)))
+        splats.CreateOpacitieshAttr(Vt.HalfArray.FromNumpy(opacities.astype(np.float16)))
+        splats.CreateRadianceSphericalHarmonicsCoefficientshAttr(Vt.Vec3hArray.FromNumpy(sh.astype(np.float16)))
+    else:
+        splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(xyzw.astype(np.float32)))
+        splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales.astype(np.float32)))
+        splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities.astype(np.float32)))
+        splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(sh.astype(np.float32)))
+    splats.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
+    splats.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(g["means"], quats, scales)))
+    if model is not None:
+        set_own_data(splats.GetPrim(), model=asdict(model))
+
+
+def read_splats(prim: Usd.Prim) -> Gaussians:
+    """The splats of a prim, as they come: float attributes, or the half ones where there are no float ones."""
+    splats = UsdVol.ParticleField3DGaussianSplat(prim)
+    means = _either(prim, splats.GetPositionsAttr(), splats.GetPositionshAttr(), 3)
+    quats = _either(prim, splats.GetOrientationsAttr(), splats.GetOrientationshAttr(), 4)
+    scales = _either(prim, splats.GetScalesAttr(), splats.GetScaleshAttr(), 3)
+    opacities = _either(prim, splats.GetOpacitiesAttr(), splats.GetOpacitieshAttr(), 1)
+    radiance = splats.GetRadianceSphericalHarmonicsCoefficientsAttr(), splats.GetRadianceSphericalHarmonicsCoefficientshAttr()
+    sh = _either(prim, *radiance, 3)
+    degree, n = splats.GetRadianceSphericalHarmonicsDegreeAttr().Get(), len(means)
+    if not 0 <= degree < len(SH_COUNTS):
+        raise ValueError(f"{prim.GetPath()} has spherical harmonics of degree {degree}; 0 to 3 are read")
+    counts = {"orientations": (len(quats), n), "scales": (len(scales), n), "opacities": (len(opacities), n)}
+    counts["sphericalHarmonicsCoefficients"] = (len(sh), n * SH_COUNTS[degree])
+    for name, (found, wanted) in counts.items():
+        if found != wanted:
+            raise ValueError(f"{prim.GetPath()} has {found} {name} for {n} positions of SH degree {degree}; it needs {wanted}")
+    with np.errstate(divide="ignore", invalid="ignore"):  # what is out of range becomes inf or nan, which `validate` names
+        p = opacities[:, 0].astype(np.float64)
+        logits = np.clip(np.log(p) - np.log1p(-p), -LOGIT_LIMIT, LOGIT_LIMIT)
+        log_scales = np.log(scales.astype(np.float64))
+    fields = means, quats[:, [3, 0, 1, 2]], log_scales, logits, sh.reshape(n, SH_COUNTS[degree], 3)
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(f, np.float32)) for f in fields))
+
+
+def read_model(prim: Usd.Prim) -> SplatModel:
+    """The model that a splat prim was trained with; the default one where it does not say."""
+    model = dict(own_data(prim).get("model", {}))
+    try:
+        return SplatModel(**model)
+    except TypeError as error:
+        raise ValueError(f"{prim.GetPath()} names an unknown splat model: {model}") from error
+
+
+def only_splats(root: Usd.Prim, path: Path) -> Usd.Prim:
+    """The one splat prim at or under a prim."""
+    found = [p for p in Usd.PrimRange(root) if p.GetTypeName() == _SPLATS]
+    if len(found) != 1:
+        paths = ", ".join(str(p.GetPath()) for p in found[:4]) or "none"
+        missing = missing_files(root)
+        why = f"; {missing[0]} is missing" if missing else ""
+        raise ValueError(f"{path}: {root.GetPath()} must hold one {_SPLATS}, it has {paths}{why}")
+    return found[0]
+
+
+def missing_files(prim: Usd.Prim) -> list[Path]:
+    """Files that the prim refers to and that do not exist."""
+    files = []
+    for spec in prim.GetPrimStack():
+        for arcs in (spec.referenceList, spec.payloadList):
+            files += [Path(spec.layer.ComputeAbsolutePath(a.assetPath)) for a in arcs.GetAddedOrExplicitItems() if a.assetPath]
+    return [f for f in files if not f.is_file()]
+
+
+def to_json(value: object, what: str) -> str:
+    """JSON text; ValueError where `value` is not plain json."""
+    try:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} cannot be stored as JSON: {error}") from error
+
+
+def _either(prim: Usd.Prim, full: Usd.Attribute, half: Usd.Attribute, width: int) -> np.ndarray:
+    value = array(full, width)
+    value = array(half, width) if value is None else value
+    if value is None:
+        raise ValueError(f"{prim.GetPath()} has no {full.GetName()}")
+    return value
+
+
+def _extent(means: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """float32 `[2, 3]`: corners of the box around all splats at 3 sigma; quats wxyz normalised."""
+    if not len(means):
+        return np.zeros((2, 3), np.float32)
+    w, x, y, z = quats.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    half = EXTENT_SIGMAS * np.sqrt(np.square(np.array(rows) * scales.T).sum(1)).T
+    return np.stack([(means - half).min(0), (means + half).max(0)]).astype(np.float32)
