@@ -100,7 +100,10 @@ def _arrays(fields) -> list:
 
 
 class Rasterize(torch.autograd.Function):
-    """(settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, z sum, instance."""
+    """(settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w, instance.
+
+    The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
+    """
 
     @staticmethod
     def forward(ctx, settings: Settings, cam_from_local, lens, *fields):
@@ -126,22 +129,23 @@ class Rasterize(torch.autograd.Function):
         ctx.pose_dtype, ctx.lens_dtype = cam_from_local.dtype, lens.dtype
         rgb = settings.crop(planes[1:4])
         alpha = 1 - settings.crop(planes[0])
-        z = settings.crop(planes[4]) if settings.depth else None
+        z, weights = settings.crop(planes[4:6]) if settings.depth else (None, None)
         instance = None
         if settings.instance:
-            instance = torch.where(alpha < 0.5, -1, settings.crop(planes[5])).to(torch.int32)
+            instance = torch.where(alpha < 0.5, -1, settings.crop(planes[6])).to(torch.int32)
             ctx.mark_non_differentiable(instance)
-        return rgb, alpha, z, instance
+        return rgb, alpha, z, weights, instance
 
     @staticmethod
-    def backward(ctx, g_rgb, g_alpha, g_z, _g_instance):
+    def backward(ctx, g_rgb, g_alpha, g_z, g_weights, _g_instance):
         settings, lists, device = ctx.settings, ctx.lists, ctx.records.device
         total = lists.ids.shape[0]
-        grads = settings.planes(5 if settings.depth else 4, device).zero_()
+        grads = settings.planes(6 if settings.depth else 4, device).zero_()
         settings.crop(grads[:3]).copy_(g_rgb)
         settings.crop(grads[3]).copy_(g_alpha).neg_().mul_(settings.crop(ctx.final_t))  # alpha = 1 - T
         if settings.depth:
             settings.crop(grads[4]).copy_(g_z)
+            settings.crop(grads[5]).copy_(g_weights)
         slots = torch.empty(total, GRADIENTS, device=device)
         outputs: list = []
         g_uniform = []
@@ -172,35 +176,35 @@ def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
 
 
 def _composite(settings: Settings, lists: TileLists, records: torch.Tensor):
-    """Planes (T, r, g, b[, z][, instance, best weight]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
+    """Planes (T, r, g, b[, z, w][, instance, best weight]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
     device = records.device
-    planes = settings.planes(4 + 3 * int(settings.depth or settings.instance), device)
+    planes = settings.planes(8 if settings.instance else 6 if settings.depth else 4, device)
     args = [view(lists.starts, int), view(lists.ids, int), view(records, float), settings.tiles_x, settings.alpha_max, settings.config.termination]
     tiles = settings.tiles_x * settings.tiles_y
     if device.type == "cuda":
         last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
-        extra = [view(planes[min(i, len(planes) - 1)], float) for i in range(7)]
+        extra = [view(planes[min(i, len(planes) - 1)], float) for i in range(8)]
         kernel = composite_blocks(settings.depth, settings.instance, TILE)
         run_blocks(kernel, tiles, TILE * TILE, [*args, *extra, view(last, int)], device)
         return planes, last
     last = torch.empty(planes.shape[1], settings.pitch, dtype=torch.int32)
     rows = _lane_planes(settings, planes)
-    extra = [rows[min(i, len(rows) - 1)] for i in range(7)]
+    extra = [rows[min(i, len(rows) - 1)] for i in range(8)]
     run(composite(settings.depth, settings.instance, settings.squarings), tiles, [*args, *extra, view(last, int)], device)
     return planes, last
 
 
 def _composite_backward(settings: Settings, lists: TileLists, records, grads, last, t_run, slots) -> None:
-    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, z])."""
+    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, z, w])."""
     device = records.device
     args = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float), settings.tiles_x, settings.alpha_max]
     tiles = settings.tiles_x * settings.tiles_y
-    if device.type == "cuda":
-        planes = [view(p, float) for p in (*grads[:3], grads[-1], grads[3])]
-        r, g, b, z, rest = planes
+    on_cuda = device.type == "cuda"
+    r, g, b, rest, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(settings, grads)
+    z, w = extra or (r, r)
+    if on_cuda:
         kernel = composite_blocks_gradient(settings.depth, TILE)
-        run_blocks(kernel, tiles, TILE * TILE, [*args, r, g, b, z, view(last, int), view(t_run, float), rest, view(slots, float)], device)
+        run_blocks(kernel, tiles, TILE * TILE, [*args, r, g, b, z, w, view(last, int), view(t_run, float), rest, view(slots, float)], device)
         return
-    r, g, b, rest, *z = _lane_planes(settings, grads)
     kernel = composite_gradient(settings.depth, settings.squarings)
-    run(kernel, tiles, [*args, r, g, b, z[0] if z else r, view(last, int), _lane_planes(settings, t_run[None])[0], rest, view(slots, float)], device)
+    run(kernel, tiles, [*args, r, g, b, z, w, view(last, int), _lane_planes(settings, t_run[None])[0], rest, view(slots, float)], device)

@@ -43,12 +43,13 @@ def render_frame(
 
     casters = shadow_casters(scene, camera) if shadows and "rgb" in outputs else []
     needed = set(outputs)
-    if "rgb" in needed or flow_to:
+    if "rgb" in needed and scene.sky is not None:
         needed.add("alpha")
     if casters:
         needed |= {"depth", "instance"}
     placed = scene.placed(camera.time_us)
-    frame = rasterize(placed, camera, outputs=tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
+    frame = rasterize(placed, camera, tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
+    assert isinstance(frame, Frame)
 
     changed: dict[str, torch.Tensor] = {}
     if "rgb" in outputs:
@@ -58,9 +59,6 @@ def render_frame(
         if camera.exposure is not None:
             rgb = expose(rgb, camera.exposure)
         changed["rgb"] = rgb
-    for way, (_, other) in flow_to.items():
-        name = f"flow_{way}"
-        changed[name] = with_sky_flow(getattr(frame, name), frame.alpha, camera, other)
     dropped = {name: None for name in needed - set(outputs)}
     return replace(frame, **changed, **dropped)
 
@@ -80,20 +78,6 @@ def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     if torch.equal(exposure, torch.eye(3, 4).to(exposure)):
         return rgb
     return rgb @ exposure[:, :3].T + exposure[:, 3]
-
-
-def with_sky_flow(flow: torch.Tensor, alpha: torch.Tensor, camera: Camera, other: Camera) -> torch.Tensor:
-    """`flow` `[H, W, 2]` with the sky's own flow where alpha < 0.5: the sky moves by rotation only.
-
-    A direction that lies behind the other camera is sent far off its image.
-    """
-    through = alpha.detach() < 0.5
-    if not through.any():
-        return flow
-    turned = world_directions(camera)[through].double() @ other.world_from_cam[:3, :3].to(alpha.device)
-    turned = torch.cat([turned[:, :2], turned[:, 2:].clamp_min(1e-6)], 1)
-    here = camera.pixel_centres().to(alpha.device)[through]
-    return flow.index_put((through,), (other.lens.project(turned) - here).to(flow))
 
 
 def world_directions(camera: Camera) -> torch.Tensor:

@@ -54,7 +54,7 @@ def rasterize(
     cam_from_world = inverse(camera.world_from_cam)
     cam_from_local = torch.stack([cam_from_world @ p.world_from_local for p in placed])
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
-    rgb, alpha, z, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), *fields)
+    rgb, alpha, z, weights, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), *fields)
 
     frame: dict[str, torch.Tensor] = {}
     if "rgb" in outputs:
@@ -65,8 +65,8 @@ def rasterize(
         frame["alpha"] = alpha
     if settings.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
-        drawn = alpha > 0
-        depth = torch.where(drawn, z / torch.where(drawn, alpha, torch.ones_like(alpha)), torch.inf)
+        drawn = weights > 0
+        depth = torch.where(drawn, z / torch.where(drawn, weights, torch.ones_like(weights)), torch.inf)
         if "depth" in outputs:
             frame["depth"] = depth
     if "instance" in outputs:

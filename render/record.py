@@ -124,7 +124,6 @@ def _keep(folder: Path, index: int, frame: Frame, keep: Sequence[str]) -> None:
 
 
 def _inserted(scene: Scene) -> list[dict]:
-    tracks = scene.meta.get("inserted", ())
     return [
         {
             "track": actor.track,
@@ -135,5 +134,5 @@ def _inserted(scene: Scene) -> list[dict]:
             "world_from_asset": [actor.trajectory.world_from_body[0].tolist(), actor.trajectory.world_from_body[-1].tolist()],
         }
         for i, actor in enumerate(scene.actors)
-        if actor.track in tracks
+        if actor.asset.meta.get("inserted")
     ]

@@ -2,7 +2,7 @@
 
 No light is traced. What a rough sky does under a car is near enough a function of the distance to its footprint:
 dark underneath, fading over about half the height of the body's underside above the ground (an ambient-occlusion
-look). Inserted assets are those whose tracks `scene.meta["inserted"]` lists; recorded actors keep their own shadows.
+look). Inserted assets are those with `inserted` in their meta; recorded actors keep the shadows of their photos.
 """
 
 from __future__ import annotations
@@ -34,10 +34,9 @@ class Caster:
 
 def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     """The inserted assets whose shadow can fall into the view, with the pixel window `x0, y0, x1, y1` it falls into."""
-    inserted = set(scene.meta.get("inserted", ()))
     found = []
     for i, actor in enumerate(scene.actors):
-        if actor.track not in inserted or not actor.trajectory.covers(camera.time_us):
+        if not actor.asset.meta.get("inserted") or not actor.trajectory.covers(camera.time_us):
             continue
         world_from_asset = actor.trajectory.at(camera.time_us)
         half = (float(actor.asset.size[0]) / 2, float(actor.asset.size[1]) / 2)

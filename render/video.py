@@ -77,9 +77,12 @@ class Video:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             try:
-                for frame in container.decode(stream):
-                    yield from_bytes(frame.to_ndarray(format="rgb24"))
-                    decoded += 1
+                for packet in container.demux(stream):
+                    if packet.is_corrupt:  # threaded decoding would pass over it in silence
+                        raise ValueError(f"{self.path} breaks off after frame {decoded}; fetch the file again")
+                    for frame in packet.decode():
+                        yield from_bytes(frame.to_ndarray(format="rgb24"))
+                        decoded += 1
             except FFmpegError as error:
                 raise ValueError(f"{self.path} cannot be decoded after frame {decoded}: {error.strerror}") from error
         if decoded == 0:

@@ -97,7 +97,7 @@ def composite(depth: bool, instance: bool, squarings: int):
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
         tiles_x: int, alpha_max: float, termination: float,
         out_t: wp.array2d[lanes], out_r: wp.array2d[lanes], out_g: wp.array2d[lanes], out_b: wp.array2d[lanes],
-        out_z: wp.array2d[lanes], out_instance: wp.array2d[lanes], best: wp.array2d[lanes], last: wp.array2d[int],
+        out_z: wp.array2d[lanes], out_w: wp.array2d[lanes], out_instance: wp.array2d[lanes], best: wp.array2d[lanes], last: wp.array2d[int],
         first: int,
     ):  # fmt: skip
         tile = first + wp.tid()
@@ -115,6 +115,7 @@ def composite(depth: bool, instance: bool, squarings: int):
             last[row0 + r, tx] = start
             if wp.static(depth):
                 out_z[row0 + r, tx] = lanes(0.0)
+                out_w[row0 + r, tx] = lanes(0.0)
             if wp.static(instance):
                 out_instance[row0 + r, tx] = lanes(-1.0)
                 best[row0 + r, tx] = lanes(0.0)
@@ -153,6 +154,7 @@ def composite(depth: bool, instance: bool, squarings: int):
                     out_b[row0 + r, tx] = out_b[row0 + r, tx] + w * blue
                     if wp.static(depth):
                         out_z[row0 + r, tx] = out_z[row0 + r, tx] + w * records[i, Z]
+                        out_w[row0 + r, tx] = out_w[row0 + r, tx] + w
                     if wp.static(instance):
                         more = step(w - best[row0 + r, tx])
                         was = out_instance[row0 + r, tx]
@@ -173,7 +175,7 @@ def composite_gradient(depth: bool, squarings: int):
     def composite_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
         tiles_x: int, alpha_max: float,
-        g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes],
+        g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes], g_w: wp.array2d[lanes],
         last: wp.array2d[int],
         t_run: wp.array2d[lanes], rest_run: wp.array2d[lanes], slots: wp.array2d[float],
         first: int,
@@ -241,7 +243,7 @@ def composite_gradient(depth: bool, squarings: int):
                     d = gr * red + gg * green + gb * blue
                     if wp.static(depth):
                         gz = g_z[row0 + r, tx]
-                        d = d + gz * records[i, Z]
+                        d = d + gz * records[i, Z] + g_w[row0 + r, tx]
                         sum_z = sum_z + wp.cw_mul(w, gz)
                     rest = rest_run[row0 + r, tx]
                     de = wp.cw_mul(wp.cw_mul(wp.cw_mul(t, d) - wp.cw_mul(rest, inverse), free), e)

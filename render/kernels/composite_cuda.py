@@ -46,7 +46,7 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
         tiles_x: int, alpha_max: float, termination: float,
         out_t: wp.array2d[float], out_r: wp.array2d[float], out_g: wp.array2d[float], out_b: wp.array2d[float],
-        out_z: wp.array2d[float], out_instance: wp.array2d[float], best: wp.array2d[float], last: wp.array2d[int],
+        out_z: wp.array2d[float], out_w: wp.array2d[float], out_instance: wp.array2d[float], best: wp.array2d[float], last: wp.array2d[int],
     ):  # fmt: skip
         tile, thread = wp.tid()
         px = (tile % tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
@@ -56,6 +56,7 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
         t = float(1.0)
         colour = wp.vec3(0.0)
         z = float(0.0)
+        weights = float(0.0)
         most = float(0.0)
         who = float(-1.0)
         stop = tile_starts[tile]
@@ -72,6 +73,7 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
                 colour += w * wp.vec3(records[i, RED], records[i, GREEN], records[i, BLUE])
                 if wp.static(depth):
                     z += w * records[i, Z]
+                    weights += w
                 if wp.static(instance):  # noqa: SIM102 - a static branch and a dynamic one
                     if w > most:
                         most = w
@@ -85,6 +87,7 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
         last[py, px] = stop
         if wp.static(depth):
             out_z[py, px] = z
+            out_w[py, px] = weights
         if wp.static(instance):
             out_instance[py, px] = who
             best[py, px] = most
@@ -101,7 +104,7 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
     def composite_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
         tiles_x: int, alpha_max: float,
-        g_r: wp.array2d[float], g_g: wp.array2d[float], g_b: wp.array2d[float], g_z: wp.array2d[float],
+        g_r: wp.array2d[float], g_g: wp.array2d[float], g_b: wp.array2d[float], g_z: wp.array2d[float], g_w: wp.array2d[float],
         last: wp.array2d[int],
         t_run: wp.array2d[float], rest_run: wp.array2d[float], slots: wp.array2d[float],
     ):  # fmt: skip
@@ -117,8 +120,10 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
         stop = last[py, px]
         g = wp.vec3(g_r[py, px], g_g[py, px], g_b[py, px])
         gz = float(0.0)
+        gw = float(0.0)
         if wp.static(depth):
             gz = g_z[py, px]
+            gw = g_w[py, px]
         for back in range(count):
             n = start + count - 1 - back
             i = ids[n]
@@ -140,7 +145,7 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
                 w = t * a
                 d = wp.dot(g, wp.vec3(records[i, RED], records[i, GREEN], records[i, BLUE]))
                 if wp.static(depth):
-                    d += gz * records[i, Z]
+                    d += gz * records[i, Z] + gw
                 if opacity * e < alpha_max:
                     de = (t * d - rest * inverse) * e
                 rest += w * d
