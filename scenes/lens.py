@@ -18,8 +18,9 @@ class Pinhole:
 
     def __post_init__(self):
         for name in ("fx", "fy"):
-            if not float(getattr(self, name)) > 0:
-                raise ValueError(f"{name} must be a positive number of pixels, got {float(getattr(self, name))}")
+            value = float(torch.as_tensor(getattr(self, name)).detach())
+            if not value > 0:
+                raise ValueError(f"{name} must be a positive number of pixels, got {value}")
 
     def params(self) -> torch.Tensor:
         """float64 `[4]`: fx, fy, cx, cy; differentiable where the fields are tensors."""

@@ -1,0 +1,59 @@
+import errno
+
+import pytest
+
+from scenes.atomic import atomic_file, atomic_folder
+
+
+def listing(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_a_file_appears_whole_with_its_suffix_and_usual_rights(tmp_path):
+    target, plain = tmp_path / "a.ply", tmp_path / "plain"
+    plain.write_text("x")
+    with atomic_file(target) as partial:
+        assert partial.suffix == ".ply" and partial.parent == tmp_path
+        partial.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole" and target.stat().st_mode == plain.stat().st_mode
+    assert listing(tmp_path) == ["a.ply", "plain"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device"), ValueError("bad")])
+def test_a_broken_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with pytest.raises(type(error)), atomic_file(target) as partial:
+        partial.write_text("half")
+        raise error
+    assert target.read_text() == "old" and listing(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+def test_a_broken_folder_leaves_the_old_one_and_nothing_else(tmp_path, error):
+    target = tmp_path / "s1"
+    with atomic_folder(target) as partial:
+        (partial / "old").write_text("old")
+    with pytest.raises(type(error)), atomic_folder(target, replace=True) as partial:
+        (partial / "new").write_text("half")
+        raise error
+    assert listing(tmp_path) == ["s1"] and listing(target) == ["old"]
+
+
+def test_a_folder_is_replaced_only_when_asked_to(tmp_path):
+    target = tmp_path / "s1"
+    with atomic_folder(target) as partial:
+        (partial / "old").write_text("old")
+    with pytest.raises(FileExistsError, match="s1 exists"), atomic_folder(target) as partial:
+        pass
+    with atomic_folder(target, replace=True) as partial:
+        (partial / "new").write_text("new")
+    assert listing(tmp_path) == ["s1"] and listing(target) == ["new"]
+
+
+def test_writing_into_a_missing_folder_names_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"), atomic_file(tmp_path / "nowhere" / "a.ply"):
+        pass
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"), atomic_folder(tmp_path / "nowhere" / "s1"):
+        pass
