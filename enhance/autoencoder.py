@@ -14,6 +14,12 @@ LATENT = 16
 STRIDE = 8
 
 
+def zero(layer: nn.Conv2d) -> None:
+    """Weights and bias 0: the layer starts without effect."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+
+
 class Residual(nn.Module):
     """x + conv(silu(conv(silu(x)))): two 3 x 3 convolutions, the second zero at first, so a new block is the identity."""
 
@@ -21,8 +27,7 @@ class Residual(nn.Module):
         super().__init__()
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)
+        zero(self.second)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x + self.second(F.silu(self.first(F.silu(x))))

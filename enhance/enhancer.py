@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from enhance.autoencoder import STRIDE
 from enhance.net import MULTIPLE, Net
-from enhance.precision import autocast
+from enhance.precision import autocast, channels_last
 from enhance.warp import carry
 from enhance.weights_file import BUILTIN, load_net
 from render.frame_types import Frame
@@ -42,7 +42,7 @@ class Enhancer:
 
     def __init__(self, net: Net, about: dict | None = None, device: str | torch.device = "cpu"):
         self.device = torch.device(device)
-        self.net = net.eval().requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+        self.net = channels_last(net.eval().requires_grad_(False).to(self.device))
         self.about = about or {}
 
     @classmethod
@@ -77,7 +77,7 @@ class Enhancer:
         better = out.rgb[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
         return better, Memory(newest, seen, (height, width), flow is not None)
 
-    def _history(self, memory: Memory | None, flow: torch.Tensor | None, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    def _history(self, memory: Memory | None, flow: torch.Tensor | None, size: torch.Size) -> tuple[torch.Tensor, torch.Tensor]:
         if memory is None:
             h, w = size[0] // STRIDE, size[1] // STRIDE
             empty = torch.zeros(1, 0, self.net.embed.in_channels, h, w, device=self.device)

@@ -81,13 +81,16 @@ class Vgg(nn.Module):
 
     WIDTHS = ((3, 64, 64), (64, 128, 128), (128, 256, 256, 256), (256, 512, 512, 512))
 
+    mean: torch.Tensor
+    std: torch.Tensor
+
     def __init__(self, path: str | Path):
         super().__init__()
         state = _read_state(Path(path))
         self.stages = nn.ModuleList()
         index = 0
         for widths in self.WIDTHS:
-            stage = nn.ModuleList()
+            stage = nn.Sequential()
             for a, b in zip(widths, widths[1:], strict=False):
                 conv = nn.Conv2d(a, b, 3, padding=1)
                 for name in ("weight", "bias"):
@@ -95,7 +98,7 @@ class Vgg(nn.Module):
                     if key not in state or state[key].shape != getattr(conv, name).shape:
                         raise ValueError(f"{path} is not torchvision's vgg16: {key} is missing or has another shape")
                     getattr(conv, name).data.copy_(state[key])
-                stage.append(conv)
+                stage.extend([conv, nn.ReLU()])
                 index += 2
             self.stages.append(stage)
             index += 1
@@ -106,8 +109,7 @@ class Vgg(nn.Module):
         x, found = (rgb - self.mean) / self.std, []
         for i, stage in enumerate(self.stages):
             x = F.max_pool2d(x, 2) if i else x
-            for conv in stage:
-                x = F.relu(conv(x))
+            x = stage(x)
             found.append(x)
         return found
 

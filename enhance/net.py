@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual
+from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
@@ -166,9 +166,8 @@ class FrameDecoder(nn.Module):
         self.up_half = nn.Conv2d(c.quarter, 4 * c.half, 1)
         self.fine = Residual(c.half)
         self.pixels = nn.Conv2d(c.half, 16, 3, padding=1)
-        for zero in (self.colour, self.pixels):
-            nn.init.zeros_(zero.weight)
-            nn.init.zeros_(zero.bias)
+        zero(self.colour)
+        zero(self.pixels)
 
     def forward(self, tokens, latent, half, quarter, eighth) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Colour coefficients `[B, 12, H/8, W/8]`, residual `[B, 3, H, W]`, gate logits `[B, 1, H, W]`."""
@@ -220,8 +219,7 @@ class Net(nn.Module):
         self.norm = nn.LayerNorm(config.width)
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
-        nn.init.zeros_(self.denoise.weight)
-        nn.init.zeros_(self.denoise.bias)
+        zero(self.denoise)
 
     def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None, latents: torch.Tensor, valid: torch.Tensor) -> Enhanced:
         """One frame.

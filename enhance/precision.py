@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import torch
+
+M = TypeVar("M", bound=torch.nn.Module)
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -15,3 +19,11 @@ def has_bfloat16(device: torch.device) -> bool:
 def autocast(device: torch.device):
     """Convolutions and matrix products in bfloat16 where that is fast."""
     return torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device))
+
+
+def channels_last(module: M) -> M:
+    """The module with its convolutions' weights in the order that CPUs and tensor cores work in."""
+    for parameter in module.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return module

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from enhance.autoencoder import STRIDE, Autoencoder
 from enhance.losses import PatchPerceptual, pixel_loss, temporal_loss
 from enhance.net import Net, NetConfig
-from enhance.precision import autocast
+from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shards import PairSet
 from enhance.warp import carry
@@ -61,8 +61,8 @@ class _Run:
     def __init__(self, config: TrainConfig, net: NetConfig, minutes: float | None, steps: int | None, seed: int):
         torch.manual_seed(seed)
         self.config, self.minutes, self.steps, self.seed = config, minutes, steps, seed
-        self.autoencoder = Autoencoder().to(memory_format=torch.channels_last)
-        self.net = Net(net).to(memory_format=torch.channels_last)
+        self.autoencoder = channels_last(Autoencoder())
+        self.net = channels_last(Net(net))
         self.average = Net(net)
         self.step = {"autoencoder": 0, "enhancer": 0}
         self.seconds = {"autoencoder": 0.0, "enhancer": 0.0}
@@ -100,7 +100,7 @@ class _Run:
         share = self.config.autoencoder if stage == "autoencoder" else 1 - self.config.autoencoder
         if self.steps is not None:
             return min(1.0, self.step[stage] / max(share * self.steps, 1))
-        return min(1.0, self.seconds[stage] / 60 / max(share * self.minutes, 1e-9))
+        return min(1.0, self.seconds[stage] / 60 / max(share * (self.minutes or 0), 1e-9))
 
 
 def train(
@@ -262,7 +262,8 @@ class _Reporter:
     """Tells `progress` the smoothed loss, a few times a minute."""
 
     def __init__(self, run: _Run, progress: Callable[[float, str], None] | None):
-        self.run, self.progress, self.loss, self.told = run, progress, {}, 0.0
+        self.run, self.progress, self.told = run, progress, 0.0
+        self.loss: dict[str, float] = {}
 
     def __call__(self, stage: str, loss: float) -> None:
         self.loss[stage] = 0.98 * self.loss.get(stage, loss) + 0.02 * loss
