@@ -5,6 +5,9 @@ Names are loaded when first used, so that `import enhance` costs nothing.
 """
 
 import importlib
+import sys
+import types
+from typing import TYPE_CHECKING
 
 _HOME = {
     "Enhancer": "enhancer",
@@ -21,8 +24,30 @@ _HOME = {
 
 __all__ = sorted(_HOME)
 
+if TYPE_CHECKING:
+    from enhance.clip import enhance_video as enhance_video
+    from enhance.enhancer import Enhancer as Enhancer
+    from enhance.enhancer import Memory as Memory
+    from enhance.evaluate import evaluate as evaluate
+    from enhance.isp import Isp as Isp
+    from enhance.isp import random_isp as random_isp
+    from enhance.pairs import make_pairs as make_pairs
+    from enhance.shards import PairSet as PairSet
+    from enhance.train import TrainConfig as TrainConfig
+    from enhance.train import train as train
+
 
 def __getattr__(name: str):
     if name not in _HOME:
         raise AttributeError(f"module 'enhance' has no attribute {name!r}")
     return getattr(importlib.import_module(f"enhance.{_HOME[name]}"), name)
+
+
+class _Package(types.ModuleType):
+    def __setattr__(self, name, value):
+        # importing enhance/train.py would bind the module to the name that belongs to the call
+        if not (name in _HOME and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

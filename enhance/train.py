@@ -89,7 +89,7 @@ class _Run:
             for name, part in self.parts().items():
                 part.load_state_dict(state[name])
             self.step, self.seconds = state["step"], state["seconds"]
-        except (KeyError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
+        except (LookupError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
             why = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
         if state["seed"] != self.seed:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+
 from enhance.isp import Isp, alter, random_isp
 from enhance.masks import random_mask
 

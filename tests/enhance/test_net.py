@@ -2,25 +2,16 @@
 
 import pytest
 import torch
-from enhance.autoencoder import Autoencoder
-from enhance.net import Net, NetConfig, colour_change, hard_gate
+from small_net import SMALL, stirred
 
-SMALL = NetConfig(width=24, blocks=2, heads=3, half=8, quarter=8, eighth=16)
+from enhance.autoencoder import Autoencoder
+from enhance.net import Net, colour_change, hard_gate
 
 
 def inputs(b=1, k=2, h=32, w=48, seed=0):
     g = torch.Generator().manual_seed(seed)
     rgb = torch.rand(b, 3, h, w, generator=g)
     return rgb, torch.randn(b, k, 16, h // 8, w // 8, generator=g), torch.ones(b, k, 1, h // 8, w // 8)
-
-
-def stirred(seed=0):
-    """A network whose last layers do something, as after training."""
-    torch.manual_seed(seed)
-    net = Net(SMALL).eval()
-    for layer in (net.decoder.colour, net.decoder.pixels, net.denoise):
-        torch.nn.init.normal_(layer.weight, std=0.05)
-    return net
 
 
 @pytest.mark.parametrize("k", [0, 1, 4])

@@ -1,6 +1,7 @@
 """Moving images by flow."""
 
 import torch
+
 from enhance.warp import carry, shrink_flow, visible, warp
 
 

@@ -1,0 +1,49 @@
+"""Whole videos."""
+
+import pytest
+import torch
+from small_net import SMALL
+
+from enhance.clip import enhance_video
+from enhance.enhancer import Enhancer
+from enhance.net import Net
+from render.video import VideoWriter, read_video
+
+
+@pytest.fixture(scope="module")
+def enhancer():
+    return Enhancer(Net(SMALL))
+
+
+def write(path, count=4, width=50, height=34):
+    with VideoWriter(path, 10, width, height) as video:
+        for i in range(count):
+            video.write(torch.full((height, width, 3), 0.2 + 0.1 * i))
+
+
+def test_every_frame_is_enhanced_and_said(tmp_path, enhancer):
+    write(tmp_path / "in.mp4")
+    told = []
+    assert enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer, lambda done, of: told.append((done, of))) == 4
+    out = list(read_video(tmp_path / "out.mp4"))
+    assert [round(float(f.mean()), 1) for f in out] == [0.2, 0.3, 0.4, 0.5] and out[0].shape == (34, 50, 3)
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)] and read_video(tmp_path / "out.mp4").fps == 10
+
+
+def test_odd_sizes_gain_the_row_and_column_that_h264_needs(tmp_path, enhancer):
+    write(tmp_path / "in.mkv", 2, 33, 19)
+    enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", enhancer)
+    assert next(iter(read_video(tmp_path / "out.mp4"))).shape == (20, 34, 3)
+
+
+def test_an_undecodable_clip_is_refused_and_leaves_nothing(tmp_path, enhancer):
+    (tmp_path / "in.mp4").write_bytes(b"no video at all" * 50)
+    with pytest.raises(ValueError, match="in.mp4"):
+        enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.mp4"]
+
+
+def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
+    write(tmp_path / "in.mp4")
+    with pytest.raises(ValueError, match="itself"):
+        enhance_video(tmp_path / "in.mp4", tmp_path / "in.mp4", enhancer)

@@ -1,0 +1,158 @@
+"""The enhancer as it is called."""
+
+import pytest
+import torch
+from small_net import SMALL, stirred
+
+from enhance.enhancer import Enhancer, Memory
+from enhance.net import Net
+from enhance.weights_file import BUILTIN, load_net, save_net
+from render.frame_types import Frame
+from scenes.camera import Camera
+from scenes.lens import Pinhole
+
+
+@pytest.fixture(scope="module")
+def enhancer():
+    return Enhancer(stirred())
+
+
+def frame(rgb, **more):
+    h, w = rgb.shape[:2]
+    return Frame(Camera(Pinhole(50.0, 50.0, w / 2, h / 2), w, h, torch.eye(4, dtype=torch.float64)), rgb=rgb, **more)
+
+
+def picture(h=32, w=48, seed=0):
+    return torch.rand(h, w, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (16, 16), (17, 33), (37, 90)])
+def test_any_size_comes_back_and_untrained_weights_are_the_identity(size):
+    rgb = picture(*size)
+    better, memory = Enhancer(Net(SMALL)).step(rgb)
+    assert torch.equal(better, rgb) and memory.size == size
+    again, memory = Enhancer(Net(SMALL)).step(rgb, memory)
+    assert torch.equal(again, rgb) and len(memory.latents) == 2
+
+
+def test_memory_grows_to_four_and_no_further(enhancer):
+    memory = None
+    for i in range(6):
+        _, memory = enhancer.step(picture(seed=i), memory)
+        assert len(memory.latents) == min(i + 1, 4)
+
+
+def test_state_is_passed_and_not_hidden(enhancer):
+    _, memory = enhancer.step(picture(seed=1))
+    kept = memory.latents.clone()
+    first, _ = enhancer.step(picture(seed=2), memory)
+    enhancer.step(picture(seed=3))
+    second, _ = enhancer.step(picture(seed=2), memory)
+    alone, _ = enhancer.step(picture(seed=2))
+    assert torch.equal(first, second) and torch.equal(memory.latents, kept) and not torch.equal(first, alone)
+
+
+def test_a_change_of_size_forgets(enhancer):
+    _, memory = enhancer.step(picture())
+    after, memory = enhancer.step(picture(40, 64), memory)
+    assert torch.equal(after, enhancer.step(picture(40, 64))[0]) and len(memory.latents) == 1
+
+
+def test_a_frame_that_lost_its_flow_forgets(enhancer):
+    _, memory = enhancer.step(frame(picture(), flow_prev=torch.zeros(32, 48, 2)))
+    assert memory.flow
+    after, memory = enhancer.step(frame(picture(seed=1)), memory)
+    assert torch.equal(after, enhancer.step(picture(seed=1))[0]) and len(memory.latents) == 1
+
+
+def test_zero_flow_equals_an_unmoved_memory(enhancer):
+    _, memory = enhancer.step(picture())
+    still, _ = enhancer.step(picture(seed=1), memory)
+    moved, _ = enhancer.step(frame(picture(seed=1), flow_prev=torch.zeros(32, 48, 2)), memory)
+    assert torch.allclose(still, moved, atol=2e-3)
+
+
+def test_flow_that_leaves_the_image_equals_no_memory(enhancer):
+    _, memory = enhancer.step(picture())
+    away, _ = enhancer.step(frame(picture(seed=1), flow_prev=torch.full((32, 48, 2), 500.0)), memory)
+    assert torch.allclose(away, enhancer.step(picture(seed=1))[0], atol=2e-3)
+
+
+def test_instances_tell_where_objects_are(enhancer):
+    instance = torch.zeros(32, 48, dtype=torch.int32)
+    none = enhancer.step(frame(picture(), instance=instance))[0]
+    instance[8:20, 8:30] = 3
+    assert not torch.equal(none, enhancer.step(frame(picture(), instance=instance))[0])
+
+
+def test_values_outside_the_display_are_clamped():
+    better, _ = Enhancer(Net(SMALL)).step(picture() * 3 - 1)
+    assert better.min() >= 0 and better.max() <= 1
+
+
+def test_a_value_that_is_not_finite_is_refused_by_place(enhancer):
+    rgb = picture()
+    rgb[4, 7, 1] = torch.nan
+    with pytest.raises(ValueError, match="row 4, column 7"):
+        enhancer.step(rgb)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [(torch.zeros(32, 48), "shape"), (torch.zeros(32, 48, 3, dtype=torch.uint8), "255"), (torch.zeros(0, 48, 3), "pixels")],
+)
+def test_what_is_no_picture_is_refused(enhancer, wrong, says):
+    with pytest.raises(ValueError, match=says):
+        enhancer.step(wrong)
+
+
+def test_flow_of_another_size_is_refused(enhancer):
+    with pytest.raises(ValueError, match="flow_prev"):
+        enhancer.step(frame(picture(), flow_prev=torch.zeros(3, 4, 2)))
+
+
+def test_a_memory_that_does_not_fit_together_is_refused():
+    with pytest.raises(ValueError, match="valid"):
+        Memory(torch.zeros(2, 16, 4, 4), torch.zeros(1, 1, 4, 4), (32, 32), False)
+
+
+def test_weights_survive_the_file(tmp_path):
+    net = stirred()
+    save_net(net, tmp_path / "w.safetensors", {"data": "none"})
+    again, about = load_net(tmp_path / "w.safetensors")
+    assert about == {"data": "none"} and again.config == SMALL
+    for name, value in net.state_dict().items():
+        assert torch.allclose(again.state_dict()[name], value, atol=1e-3), name
+
+
+def test_broken_weights_say_what_is_wrong(tmp_path):
+    file = tmp_path / "w.safetensors"
+    save_net(stirred(), file, {})
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="not a whole safetensors file"):
+        load_net(file)
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.zeros(1)}, file)
+    with pytest.raises(ValueError, match="not a Sidestep enhancer"):
+        load_net(file)
+    with pytest.raises(FileNotFoundError, match="builtin"):
+        load_net(tmp_path / "none.safetensors")
+
+
+def test_weights_with_a_value_that_is_not_finite_are_refused(tmp_path):
+    net = stirred()
+    with torch.no_grad():
+        net.age[0, 0] = torch.nan
+    save_net(net, tmp_path / "w.safetensors", {})
+    with pytest.raises(ValueError, match="age"):
+        load_net(tmp_path / "w.safetensors")
+
+
+def test_the_shipped_weights_fit_and_leave_a_grey_frame_grey():
+    assert BUILTIN.stat().st_size <= 10_000_000
+    enhancer = Enhancer.load("builtin")
+    assert "attribution" in enhancer.about
+    grey = torch.full((64, 96, 3), 0.5)
+    assert (enhancer.step(grey)[0] - grey).abs().max() < 0.1

@@ -1,0 +1,88 @@
+"""Training: repeatable, resumable, and downhill."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from small_net import SMALL
+
+from enhance.enhancer import Enhancer
+from enhance.evaluate import evaluate, table
+from enhance.shards import PairSet, to_bytes, write_shard
+from enhance.train import TrainConfig, train
+from enhance.weights_file import load_net
+
+QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pairs")
+    y, x = torch.meshgrid(torch.linspace(0, 6, 40), torch.linspace(0, 9, 56), indexing="ij")
+    for kind in ("underfit", "isp", "clean"):
+        target = torch.stack([torch.stack([x.sin(), (x + t).cos(), y.sin()], -1) * 0.4 + 0.5 for t in (0, 0.1, 0.2)])
+        region = torch.zeros(3, 40, 56)
+        region[:, 10:30, 10:40] = float(kind != "clean")
+        damage = {"underfit": 0.15, "isp": 0.2 * region[..., None], "clean": 0.0}[kind]
+        flow = torch.zeros(3, 40, 56, 2, dtype=torch.float16)
+        flow[0] = torch.nan
+        tensors = {
+            "input": to_bytes(target + damage),
+            "target": to_bytes(target),
+            "region": to_bytes(region),
+            "instance": region.to(torch.uint8),
+            "flow": flow,
+            "visible": torch.ones(3, 40, 56, dtype=torch.uint8),
+        }
+        for i, split in enumerate(("train", "held out")):
+            write_shard(folder / kind / f"{i}.safetensors", tensors, {"kind": kind, "split": split})
+    return PairSet(folder)
+
+
+def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch):
+    torch.set_num_threads(1)
+    whole = train(pairs, tmp_path / "whole", steps=12, seed=3, config=QUICK, net=SMALL)
+
+    module, steps = sys.modules["enhance.train"], []
+    step = module._enhancer_step
+
+    def stop(*arguments):
+        if len(steps) == 5:
+            raise KeyboardInterrupt
+        steps.append(1)
+        return step(*arguments)
+
+    monkeypatch.setattr(module, "_enhancer_step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(pairs, tmp_path / "halves", steps=12, seed=3, config=QUICK, net=SMALL)
+    monkeypatch.undo()
+    halves = train(pairs, tmp_path / "halves", steps=12, seed=3, config=QUICK, net=SMALL, resume=True)
+    first, second = load_net(whole)[0].state_dict(), load_net(halves)[0].state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_an_unfinished_training_is_not_overwritten(pairs, tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"something")
+    with pytest.raises(FileExistsError, match="--resume"):
+        train(pairs, tmp_path, steps=4, config=QUICK, net=SMALL)
+    with pytest.raises(ValueError, match="not a checkpoint"):
+        train(pairs, tmp_path, steps=4, config=QUICK, net=SMALL, resume=True)
+
+
+@pytest.mark.parametrize("budget", [{}, {"steps": 3, "minutes": 1}, {"steps": 0}, {"minutes": -1}])
+def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
+    with pytest.raises(ValueError, match="budget"):
+        train(pairs, tmp_path, **budget)
+
+
+def test_training_undoes_a_constant_error(pairs, tmp_path):
+    config = replace(QUICK, autoencoder=0.1, images=4)
+    weights = train(pairs, tmp_path, steps=120, config=config, net=SMALL)
+    rows = evaluate(pairs, Enhancer.load(weights))
+    assert [r.method for r in rows] == ["identity", "ours", "ours + instances"] * 3
+    by = {(r.kind, r.method): r for r in rows}
+    assert by["underfit", "ours"].region > by["underfit", "identity"].region + 0.5
+    assert by["clean", "identity"].frame == float("inf") and by["isp", "identity"].warp_error > 0
+    text = table(rows)
+    assert text.count("\n") == 10 and "| clean | identity | - | equal |" in text
