@@ -1,13 +1,20 @@
 """Names that do not exist: the sentence that says so, and the nearest one that does. Pure Python."""
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
 def nearest(name: str, options: Iterable[str]) -> str:
     """' Did you mean x?' for the option closest in spelling to `name`, or ''."""
-    close = difflib.get_close_matches(name, list(options), n=1, cutoff=0.4)
-    return f" Did you mean {close[0]}?" if close else ""
+    best = max(options, key=lambda option: _likeness(name, option), default="")
+    return f" Did you mean {best}?" if _likeness(name, best) >= 0.5 else ""
+
+
+def _likeness(name: str, option: str) -> float:
+    """0 to 1: how like an option, or one of its words, a name is; so that "frnt" is nearer to front_camera than to left."""
+    parts = [option, *re.split(r"[\W_]+", option)]
+    return max(difflib.SequenceMatcher(None, name.casefold(), part.casefold()).ratio() for part in parts)
 
 
 def unknown(kind: str, name: str, where: str, options: Iterable[str]) -> str:

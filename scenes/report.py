@@ -86,8 +86,7 @@ def _about_scene(scene: Scene) -> dict:
     cameras = [
         {
             "name": name,
-            "width": c.width,
-            "height": c.height,
+            "pixels": f"{c.width}x{c.height}",
             "lens": _lens(c.lens),
             "frames": len(c.times_us),
             "seconds": [_seconds(t, times[0]) for t in (c.times_us[[0, -1]] if len(c.times_us) else [])],
@@ -162,12 +161,10 @@ def _cell(key: str, value) -> str:
         return "x".join(f"{v:.2f}" for v in value) + " m"
     if key == "seconds":
         return f"{value[0]:g} to {value[1]:g} s"
-    if key in ("name", "track", "id", "label", "lens", "licence"):
+    if key in ("name", "track", "id", "label", "pixels", "lens", "licence"):
         return str(value)
     if value is True:
         return key
-    if key == "height":
-        return f"x{value}"
     return f"{value} {key}" if key in ("splats", "views", "frames", "poses") else f"{key} {value}"
 
 

@@ -1,5 +1,7 @@
 """Random splats, poses and scenes for tests of files: every field used, nothing round."""
 
+import math
+
 import torch
 
 from scenes import Actor, Asset, Gaussians, Ground, Pinhole, Placed, RigCamera, Scene, Sky, SplatModel, Trajectory
@@ -22,7 +24,8 @@ def gaussians(count=20, coefficients=4, seed=0):
     def normal(*shape):
         return torch.randn(*shape, generator=dice)
 
-    return Gaussians(10 * normal(count, 3), 3 * normal(count, 4), 2 * normal(count, 3) - 3, 8 * normal(count), normal(count, coefficients, 3))
+    means, quats, log_scales, logits = 10 * normal(count, 3), 3 * normal(count, 4), 2 * normal(count, 3) - 3, 8 * normal(count)
+    return Gaussians(means, quats, log_scales, logits, normal(count, coefficients, 3))
 
 
 def trajectory(count=12, seed=0):
@@ -30,7 +33,7 @@ def trajectory(count=12, seed=0):
 
 
 def asset(seed=0, label="Car", count=6):
-    meta = {"licence": "CC BY 4.0", "attribution": "PandaSet", "source": "drive 002", "views": 7, "pi": 3.141592653589793, "text": 'a "b" ü'}
+    meta = {"licence": "CC BY 4.0", "attribution": "PandaSet", "source": "drive 002", "views": 7, "pi": math.pi, "text": 'a "b" ü'}
     return Asset(gaussians(count, seed=seed), [4.1, 1.7999999999, 1.5], label, SplatModel(antialias=True), meta)
 
 

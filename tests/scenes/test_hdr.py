@@ -25,7 +25,7 @@ def test_a_pixel_returns_within_a_256th_of_its_largest_channel(tmp_path, size):
     assert torch.equal(load_hdr(tmp_path / "b.hdr"), after)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.sampled_from([0.0, 0.5, 0.75, 1.0, 3.0]), min_size=8, max_size=700))
 def test_runs_of_any_length_return(tmp_path_factory, row):
     path = tmp_path_factory.getbasetemp() / "runs.hdr"

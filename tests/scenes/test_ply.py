@@ -13,10 +13,12 @@ DEGREE_1 = (
     + [f"f_rest_{i}" for i in range(9)]
     + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 )
+FORMATS = ["binary_little_endian", "binary_big_endian", "ascii"]
 
 
 def same_bits(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in zip(a.tensors().values(), b.tensors().values(), strict=True))
+    pairs = zip(a.tensors().values(), b.tensors().values(), strict=True)
+    return all(torch.equal(x.view(torch.int32), y.view(torch.int32)) for x, y in pairs)
 
 
 def write(path, names, rows, kind="float", order="<", fmt="binary_little_endian", count=None, before="", tail=b""):
@@ -24,7 +26,8 @@ def write(path, names, rows, kind="float", order="<", fmt="binary_little_endian"
     code = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}[kind]
     header = f"ply\nformat {fmt} 1.0\ncomment made by hand\n{before}element vertex {len(rows) if count is None else count}\n"
     header += "".join(f"property {kind} {n}\n" for n in names) + "end_header\n"
-    body = "\n".join(" ".join(repr(float(v)) for v in row) for row in rows).encode() if fmt == "ascii" else rows.astype(order + code).tobytes()
+    text = "\n".join(" ".join(repr(float(v)) for v in row) for row in rows)
+    body = text.encode() if fmt == "ascii" else rows.astype(order + code).tobytes()
     path.write_bytes(header.encode() + body + tail)
 
 
@@ -56,12 +59,13 @@ def test_negative_zeros_and_denormals_survive(tmp_path):
 def test_the_bytes_are_those_of_the_reference_code(tmp_path):
     g = gaussians(5, 4)
     save_ply(tmp_path / "a.ply", g)
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 5\n" + "".join(f"property float {n}\n" for n in DEGREE_1) + "end_header\n"
+    properties = "".join(f"property float {n}\n" for n in DEGREE_1)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex 5\n{properties}end_header\n"
     assert (tmp_path / "a.ply").read_bytes() == header.encode() + values(g, DEGREE_1).astype("<f4").tobytes()
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.permutations(DEGREE_1), st.sampled_from(["float", "double"]), st.sampled_from(["binary_little_endian", "binary_big_endian", "ascii"]))
+@settings(max_examples=30)
+@given(st.permutations(DEGREE_1), st.sampled_from(["float", "double"]), st.sampled_from(FORMATS))
 def test_any_order_type_and_format_reads_the_same(tmp_path_factory, names, kind, fmt):
     path, g = tmp_path_factory.mktemp("ply") / "a.ply", gaussians(4)
     names = [*names[:5], "confidence", *names[5:], "segment"]
@@ -95,7 +99,7 @@ def test_every_truncation_is_refused(tmp_path, fmt):
             load_ply(path)
 
 
-@pytest.mark.parametrize("fmt", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("fmt", FORMATS)
 def test_a_giant_claimed_count_allocates_nothing(tmp_path, fmt):
     path = tmp_path / "a.ply"
     for count in (2**31, 2**62, 10**30):
@@ -176,7 +180,7 @@ def test_saving_refuses_what_loading_would_refuse(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.binary(max_size=300), st.integers(0, 700), st.booleans())
 def test_damaged_files_never_do_worse_than_a_value_error(tmp_path_factory, noise, where, keep_length):
     path = tmp_path_factory.getbasetemp() / "damaged.ply"

@@ -10,7 +10,6 @@ from pxr import Gf, Usd, UsdGeom
 from randomized import START_US, asset, scene, trajectory
 
 from scenes import Actor, Gaussians, Scene, Sky, Trajectory, add_edit, load, load_dropping, save
-from scenes.poses import inverse
 from scenes.usd import usd_problems
 
 

@@ -1,0 +1,104 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from street import START_US, STEP_US, car
+
+from scenes import Ground, Trajectory
+from scenes.insert import insert, standing_pose
+from scenes.placement import Placement
+from scenes.poses import translation, yaw, yaw_of
+
+
+def ramp(rise=0.1, bank=0.0):
+    """A ground that rises along x and along y."""
+    y, x = torch.meshgrid(torch.arange(-20.0, 20.0), torch.arange(-10.0, 50.0), indexing="ij")
+    return Ground(rise * x + bank * y, (-10.0, -20.0), 1.0)
+
+
+def test_a_parked_asset_stands_where_it_was_put(street):
+    result = insert(street, car(), Placement("car/0001", 12, 3.5, math.radians(5)))
+    assert result.warnings == ()
+    assert result.scene.actors == (*street.actors, result.actor)
+    assert result.actor.track == "inserted_car_0001"
+    pose = result.actor.trajectory.at(START_US + 123)
+    assert pose[:3, 3].tolist() == pytest.approx([12, 3.5, 0])
+    assert float(yaw_of(pose)) == pytest.approx(math.radians(5))
+
+
+def test_places_are_relative_to_the_body_at_the_first_frame(street):
+    turned = Trajectory(street.ego.times_us, translation(5, 1, 2) @ yaw(math.pi / 2) @ street.ego.world_from_body)
+    later = insert(replace(street, ego=turned), car(), Placement("car", 10, 2), start_us=START_US + 4 * STEP_US)
+    # the body has gone 2 m along world y to (5, 3), and faces along y: 10 m forward is +y, 2 m left is -x
+    assert later.actor.trajectory.at(START_US)[:3, 3].tolist() == pytest.approx([3, 13, 0])
+
+
+def test_a_moving_asset_goes_along_its_heading(street):
+    result = insert(street, car(), Placement("car", 10, 0, math.pi / 2, speed=8), start_us=START_US + STEP_US)
+    path = result.actor.trajectory
+    assert path.at(START_US + STEP_US)[:3, 3].tolist() == pytest.approx([10.5, 0, 0])
+    assert path.at(START_US + 6 * STEP_US)[:3, 3].tolist() == pytest.approx([10.5, 4, 0])
+    assert path.at(START_US)[:3, 3].tolist() == pytest.approx([10.5, -0.8, 0])  # it was on its way before the clip began
+
+
+def test_an_asset_tilts_with_the_ground(street):
+    hill = replace(street, ground=ramp(rise=0.1, bank=0.05))
+    for heading in (0.0, 1.0, math.pi):
+        pose = standing_pose(hill, torch.tensor([10.0, 2.0], dtype=torch.float64), heading, car().size)
+        normal = torch.tensor([-0.1, -0.05, 1.0], dtype=torch.float64)
+        assert torch.allclose(pose[:3, 2], normal / normal.norm(), atol=1e-6)
+        assert torch.allclose(pose[:3, :3] @ pose[:3, :3].T, torch.eye(3, dtype=torch.float64), atol=1e-12)
+        assert float(pose[2, 3]) == pytest.approx(0.1 * 10 + 0.05 * 2, abs=1e-6)
+        assert float(yaw_of(pose)) == pytest.approx(heading, abs=1e-6)
+
+
+def test_wheels_stay_on_the_ground_along_the_way(street):
+    hill = replace(street, ground=ramp(0.2))
+    path = insert(hill, car(), Placement("car", 5, 0, speed=10)).actor.trajectory
+    for t in range(START_US, START_US + 8 * STEP_US, 30_000):
+        x, _, z = path.at(t)[:3, 3].tolist()
+        assert z == pytest.approx(0.2 * x, abs=1e-3)
+
+
+def test_leaving_the_known_ground_is_said(street):
+    result = insert(street, car(), Placement("car", 60, 0))
+    (warning,) = result.warnings
+    assert "11.0 m beyond the known ground" in warning
+
+
+def test_without_a_ground_the_lowest_splats_carry_it_and_that_is_said(street):
+    result = insert(replace(street, ground=None), car(), Placement("car", 12, 0))
+    assert "no ground" in result.warnings[0]
+    assert abs(float(result.actor.trajectory.at(START_US)[2, 3])) < 0.1
+    with pytest.raises(ValueError, match="nearer"):
+        insert(replace(street, ground=None), car(), Placement("car", 1000, 0))
+
+
+def test_one_asset_can_be_inserted_many_times(street):
+    scene = street
+    for i in range(3):
+        scene = insert(scene, car(), Placement("car/0001", 10 + 6 * i, 3)).scene
+    assert [a.track for a in scene.actors[1:]] == ["inserted_car_0001", "inserted_car_0001_2", "inserted_car_0001_3"]
+
+
+def test_a_trajectory_file_is_followed(street, tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.3,13,0\n0.6,13,3\n")
+    result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"), start_us=START_US)
+    path = result.actor.trajectory
+    assert path.at(START_US + 150_000)[:2, 3].tolist() == pytest.approx([11.5, 0])
+    assert path.at(START_US + 450_000)[:2, 3].tolist() == pytest.approx([13, 1.5])
+    headings = [float(yaw_of(path.at(START_US + t))) for t in (0, 300_000, 600_000)]
+    assert headings == pytest.approx([0, math.pi / 4, math.pi / 2])
+    assert not path.covers(START_US + 800_000)
+
+
+def test_yaw_goes_the_shorter_way_round(street, tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,x_m,y_m,yaw_deg\n0,10,0,170\n0.4,10,1,-170\n")
+    path = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"), start_us=START_US).actor.trajectory
+    assert abs(float(yaw_of(path.at(START_US + 200_000)))) == pytest.approx(math.pi)
+
+
+def test_a_start_off_the_drive_is_refused(street):
+    with pytest.raises(ValueError, match="outside the trajectory"):
+        insert(street, car(), Placement("car", 10, 0), start_us=START_US + 10_000_000)
