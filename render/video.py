@@ -92,7 +92,6 @@ class Video:
         import av
         from av.error import FFmpegError
 
-        av.logging.set_level(av.logging.PANIC)  # a broken file is our error to report, once
         try:
             return av.open(str(self.path))
         except FFmpegError as error:

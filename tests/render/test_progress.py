@@ -1,0 +1,53 @@
+import io
+import time
+
+from render.progress import Progress, Stopwatch, progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_elsewhere_than_a_terminal_lines_are_plain():
+    out = io.StringIO()
+    with Progress("fit", 3, stream=out) as steps:
+        for _ in range(3):
+            steps.step(note="28.1 dB")
+    assert out.getvalue() == "fit 3/3  0 s  28.1 dB\n"
+
+
+def test_a_terminal_gets_a_bar_that_ends_in_a_new_line():
+    out = Terminal()
+    with Progress("fit", 2, stream=out) as steps:
+        steps.step(2)
+    assert "[########################] fit 2/2" in out.getvalue()
+    assert out.getvalue().endswith("\n")
+
+
+def test_unknown_totals_are_counted_without_a_bar():
+    out = Terminal()
+    with Progress("decode", stream=out) as steps:
+        steps.step(7)
+    assert "decode 7" in out.getvalue()
+    assert "[#" not in out.getvalue()
+
+
+def test_items_pass_through(capsys):
+    assert list(progress([3, 1, 2], "count")) == [3, 1, 2]
+    assert "count 3/3" in capsys.readouterr().err
+
+
+def test_inner_stages_are_not_counted_to_outer_ones():
+    watch = Stopwatch()
+
+    def inner():
+        for _ in range(2):
+            time.sleep(0.03)
+            yield 1
+
+    for _ in watch.during("outer", watch.during("inner", inner())):
+        pass
+    assert watch.seconds["inner"] >= 0.06
+    assert watch.seconds["outer"] < watch.seconds["inner"]
+    assert set(watch.milliseconds(2)) == {"outer", "inner"}

@@ -1,0 +1,104 @@
+import os
+
+import pytest
+import torch
+
+from render.compare import psnr
+from render.video import VideoWriter, read_image, read_video, write_image
+
+
+def smooth_image(height, width):
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    return torch.stack([x, y, 0.5 + 0.5 * torch.sin(3 * x + 2 * y)], -1)
+
+
+def test_a_png_comes_back_to_the_nearest_byte(tmp_path):
+    image = smooth_image(9, 7)
+    write_image(tmp_path / "a.png", image)
+    assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_values_outside_the_display_are_clamped(tmp_path):
+    write_image(tmp_path / "a.png", torch.tensor([[[-1.0, 0.5, 7.0]]]))
+    assert read_image(tmp_path / "a.png").flatten().tolist() == pytest.approx([0, 128 / 255, 1])
+
+
+def test_a_video_comes_back_alike(tmp_path):
+    image = smooth_image(48, 64)
+    with VideoWriter(tmp_path / "a.mp4", 12.5, 64, 48) as video:
+        for _ in range(4):
+            video.write(image)
+    back = read_video(tmp_path / "a.mp4")
+    assert (back.width, back.height, back.fps, back.count) == (64, 48, 12.5, 4)
+    frames = list(back)
+    assert len(frames) == 4
+    assert all(psnr(frame, image) > 32 for frame in frames)  # so small an image loses most to 4:2:0
+
+
+@pytest.mark.parametrize("colour", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.5, 0.5, 0.5), (0.2, 0.5, 0.8), (0.9, 0.1, 0.1)])
+def test_colours_survive_the_codec(tmp_path, colour):
+    with VideoWriter(tmp_path / "a.mp4", 10, 32, 32) as video:
+        video.write(torch.tensor(colour).expand(32, 32, 3))
+    (frame,) = read_video(tmp_path / "a.mp4")
+    assert frame[16, 16].tolist() == pytest.approx(colour, abs=2 / 255)
+
+
+def test_odd_sizes_gain_a_row_and_a_column(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", 10, 33, 31) as video:
+        video.write(smooth_image(31, 33))
+    (frame,) = read_video(tmp_path / "a.mp4")
+    assert frame.shape == (32, 34, 3)
+
+
+def test_a_broken_write_leaves_what_was_there(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"precious")
+    with pytest.raises(RuntimeError), VideoWriter(tmp_path / "a.mp4", 10, 32, 32) as video:
+        video.write(torch.zeros(32, 32, 3))
+        raise RuntimeError
+    assert (tmp_path / "a.mp4").read_bytes() == b"precious"
+    assert os.listdir(tmp_path) == ["a.mp4"]
+
+
+def test_a_video_without_frames_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="no frames"), VideoWriter(tmp_path / "a.mp4", 10, 32, 32):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_frame_of_another_size_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"\(32, 32, 3\), got \(16, 32, 3\)"), VideoWriter(tmp_path / "a.mp4", 10, 32, 32) as video:
+        video.write(torch.zeros(16, 32, 3))
+
+
+def test_a_name_that_is_no_video_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"must end in \.mp4"):
+        VideoWriter(tmp_path / "a.gif", 10, 32, 32)
+
+
+def test_a_file_that_is_no_video_is_named(tmp_path):
+    (tmp_path / "clip.mp4").write_text("this is not a video")
+    with pytest.raises(ValueError, match=r"clip\.mp4 cannot be decoded"):
+        read_video(tmp_path / "clip.mp4")
+
+
+def test_a_truncated_video_is_named(tmp_path):
+    with VideoWriter(tmp_path / "a.mp4", 10, 64, 48) as video:
+        for seed in range(8):
+            video.write(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(seed)))
+    whole = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"cut\.mp4"):
+        list(read_video(tmp_path / "cut.mp4"))
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="gone"):
+        read_video(tmp_path / "gone.mp4")
+    with pytest.raises(FileNotFoundError, match="gone"):
+        read_image(tmp_path / "gone.png")
+
+
+def test_a_file_that_is_no_image_is_named(tmp_path):
+    (tmp_path / "a.png").write_text("not a picture")
+    with pytest.raises(ValueError, match=r"a\.png cannot be decoded"):
+        read_image(tmp_path / "a.png")
