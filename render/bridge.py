@@ -13,7 +13,7 @@ from render.kernels.composite import composite, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.project import project, project_backward
 from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, lanes
-from render.launch import run, run_blocks, stream, view
+from render.launch import BANDS, run, run_blocks, stream, view
 from render.order import TileLists, tile_lists
 from scenes.gaussians import SplatModel
 
@@ -150,7 +150,7 @@ class Rasterize(torch.autograd.Function):
         outputs: list = []
         g_uniform = []
         with stream(device):
-            _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t.clone(), slots)
+            _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t, slots)
             base = 0
             for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
                 out = [torch.empty_like(f) for f in group]
@@ -176,35 +176,43 @@ def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
 
 
 def _composite(settings: Settings, lists: TileLists, records: torch.Tensor):
-    """Planes (T, r, g, b[, z, w][, instance, best weight]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
-    device = records.device
-    planes = settings.planes(8 if settings.instance else 6 if settings.depth else 4, device)
-    args = [view(lists.starts, int), view(lists.ids, int), view(records, float), settings.tiles_x, settings.alpha_max, settings.config.termination]
-    tiles = settings.tiles_x * settings.tiles_y
+    """Planes (T, r, g, b[, w z, w][, instance]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
+    device, tiles = records.device, settings.tiles_x * settings.tiles_y
+    planes = settings.planes(7 if settings.instance else 6 if settings.depth else 4, device)
+    lists_of = [view(lists.starts, int), view(lists.ids, int), view(records, float)]
+    limits = [settings.alpha_max, settings.config.termination]
     if device.type == "cuda":
         last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
-        extra = [view(planes[min(i, len(planes) - 1)], float) for i in range(8)]
+        out = [view(planes[min(i, len(planes) - 1)], float) for i in range(7)]
         kernel = composite_blocks(settings.depth, settings.instance, TILE)
-        run_blocks(kernel, tiles, TILE * TILE, [*args, *extra, view(last, int)], device)
+        run_blocks(kernel, tiles, TILE * TILE, [*lists_of, settings.tiles_x, *limits, *out, view(last, int)], device)
         return planes, last
     last = torch.empty(planes.shape[1], settings.pitch, dtype=torch.int32)
     rows = _lane_planes(settings, planes)
-    extra = [rows[min(i, len(rows) - 1)] for i in range(8)]
-    run(composite(settings.depth, settings.instance, settings.squarings), tiles, [*args, *extra, view(last, int)], device)
+    out = [rows[min(i, len(rows) - 1)] for i in range(7)]
+    grid = [settings.tiles_x, tiles, BANDS]
+    kernel = composite(settings.depth, settings.instance, settings.squarings)
+    run(kernel, BANDS, [*lists_of, *grid, *limits, *_working(), *out, view(last, int)], device)
     return planes, last
 
 
-def _composite_backward(settings: Settings, lists: TileLists, records, grads, last, t_run, slots) -> None:
-    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, z, w])."""
-    device = records.device
-    args = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float), settings.tiles_x, settings.alpha_max]
-    tiles = settings.tiles_x * settings.tiles_y
+def _composite_backward(settings: Settings, lists: TileLists, records, grads, last, final_t, slots) -> None:
+    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, w z, w])."""
+    device, tiles = records.device, settings.tiles_x * settings.tiles_y
+    lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float)]
     on_cuda = device.type == "cuda"
-    r, g, b, rest, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(settings, grads)
+    r, g, b, t_gradient, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(settings, grads)
     z, w = extra or (r, r)
     if on_cuda:
         kernel = composite_blocks_gradient(settings.depth, TILE)
-        run_blocks(kernel, tiles, TILE * TILE, [*args, r, g, b, z, w, view(last, int), view(t_run, float), rest, view(slots, float)], device)
+        args = [*lists_of, settings.tiles_x, settings.alpha_max, r, g, b, z, w, view(last, int), view(final_t, float), t_gradient]
+        run_blocks(kernel, tiles, TILE * TILE, [*args, view(slots, float)], device)
         return
+    args = [*lists_of, settings.tiles_x, tiles, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(last, int)]
     kernel = composite_gradient(settings.depth, settings.squarings)
-    run(kernel, tiles, [*args, r, g, b, z, w, view(last, int), _lane_planes(settings, t_run[None])[0], rest, view(slots, float)], device)
+    run(kernel, BANDS, [*args, _lane_planes(settings, final_t[None])[0], t_gradient, view(slots, float)], device)
+
+
+def _working() -> list:
+    """The column ramp, and working rows of the tile at hand for each band."""
+    return [view(torch.arange(TILE, dtype=torch.float32)[None], lanes), view(torch.empty(BANDS, 8, TILE, TILE), lanes)]

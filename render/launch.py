@@ -22,7 +22,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="sidestep-render")
 
 
-def run(kernel: wp.Kernel, count: int, args: list, device: torch.device, bands: int = BANDS) -> None:
+def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None:
     """Launch `kernel` over `count` work items; its last parameter, `first`, is the index of a band's first item."""
     if count == 0:
         return
@@ -30,7 +30,7 @@ def run(kernel: wp.Kernel, count: int, args: list, device: torch.device, bands: 
         wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
         return
     threads = torch.get_num_threads()
-    bands = 1 if threads == 1 else min(bands, count)
+    bands = 1 if threads == 1 else min(BANDS, count)
     edges = [count * b // bands for b in range(bands + 1)]
 
     def band(b: int) -> None:

@@ -57,13 +57,15 @@ def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, 
     if total and device.type == "cpu":
         chunk = -(-visible // CHUNKS)
         histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
-        args = [view(records, float), view(order, int), visible, chunk, tiles_x, tiles_y]
-        run(count_chunks, CHUNKS, [*args, view(histogram, int)], device)
+        tile_keys = torch.empty(total, dtype=torch.int32)
+        args = [view(records, float), view(order, int), visible, chunk, tiles_x, tiles_y, view(first_slot, int)]
+        run(count_chunks, CHUNKS, [*args, view(histogram, int), view(tile_keys, int)], device)
         by_tile = histogram.t().reshape(-1)
         after = by_tile.cumsum(0, dtype=torch.int32)
         starts[1:] = after[CHUNKS - 1 :: CHUNKS]
         cursor = (after - by_tile).reshape(tiles, CHUNKS).t().contiguous()
-        run(emit_chunks, CHUNKS, [*args, view(first_slot, int), view(cursor, int), view(ids, int), view(slot_of, int)], device)
+        args = [view(order, int), visible, chunk, view(first_slot, int), view(counts, int), view(tile_keys, int)]
+        run(emit_chunks, CHUNKS, [*args, view(cursor, int), view(ids, int), view(slot_of, int)], device)
     elif total:
         pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
         owner = torch.empty(total, dtype=torch.int32, device=device)

@@ -5,7 +5,7 @@
 
 import warp as wp
 
-from render.kernels.types import CS, INV_C, K2H, OPTIONS, S_MAX, SLACK, TILE, Y_EXT, H, K, M, X, Y
+from render.kernels.types import INV_K, OPTIONS, S_MAX, SLACK, TILE, Y_AT_EXT, Y_EXT, H, M, X, Y
 
 wp.set_module_options(OPTIONS)
 
@@ -28,18 +28,17 @@ def tile_rows(records: wp.array2d[float], j: int, tiles_y: int):
 def tile_columns(records: wp.array2d[float], j: int, ty: int, tiles_x: int):
     """First and last tile of tile row ty that the ellipse reaches: its extreme x over the row's span of y."""
     x = records[j, X]
-    k = records[j, K]
+    inv_k = records[j, INV_K]
     m = records[j, M]
     h = records[j, H]
     s_max = records[j, S_MAX]
+    y_at_ext = records[j, Y_AT_EXT]
     above = float(ty) * TILE_SIZE + 0.5 - records[j, Y] - SLACK
     below = above + LAST_CENTRE - 0.5 + 2.0 * SLACK
-    # the rightmost point of the ellipse lies at dy = k^2 m / c * x_ext, the leftmost opposite
-    y_at_ext = k * k * m * records[j, INV_C] * wp.sqrt(records[j, CS] / records[j, K2H])
     dy_right = wp.clamp(y_at_ext, above, below)
     dy_left = wp.clamp(-y_at_ext, above, below)
-    right = m * dy_right + wp.sqrt(wp.max(s_max - h * dy_right * dy_right, 0.0)) / k + SLACK
-    left = m * dy_left - wp.sqrt(wp.max(s_max - h * dy_left * dy_left, 0.0)) / k - SLACK
+    right = m * dy_right + wp.sqrt(wp.max(s_max - h * dy_right * dy_right, 0.0)) * inv_k + SLACK
+    left = m * dy_left - wp.sqrt(wp.max(s_max - h * dy_left * dy_left, 0.0)) * inv_k - SLACK
     first = wp.ceil((wp.clamp(x + left, -FAR, FAR) - LAST_CENTRE) / TILE_SIZE)
     last = wp.floor((wp.clamp(x + right, -FAR, FAR) - 0.5) / TILE_SIZE)
     return wp.vec2i(wp.max(int(first), 0), wp.min(int(last), tiles_x - 1))
@@ -47,28 +46,12 @@ def tile_columns(records: wp.array2d[float], j: int, ty: int, tiles_x: int):
 
 @wp.kernel
 def count_chunks(
-    records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, tiles_x: int, tiles_y: int,
-    histogram: wp.array2d[int],
-    first: int,
-):  # fmt: skip
-    """A thread takes one chunk of the depth-ordered splats: how many of them each tile has, `[chunks, tiles]`, zeroed before."""
-    part = first + wp.tid()
-    for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
-        j = order[d]
-        rows = tile_rows(records, j, tiles_y)
-        for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(records, j, ty, tiles_x)
-            for tx in range(columns[0], columns[1] + 1):
-                histogram[part, ty * tiles_x + tx] = histogram[part, ty * tiles_x + tx] + 1
-
-
-@wp.kernel
-def emit_chunks(
     records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, tiles_x: int, tiles_y: int, starts: wp.array[int],
-    cursor: wp.array2d[int], ids: wp.array[int], slot_of: wp.array[int],
+    histogram: wp.array2d[int], tile_keys: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """The stable second pass of the counting sort: `cursor` holds where each chunk's entries of each tile begin."""
+    """A thread takes one chunk of the depth-ordered splats: the tile of every slot, and how many of them each tile has,
+    `[chunks, tiles]`, zeroed before."""
     part = first + wp.tid()
     for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
         j = order[d]
@@ -77,11 +60,28 @@ def emit_chunks(
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(records, j, ty, tiles_x)
             for tx in range(columns[0], columns[1] + 1):
-                k = cursor[part, ty * tiles_x + tx]
-                cursor[part, ty * tiles_x + tx] = k + 1
-                ids[k] = j
-                slot_of[k] = slot
+                tile = ty * tiles_x + tx
+                tile_keys[slot] = tile
+                histogram[part, tile] = histogram[part, tile] + 1
                 slot += 1
+
+
+@wp.kernel
+def emit_chunks(
+    order: wp.array[int], visible: int, chunk: int, starts: wp.array[int], counts: wp.array[int], tile_keys: wp.array[int],
+    cursor: wp.array2d[int], ids: wp.array[int], slot_of: wp.array[int],
+    first: int,
+):  # fmt: skip
+    """The stable second pass of the counting sort: `cursor` holds where each chunk's entries of each tile begin."""
+    part = first + wp.tid()
+    for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
+        j = order[d]
+        for slot in range(starts[j], starts[j] + counts[j]):
+            tile = tile_keys[slot]
+            k = cursor[part, tile]
+            cursor[part, tile] = k + 1
+            ids[k] = j
+            slot_of[k] = slot
 
 
 @wp.kernel

@@ -46,7 +46,7 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
         tiles_x: int, alpha_max: float, termination: float,
         out_t: wp.array2d[float], out_r: wp.array2d[float], out_g: wp.array2d[float], out_b: wp.array2d[float],
-        out_z: wp.array2d[float], out_w: wp.array2d[float], out_instance: wp.array2d[float], best: wp.array2d[float], last: wp.array2d[int],
+        out_z: wp.array2d[float], out_w: wp.array2d[float], out_instance: wp.array2d[float], last: wp.array2d[int],
     ):  # fmt: skip
         tile, thread = wp.tid()
         px = (tile % tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
@@ -90,7 +90,6 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
             out_w[py, px] = weights
         if wp.static(instance):
             out_instance[py, px] = who
-            best[py, px] = most
 
     return composite_blocks_forward
 
@@ -106,7 +105,7 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
         tiles_x: int, alpha_max: float,
         g_r: wp.array2d[float], g_g: wp.array2d[float], g_b: wp.array2d[float], g_z: wp.array2d[float], g_w: wp.array2d[float],
         last: wp.array2d[int],
-        t_run: wp.array2d[float], rest_run: wp.array2d[float], slots: wp.array2d[float],
+        final_t: wp.array2d[float], t_gradient: wp.array2d[float], slots: wp.array2d[float],
     ):  # fmt: skip
         tile, thread = wp.tid()
         px = (tile % tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
@@ -115,8 +114,8 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
         y = float(py) + 0.5
         start = tile_starts[tile]
         count = tile_starts[tile + 1] - start
-        t = t_run[py, px]
-        rest = rest_run[py, px]
+        t = final_t[py, px]
+        rest = t_gradient[py, px]
         stop = last[py, px]
         g = wp.vec3(g_r[py, px], g_g[py, px], g_b[py, px])
         gz = float(0.0)

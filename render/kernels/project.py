@@ -17,7 +17,6 @@ from render.kernels.bin import tile_columns, tile_rows
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
-    CS,
     G_BLUE,
     G_GREEN,
     G_H,
@@ -32,12 +31,13 @@ from render.kernels.types import (
     GREEN,
     INSTANCE,
     INV_C,
-    K2H,
+    INV_K,
     OPACITY,
     OPTIONS,
     RED,
     S_MAX,
     UNIFORM_GRADIENTS,
+    Y_AT_EXT,
     Y_EXT,
     H,
     K,
@@ -219,9 +219,9 @@ def project(
             records[j, Z] = t[2]
             records[j, INSTANCE] = pose.instance
             records[j, Y_EXT] = wp.sqrt(s_max / h)
-            records[j, CS] = c * s_max
-            records[j, K2H] = k2 * h
+            records[j, INV_K] = 1.0 / k
             records[j, INV_C] = 1.0 / c
+            records[j, Y_AT_EXT] = k * m * wp.sqrt(s_max / (c * h))
             rows = tile_rows(records, j, view.tiles_y)
             total = int(0)
             for ty in range(rows[0], rows[1] + 1):

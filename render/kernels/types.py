@@ -15,7 +15,8 @@ RECORD = 16
 """Floats of a projected splat: one cache line. With dx, dy the pixel's offset from (X, Y), the exponent is
 s = (K (dx - M dy))^2 + H dy^2: the conic as a product of conditionals, which does not cancel for needles as
 a dx^2 + 2 b dx dy + c dy^2 does, and gives a row's exact extent by one square root."""
-X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, CS, K2H, INV_C = (wp.constant(i) for i in range(RECORD))
+X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, INV_K, Y_AT_EXT, INV_C = (wp.constant(i) for i in range(RECORD))
+# Y_EXT: the ellipse's reach in y; INV_K = 1 / K; Y_AT_EXT: dy of its rightmost point; INV_C = 1 / (K^2 M^2 + H)
 
 GRADIENTS = 10
 """Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""

@@ -1,0 +1,1 @@
+"""Benchmarks: run by hand, print tables; nothing here asserts a time."""
