@@ -17,7 +17,7 @@ from enhance.isp import alter, random_isp
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from enhance.warp import visible
 from recon import open_log
-from recon.log import LogCamera
+from recon.log import Log, LogCamera
 from render import render_frame
 from scenes.atomic import atomic_file
 from scenes.files import load
@@ -43,8 +43,8 @@ class PairConfig:
 
 
 def make_pairs(
-    scene_path: str | Path,
-    log_path: str | Path,
+    scene_path: str | Path | Scene,
+    log_path: str | Path | Log,
     out: str | Path,
     kinds: Sequence[str] = KINDS,
     cameras: Sequence[str] | None = None,
@@ -53,7 +53,7 @@ def make_pairs(
     unfinished: Sequence[str | Path] = (),
     config: PairConfig | None = None,
 ) -> Path:
-    """Make the pairs of a scene in the folder `out`; returns it.
+    """Make the pairs of a scene in the folder `out`; returns it. Scene and recording may be given loaded.
 
     Of every clip of every camera: "underfit", the scene rendered from too few, too coarse splats (or from one of the scenes in
     `unfinished`, the same drive stopped early) against the photo; "isp", the photo with the colours of its instances altered against
@@ -65,7 +65,8 @@ def make_pairs(
     Raises ValueError for an unknown kind or camera, for a camera that the scene was not given, and for a folder made with other settings.
     """
     config = config or PairConfig()
-    scene, log = load(scene_path), open_log(log_path)
+    scene = scene_path if isinstance(scene_path, Scene) else load(scene_path)
+    log = log_path if isinstance(log_path, Log) else open_log(log_path)
     if not isinstance(scene, Scene):
         raise ValueError(f"{scene_path} is not a scene; pairs are made from a scene that sidestep recon wrote")
     early = [s for s in map(load, unfinished) if isinstance(s, Scene)]
@@ -75,10 +76,10 @@ def make_pairs(
     both = [name for name in log.cameras if name in scene.rig]
     for name in cameras or ():
         if name not in both:
-            raise ValueError(unknown("camera", name, f"both {scene_path} and {log_path}", both))
+            raise ValueError(unknown("camera", name, "both the scene and its recording", both))
     chosen = list(cameras or both)
     if not chosen:
-        raise ValueError(f"{scene_path} and {log_path} have no camera in common; make the pairs from the drive that the scene came from")
+        raise ValueError("the scene and the recording have no camera in common; make the pairs from the drive that the scene came from")
     out = Path(out)
     _claim(out, {"seed": seed, "kinds": sorted(kinds), "width": config.width, "frames": config.frames, "every": config.every})
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
@@ -156,6 +157,7 @@ class _Clip:
     def make(self, kind: str, early: Sequence[Scene]) -> tuple[dict[str, torch.Tensor], dict]:
         """The clip's tensors for one kind of damage, and what was done in words."""
         rng = np.random.default_rng([self.seed, KINDS.index(kind)])
+        what: dict[str, object]
         if kind == "underfit":
             damaged, what = self._underfit(rng, early)
             region = torch.ones(self.target.shape[:3])
@@ -164,12 +166,13 @@ class _Clip:
             isp = random_isp(rng)
             rgb = self.target.permute(0, 3, 1, 2).float() / 255
             damaged = to_bytes(alter(rgb, region[:, None], isp).permute(0, 2, 3, 1))
-            what = {**what, "isp": vars(isp)}
+            what = what | {"isp": vars(isp)}
         else:
-            damaged, region, what = self.target, torch.zeros(self.target.shape[:3]), {}
+            damaged, region, what = self.target.clone(), torch.zeros(self.target.shape[:3]), {}
         return {"input": damaged, "target": self.target, "region": to_bytes(region), **self.geometry()}, what
 
     def _underfit(self, rng: np.random.Generator, early: Sequence[Scene]) -> tuple[torch.Tensor, dict]:
+        what: dict[str, object]
         if early and rng.random() < 0.7:
             pick = int(rng.integers(len(early)))
             scene, what = early[pick], {"underfit": "stopped early", "scene": str(early[pick].meta.get("name", pick))}

@@ -33,7 +33,7 @@ class TrainConfig:
 
     autoencoder: float = 0.25
     """Share of the budget for the autoencoder."""
-    crop: int = 192
+    crop: int = 160
     """Side of training crops in pixels, a multiple of 16."""
     images: int = 8
     """Crops in an image batch."""
@@ -41,6 +41,8 @@ class TrainConfig:
     """Clips in a temporal batch."""
     frames: int = 4
     """Frames of a training clip."""
+    temporal_every: int = 3
+    """Every how many steps a temporal batch comes; the others are images."""
     rate: float = 8e-4
     """Highest learning rate."""
     latent: float = 0.1
@@ -51,6 +53,8 @@ class TrainConfig:
     """Weight of the warp error in temporal batches."""
 
     def __post_init__(self):
+        if self.temporal_every < 2:
+            raise ValueError(f"temporal_every must be at least 2, got {self.temporal_every}")
         if self.crop % 16 or self.crop < 32:
             raise ValueError(f"crop must be a multiple of 16 from 32, got {self.crop}")
 
@@ -204,7 +208,7 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
 
 def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
     c = run.config
-    temporal = step % 2 == 1 and c.frames > 1
+    temporal = step % c.temporal_every == 1 and c.frames > 1
     rng = np.random.default_rng([run.seed, 7, step])
     sample = sampler.batch(2 * step + 1, c.clips if temporal else c.images, c.frames if temporal else 1, c.crop)
     losses = rollout_losses(run.net, sample, perceptual, c, rng)
