@@ -1,11 +1,23 @@
-"""A video file in, a better one out, frame by frame."""
+"""A video file, or a stream of rendered frames, in; a better one out, frame by frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from enhance.enhancer import Enhancer
+from render.frame_types import Frame
+
+READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb
+
+
+def enhance_frames(frames: Iterable[Frame], enhancer: Enhancer) -> Iterator[Frame]:
+    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in READS."""
+    memory = None
+    for frame in frames:
+        better, memory = enhancer.step(frame, memory)
+        yield replace(frame, rgb=better)
 
 
 def enhance_video(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -12,6 +12,7 @@ from render.outputs import check_outputs
 from render.rasterize import rasterize
 from render.shadow import cast, shadow_casters
 from scenes.camera import Camera
+from scenes.gaussians import Placed
 from scenes.scene import Scene
 from scenes.sky import Sky
 
@@ -39,7 +40,9 @@ def render_frame(
     for way, other in others.items():
         if f"flow_{way}" in outputs and other is None:
             raise ValueError(f"flow_{way} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
-    flow_to = {way: (scene.placed(c.time_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs}
+    flow_to: dict[str, tuple[Sequence[Placed], Camera]] = {
+        way: (scene.placed(c.time_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs
+    }
 
     casters = shadow_casters(scene, camera) if shadows and "rgb" in outputs else []
     needed = set(outputs)
@@ -51,20 +54,21 @@ def render_frame(
     frame = rasterize(placed, camera, tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
     assert isinstance(frame, Frame)
 
-    changed: dict[str, torch.Tensor] = {}
-    if "rgb" in outputs:
-        rgb = cast(frame, casters) if casters else frame.rgb
+    rgb = frame.rgb if "rgb" in outputs else None
+    if rgb is not None:
+        if casters:
+            rgb = cast(frame, casters)
         if scene.sky is not None:
             rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
         if camera.exposure is not None:
             rgb = expose(rgb, camera.exposure)
-        changed["rgb"] = rgb
-    dropped = {name: None for name in needed - set(outputs)}
-    return replace(frame, **changed, **dropped)
+    wanted = {name: getattr(frame, name) for name in outputs}
+    return Frame(camera, **{**wanted, "rgb": rgb})
 
 
-def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:
+def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Camera) -> torch.Tensor:
     """Premultiplied `rgb` `[H, W, 3]` over the sky, looked up only where `alpha` `[H, W]` lets light pass."""
+    assert alpha is not None
     through = alpha.detach() < 1 - SKY_SHOWS
     if not through.any():
         return rgb

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
-ORDER = ["scenes", "render", "recon", "enhance"]
+ORDER = ["scenes", "render", "recon", "enhance", "commands"]
 
 
 def imported_packages(path: Path) -> set[str]:

@@ -1,0 +1,48 @@
+"""`sidestep info` and `sidestep validate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from commands.written import AnyPath, Flag
+
+
+@dataclass
+class Info:
+    """Say what a scene, databank, PLY or USD file holds."""
+
+    path: AnyPath
+    """Folder or file."""
+    json: Flag = False
+    """As JSON."""
+
+    def run(self) -> None:
+        from scenes.report import describe, summary
+
+        told = describe(self.path)
+        if self.json:
+            import json
+
+            print(json.dumps(told, indent=1))
+        else:
+            print("\n".join(summary(told)))
+
+
+@dataclass
+class Validate:
+    """Check a scene, databank, PLY or USD file, with USD's own validators too; exit 1 where something is wrong."""
+
+    path: AnyPath
+    """Folder or file."""
+    drop_invalid: Flag = False
+    """Count splats with values that are not finite, and check what is left without them."""
+
+    def run(self) -> None:
+        from scenes.report import validate
+
+        problems = validate(self.path)
+        for problem in problems:
+            print(problem)
+        if problems:
+            raise ValueError(f"{self.path} has {len(problems)} problem{'s' * (len(problems) > 1)}")
+        print(f"{self.path} is valid")
