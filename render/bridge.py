@@ -122,7 +122,7 @@ class Rasterize(torch.autograd.Function):
                 uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
                 uniforms.append(uniform)
                 run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
-            lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y)
+            lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y, counting=device.type == "cpu")
             planes, last = _composite(settings, lists, records)
         ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
         ctx.records, ctx.counts, ctx.last, ctx.final_t = records, counts, last, planes[0]

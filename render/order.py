@@ -40,8 +40,8 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
     return pair[1, :n]
 
 
-def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int) -> TileLists:
-    """Sort the visible records by depth once, then deal them to tiles with a stable counting pass."""
+def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, counting: bool = True) -> TileLists:
+    """Sort the visible records by depth once, then deal them to tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles."""
     device, tiles = records.device, tiles_x * tiles_y
     order = depth_order(keys)
     visible = order.shape[0]
@@ -54,7 +54,7 @@ def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, 
     ids = torch.empty(total, dtype=torch.int32, device=device)
     slot_of = torch.empty(total, dtype=torch.int32, device=device)
     starts = torch.zeros(tiles + 1, dtype=torch.int32, device=device)
-    if total and device.type == "cpu":
+    if total and counting:
         chunk = -(-visible // CHUNKS)
         histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
         tile_keys = torch.empty(total, dtype=torch.int32)

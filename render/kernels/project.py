@@ -314,20 +314,22 @@ def project_backward(
             m = f.xy / yy
             h = 0.5 / yy
 
-            g_det = -0.5 * g[G_K] * k / det
+            g_det = -0.5 * g[G_K] * k / det  # det = det0 + dilation (xx0 + yy0 + dilation)
+            g_trace = g_det
+            g_det0 = g_det
             g_yy = (0.5 * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy
             g_xy = g[G_M] / yy
-            g_det0 = float(0.0)
             g_o = g[G_OPACITY]
             if view.antialias != 0:
+                # opacity sqrt(det0 / det): its two derivatives by det0 nearly cancel for large splats, so they are taken together
                 ratio = wp.sqrt(f.det0 / det)
-                g_det0 = 0.5 * g_o * o * ratio / wp.max(f.det0, TINY)
-                g_det -= 0.5 * g_o * o * ratio / det
+                g_ratio = 0.5 * g_o * o * ratio / det
+                g_trace -= g_ratio
+                g_det0 += g_ratio * view.dilation * (f.xx + f.yy + view.dilation) / wp.max(f.det0, TINY)
                 g_o = g_o * ratio
             g_logit_opacities[i] = g_o * o * (1.0 - o)
-            g_det0 += g_det
-            g_xx = g_det * view.dilation
-            g_yy += g_det * view.dilation
+            g_xx = g_trace * view.dilation
+            g_yy += g_trace * view.dilation
 
             uv = cross2(f.u.e, f.v.e)
             uw = cross2(f.u.e, f.w.e)

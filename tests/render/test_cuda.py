@@ -1,0 +1,139 @@
+"""The CUDA kernels: compiled for sm_90 without a GPU, run on the CPU with tiles of one pixel, and on a GPU where there is one."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+from render import rasterize
+from render.bridge import Rasterize, Settings
+from render.frame_types import RenderConfig
+from render.kernels import bin as bin_kernels
+from render.kernels import project as project_kernels
+from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
+from render.kernels.types import GRADIENTS, TILE
+from render.launch import run, run_blocks, view
+from render.order import tile_lists
+from scenes import Pinhole, Placed, SplatModel
+from scenes.poses import translation
+from tests.bench.presets import random_splats
+
+WIDTH, HEIGHT = 37, 29
+KERNELS = {
+    "project": lambda: project_kernels.project,
+    "bin": lambda: bin_kernels.emit_pairs,
+    "composite": lambda: composite_blocks(True, True, TILE),
+    "composite backward": lambda: composite_blocks_gradient(True, TILE),
+}
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_compile_for_sm_90(name, tmp_path):
+    wp.init()
+    module = KERNELS[name]().module
+    block_dim = module.options["block_dim"]
+    module.options["block_dim"] = TILE * TILE  # a launch sets it
+    try:
+        files = wp.compile_aot_module(module, device=None, arch=90, module_dir=tmp_path)
+    finally:
+        module.options["block_dim"] = block_dim
+    built = [Path(f) for f in files if Path(f).suffix in (".ptx", ".cubin")]
+    assert built and all(f.stat().st_size > 1000 for f in built)
+
+
+class Captured:
+    """What `Rasterize` keeps for backward, outside autograd."""
+
+    def mark_non_differentiable(self, *_):
+        pass
+
+
+def lane_result():
+    """Forward and backward of the lane kernels with depth and instance: outputs, kept state, output gradients, field gradients."""
+    g = random_splats(80, 1)
+    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), True, True, (5,))
+    pose = translation(0, 0, 5)[None]
+    lens = Pinhole(30.0, 30.0, 18.0, 14.0).params()
+    kept = Captured()
+    kept.needs_input_grad = (False,) * 8
+    outputs = Rasterize.forward(kept, settings, pose, lens, *g.tensors().values())
+    return settings, kept, outputs
+
+
+def test_block_kernels_agree_with_lane_kernels():
+    """One pixel a tile and one thread a block: the CUDA kernels' own arithmetic, on the CPU."""
+    settings, kept, outputs = lane_result()
+    generator = torch.Generator().manual_seed(3)
+    gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:4]]
+    expected = Rasterize.backward(kept, *gradients, None)
+
+    records, (group,), (uniform,) = kept.records, kept.groups, kept.uniforms
+    visible = torch.where(kept.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
+    pixels = WIDTH * HEIGHT
+    everywhere = torch.where(kept.counts > 0, pixels, 0).to(torch.int32)  # every pixel lists every splat: more than the exact lists
+    order = torch.argsort(visible, stable=True)[: int((kept.counts > 0).sum())].to(torch.int32)
+    n = len(order)
+    starts = torch.arange(pixels + 1, dtype=torch.int32) * n
+    ids = order.repeat(pixels)
+    first_slot = torch.zeros(len(records), dtype=torch.int32)
+    first_slot[order.long()] = torch.arange(n, dtype=torch.int32) * pixels
+    slot_of = (torch.arange(n, dtype=torch.int32)[None] * pixels + torch.arange(pixels, dtype=torch.int32)[:, None]).reshape(-1).contiguous()
+
+    planes = torch.empty(7, HEIGHT, WIDTH)
+    last = torch.empty(HEIGHT, WIDTH, dtype=torch.int32)
+    lists = [view(starts, int), view(ids, int)]
+    limits = [settings.alpha_max, settings.config.termination]
+    args = [*lists, view(records, float), WIDTH, *limits, *(view(p, float) for p in planes), view(last, int)]
+    cpu = torch.device("cpu")
+    run_blocks(composite_blocks(True, True, 1), pixels, 1, args, cpu)
+    rgb, alpha, z, weights, instance = outputs
+    assert torch.allclose(planes[1:4], rgb, atol=2e-5) and torch.allclose(1 - planes[0], alpha, atol=2e-5)
+    assert torch.allclose(planes[4], z, atol=2e-4) and torch.allclose(planes[5], weights, atol=2e-5)
+    assert (torch.where(alpha < 0.5, -1, planes[6]).int() != instance).float().mean() < 0.002
+
+    g_rgb, g_alpha, g_z, g_w = gradients
+    slots = torch.empty(n * pixels, GRADIENTS)
+    backs = [*g_rgb, g_z, g_w]
+    t_gradient = -g_alpha * planes[0]
+    args = [*lists, view(slot_of, int), view(records, float), WIDTH, settings.alpha_max, *(view(p.contiguous(), float) for p in backs)]
+    args += [view(last, int), view(planes[0], float), view(t_gradient, float), view(slots, float)]
+    run_blocks(composite_blocks_gradient(True, 1), pixels, 1, args, cpu)
+    out = [torch.empty_like(t) for t in group]
+    shared = torch.empty(2, 16)
+    types = [wp.vec3, wp.vec4, wp.vec3, float, wp.vec3]
+    fields = [view(t, d) for t, d in zip(group, types, strict=True)]
+    results = [view(t, d) for t, d in zip(out, types, strict=True)]
+    tail = [view(everywhere, int), view(first_slot, int), view(slots, float), *results, view(shared, float)]
+    run(project_kernels.project_backward, 2, [*fields, *uniform, len(records), 64, *tail], cpu)
+    for mine, reference in zip(out, expected[3:], strict=True):
+        assert (mine - reference).abs().max() < 1e-3 * reference.abs().max()
+
+
+def test_sorted_pairs_make_the_same_lists_as_counting():
+    """CUDA's way from depth order to tile lists (emit pairs, stable sort by tile), on the CPU, against the counting pass."""
+    settings, kept, _ = lane_result()
+    keys = torch.where(kept.counts > 0, kept.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
+    counted = tile_lists(kept.records, keys, kept.counts, settings.tiles_x, settings.tiles_y)
+    paired = tile_lists(kept.records, keys, kept.counts, settings.tiles_x, settings.tiles_y, counting=False)
+    assert len(counted.ids) > 100
+    drawn = kept.counts > 0
+    assert torch.equal(counted.first_slot[drawn], paired.first_slot[drawn])
+    for name in ("starts", "ids", "slot_of"):
+        assert torch.equal(getattr(counted, name), getattr(paired, name)), name
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU: renders there and compares with the CPU")
+def test_a_gpu_draws_what_the_cpu_draws():
+    from tests.render.test_rasterize import CAMERA, two_instances
+
+    def gradients(device):
+        placed = [Placed(p.gaussians.to(device).map(lambda t: t.requires_grad_()), p.world_from_local, instance=p.instance) for p in two_instances(1)]
+        frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"))
+        frame.rgb.square().sum().backward()
+        return frame, [t.grad.cpu() for p in placed for t in p.gaussians.tensors().values()]
+
+    (here, g_here), (there, g_there) = gradients("cpu"), gradients("cuda")
+    assert (here.rgb - there.rgb.cpu()).abs().max() < 1e-2 and (here.rgb - there.rgb.cpu()).abs().mean() < 1e-5
+    for a, b in zip(g_here, g_there, strict=True):
+        assert (a - b).abs().max() < 1e-2 * a.abs().max()

@@ -1,0 +1,282 @@
+"""The rasterizer against the float64 oracle, and its laws."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import RenderConfig, rasterize
+from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
+from scenes.poses import pose_from, translation
+from tests import oracle
+from tests.bench.presets import random_splats
+
+CAMERA = Camera(Pinhole(60.0, 62.0, 34.0, 22.0), 70, 50, pose_from([1, 0.02, 0.01, -0.03], [0.1, 0.2, -0.3]))
+MODELS = [SplatModel(projection=p, antialias=a) for p in ("ewa", "ut") for a in (False, True)]
+EXACT = RenderConfig(alpha_cutoff=1e-8, termination=0)
+
+
+def two_instances(seed: int) -> list[Placed]:
+    return [
+        Placed(random_splats(120, seed), pose_from([1, 0.1, 0.2, 0.05], [0.1, 0.2, 6.0])),
+        Placed(random_splats(50, seed + 1, sh_count=4), pose_from([0.9, -0.1, 0.2, 0.05], [0.5, -0.2, 5.0]), instance=3),
+    ]
+
+
+def needles_and_pancakes(seed: int) -> list[Placed]:
+    g = random_splats(60, seed)
+    shape = torch.tensor([[2.0, -3.5, -3.5], [0.5, 0.5, -9.0]]).repeat(30, 1)
+    return [Placed(replace(g, log_scales=shape + 0.2 * g.log_scales), translation(0, 0, 7))]
+
+
+def off_axis_and_close(seed: int) -> list[Placed]:
+    """Splats to either side of the view and up to the camera plane: sigma points behind the camera, EWA's clamp."""
+    g = random_splats(80, seed)
+    return [Placed(replace(g, means=g.means * torch.tensor([3.0, 2.0, 1.0]), log_scales=g.log_scales + 1), translation(0, 0, 2.5))]
+
+
+SCENES = [two_instances, needles_and_pancakes, off_axis_and_close]
+
+
+def largest(a: torch.Tensor, b: torch.Tensor, where: torch.Tensor) -> float:
+    return float((a.detach().double() - b.detach()).abs()[where].max())
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("make", SCENES)
+def test_forward_agrees_with_the_oracle(make, model):
+    placed = make(1)
+    rgb, alpha, depth, instance, near_cutoff = oracle.render(oracle.as_oracle(placed), CAMERA, model, cutoff=1 / 255, alpha_max=0.999)
+    frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"), model=model, config=RenderConfig(termination=0))
+    sure = ~near_cutoff  # at the cutoff a pixel is in or out by rounding
+    assert sure.float().mean() > 0.95
+    assert largest(frame.rgb, rgb, sure) < 2e-5 * max(1.0, float(rgb.detach().max()))
+    assert largest(frame.alpha, alpha, sure) < 2e-5
+    solid = sure & (alpha > 0.01)
+    # where little is drawn the weights are tails, which the exp polynomial gives to 1e-4 of themselves
+    off = largest(frame.depth / depth, torch.ones_like(depth), solid)
+    assert off < 1e-4
+    assert (frame.instance != instance)[sure & ((alpha - 0.5).abs() > 1e-4)].float().mean() < 0.002  # ties of two weights
+    terminated = rasterize(placed, CAMERA, ("rgb",), model=model)
+    assert largest(terminated.rgb, rgb, sure) < 1e-4 * max(1.0, float(rgb.detach().max()))
+
+
+def assert_gradient(name: str, mine: torch.Tensor, reference: torch.Tensor) -> None:
+    error = (mine.double() - reference).abs()
+    allowed = 1e-3 * reference.abs() + 1e-6 * reference.abs().max()
+    assert (error <= allowed).all(), f"{name}: {int((error > allowed).sum())} of {error.numel()} off, worst {float((error / allowed).max()):.1f}x"
+
+
+def gradients_of_both(placed: list[Placed], model: SplatModel):
+    """(name, ours, oracle's) for every field, pose and lens parameter of a random linear loss on rgb, alpha and depth."""
+    truth = oracle.as_oracle(placed)
+    pose, lens = CAMERA.world_from_cam.clone().requires_grad_(), CAMERA.lens.params().requires_grad_()
+    rgb, alpha, depth, _, _ = oracle.render(truth, CAMERA, model, pose, lens, cutoff=1e-8, alpha_max=0.999)
+    generator = torch.Generator().manual_seed(5)
+    weights = [torch.randn(*t.shape, generator=generator).double() for t in (rgb, alpha, depth)]
+    seen = alpha > 1e-3
+
+    def loss(rgb, alpha, depth):
+        return (rgb * weights[0]).sum() + (alpha * weights[1]).sum() + 0.1 * (depth[seen] * weights[2][seen]).sum()
+
+    loss(rgb, alpha, depth).backward()
+    mine = [
+        replace(p, gaussians=p.gaussians.map(lambda t: t.clone().requires_grad_()), world_from_local=p.world_from_local.clone().requires_grad_())
+        for p in placed
+    ]
+    my_pose, my_lens = CAMERA.world_from_cam.clone().requires_grad_(), CAMERA.lens.params().requires_grad_()
+    camera = replace(CAMERA, lens=Pinhole(*my_lens), world_from_cam=my_pose)
+    frame = rasterize(mine, camera, ("rgb", "alpha", "depth"), model=model, config=EXACT)
+    loss(frame.rgb, frame.alpha, frame.depth).backward()
+    for i, (p, (fields, world_from_local, _)) in enumerate(zip(mine, truth, strict=True)):
+        for name, tensor in p.gaussians.tensors().items():
+            yield f"{name} of {i}", tensor.grad, fields[name].grad
+        yield f"pose of {i}", p.world_from_local.grad[:3], world_from_local.grad[:3]
+    yield "camera pose", my_pose.grad[:3], pose.grad[:3]
+    yield "lens", my_lens.grad, lens.grad
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("make", SCENES)
+def test_gradients_agree_with_the_oracle(make, model):
+    for name, mine, reference in gradients_of_both(make(2), model):
+        assert_gradient(name, mine, reference)
+
+
+def test_the_oracles_gradients_are_its_finite_differences():
+    placed = [Placed(random_splats(6, 3), translation(0, 0, 5))]
+    camera = CAMERA.resized(14, 10)
+    (fields, pose, instance) = oracle.as_oracle(placed)[0]
+
+    def total(*values):
+        g = dict(zip(fields, values[:-1], strict=True))
+        rgb, alpha, _, _, _ = oracle.render([(g, values[-1], instance)], camera, SplatModel())
+        return (rgb.sum(-1) * torch.linspace(-1, 1, 14, dtype=torch.float64)).sum() + alpha.square().sum()
+
+    assert torch.autograd.gradcheck(total, (*fields.values(), pose), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+def test_zero_splats_renders_background():
+    sky = torch.tensor([0.1, 0.5, 0.9])
+    frame = rasterize(Gaussians.empty(), CAMERA, ("rgb", "alpha", "depth", "instance"), background=sky)
+    assert torch.equal(frame.rgb, sky.expand(50, 70, 3))
+    assert (frame.alpha == 0).all() and frame.depth.isinf().all() and (frame.instance == -1).all()
+
+
+def test_hidden_splats_do_not_perturb_render():
+    wall = Gaussians(torch.tensor([[0.0, 0, 3]] * 3), torch.tensor([[1.0, 0, 0, 0]] * 3), torch.tensor([[3.0, 3, -5]] * 3), torch.full((3,), 12.0), torch.ones(3, 1, 3))
+    behind = random_splats(50, 4)
+    behind = replace(behind, means=behind.means + torch.tensor([0.0, 0, 30]))
+    camera = replace(CAMERA, world_from_cam=torch.eye(4, dtype=torch.float64))
+    alone = rasterize(wall, camera).rgb
+    together = rasterize(Gaussians.cat([wall, behind]), camera).rgb
+    assert (alone - together).abs().max() <= 1e-4
+
+
+def test_rotating_scene_and_camera_together_changes_nothing():
+    placed = two_instances(6)
+    turn = pose_from([0.7, 0.3, -0.5, 0.4], [3.0, -8.0, 2.0])
+    moved = [replace(p, world_from_local=turn @ p.world_from_local) for p in placed]
+    here = rasterize(placed, CAMERA).rgb
+    there = rasterize(moved, replace(CAMERA, world_from_cam=turn @ CAMERA.world_from_cam)).rgb
+    assert (here - there).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("metres", [1e4, 1e6, 1e7])
+def test_far_from_the_origin_the_picture_is_the_same(metres):
+    placed = two_instances(7)
+    away = translation(metres, -metres, 0.5 * metres)
+    moved = [replace(p, world_from_local=away @ p.world_from_local) for p in placed]
+    near = rasterize(placed, CAMERA).rgb
+    far = rasterize(moved, replace(CAMERA, world_from_cam=away @ CAMERA.world_from_cam)).rgb
+    assert (near - far).abs().max() < 1e-5
+
+
+def test_splitting_into_instances_changes_nothing():
+    g = random_splats(100, 8)
+    pose = translation(0, 0, 6)
+    whole = rasterize(Placed(g, pose), CAMERA, ("rgb", "alpha", "depth"))
+    parts = rasterize([Placed(g.select(torch.arange(0, 40)), pose), Placed(g.select(torch.arange(40, 100)), pose, instance=1)], CAMERA, ("rgb", "alpha", "depth"))
+    for name, picture in whole.outputs().items():
+        assert torch.equal(picture, getattr(parts, name)), name
+
+
+def test_what_was_not_asked_for_is_none_and_does_not_change_the_rest():
+    placed = two_instances(9)
+    only = rasterize(placed, CAMERA, ("rgb",))
+    assert only.alpha is None and only.depth is None and only.instance is None
+    both = rasterize(placed, CAMERA, ("rgb", "depth", "instance"))
+    assert torch.equal(only.rgb, both.rgb)
+
+
+def test_the_same_bits_on_any_number_of_threads():
+    def run(threads: int):
+        torch.set_num_threads(threads)
+        g = random_splats(400, 10).map(lambda t: t.requires_grad_())
+        pose = translation(0, 0, 5).requires_grad_()
+        frame = rasterize(Placed(g, pose), CAMERA)
+        frame.rgb.square().sum().backward()
+        return [frame.rgb.detach(), pose.grad, *(t.grad for t in g.tensors().values())]
+
+    before = torch.get_num_threads()
+    try:
+        results = [run(threads) for threads in (1, 2, 3)]
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 3), (1025, 2), (5, 130)])
+def test_any_image_size(size):
+    width, height = size
+    camera = Camera(Pinhole(40.0, 40.0, width / 2, height / 2), width, height, torch.eye(4, dtype=torch.float64))
+    placed = [Placed(random_splats(60, 11), translation(0, 0, 4))]
+    truth, _, _, _, near_cutoff = oracle.render(oracle.as_oracle(placed), camera, SplatModel(), cutoff=1 / 255, alpha_max=0.999)
+    frame = rasterize(placed, camera, ("rgb",), config=RenderConfig(termination=0))
+    assert frame.rgb.shape == (height, width, 3)
+    assert (frame.rgb.double() - truth).abs()[~near_cutoff].max() < 2e-5 * float(truth.max().clamp_min(1))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"logit_opacities": -200.0},
+        {"logit_opacities": 200.0},
+        {"log_scales": math.log(1e-8)},
+        {"log_scales": math.log(1e4)},
+        {"quats": 0.0},
+        {"quats": 1e-42},
+        {"means": 1e30},
+        {"means": float("nan")},
+        {"log_scales": float("inf")},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("projection", ["ewa", "ut"])
+def test_extreme_splats_leave_image_and_gradients_finite(change, projection):
+    g = random_splats(60, 12)
+    (field, value), (first, *_) = next(iter(change.items())), [7]
+    tensor = getattr(g, field).clone()
+    tensor[first] = value
+    g = replace(g, **{field: tensor}).map(lambda t: t.requires_grad_())
+    frame = rasterize(Placed(g, translation(0, 0, 5)), CAMERA, ("rgb", "alpha"), model=SplatModel(projection=projection))
+    assert frame.rgb.isfinite().all() and frame.alpha.isfinite().all()
+    frame.rgb.sum().backward()
+    assert all(t.grad.isfinite().all() for t in g.tensors().values())
+
+
+def test_flow_follows_camera_and_instance():
+    placed = two_instances(13)
+    moved = [placed[0], replace(placed[1], world_from_local=translation(0.3, 0, 0) @ placed[1].world_from_local)]
+    other = replace(CAMERA, world_from_cam=CAMERA.world_from_cam @ translation(0.05, 0.02, 0.1))
+    frame = rasterize(placed, CAMERA, ("depth", "instance", "flow_next"), flow_to={"next": (moved, other)})
+    for instance, start, end in [(0, placed[0], moved[0]), (3, placed[1], moved[1])]:
+        rows, columns = torch.nonzero(frame.instance == instance, as_tuple=True)
+        pixel = torch.stack([columns, rows], -1).double() + 0.5
+        ray = CAMERA.lens.unproject(pixel) * frame.depth[rows, columns].double()[:, None]
+        world = ray @ CAMERA.world_from_cam[:3, :3].T + CAMERA.world_from_cam[:3, 3]
+        motion = end.world_from_local @ start.world_from_local.inverse()
+        world = world @ motion[:3, :3].T + motion[:3, 3]
+        back = other.world_from_cam.inverse()
+        expected = other.lens.project(world @ back[:3, :3].T + back[:3, 3]) - pixel
+        assert (frame.flow_next[rows, columns].double() - expected).abs().max() < 1e-3
+    sky = frame.instance == -1
+    assert sky.any() and frame.flow_next[sky].abs().max() < 1e-4  # the camera only moved
+
+
+def test_depth_far_behind_faint_splats_is_still_divided_by_its_weight():
+    g = random_splats(5, 14)
+    g = replace(g, logit_opacities=torch.full((5,), -4.0))
+    placed = [Placed(g, translation(0, 0, 5))]
+    _, alpha, depth, _, near_cutoff = oracle.render(oracle.as_oracle(placed), CAMERA, SplatModel(), cutoff=1e-8)
+    frame = rasterize(placed, CAMERA, ("depth",), config=EXACT)
+    seen = (alpha > 1e-6) & ~near_cutoff
+    assert (frame.depth[seen] / depth[seen] - 1).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda: rasterize(random_splats(3, 0), CAMERA, "rgb"), "outputs must be a tuple"),
+        (lambda: rasterize(random_splats(3, 0), CAMERA, ("rbg",)), "rgb"),
+        (lambda: rasterize(random_splats(3, 0), CAMERA, ("flow_next",)), "flow_to"),
+        (lambda: rasterize(random_splats(3, 0), replace(CAMERA, shutter="rows")), "rolling shutter"),
+        (lambda: rasterize(random_splats(3, 0), CAMERA, model=SplatModel(response="ray")), "ray"),
+        (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=torch.full((4, 4), torch.nan, dtype=torch.float64))), "not finite"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        change()
+
+
+def test_two_threads_may_render_at_once():
+    from concurrent.futures import ThreadPoolExecutor
+
+    g = random_splats(300, 15)
+    alone = rasterize(Placed(g, translation(0, 0, 5)), CAMERA).rgb
+    with ThreadPoolExecutor(2) as pool:
+        pictures = list(pool.map(lambda _: rasterize(Placed(g, translation(0, 0, 5)), CAMERA).rgb, range(6)))
+    assert all(torch.equal(alone, p) for p in pictures)
