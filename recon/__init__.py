@@ -1,0 +1,13 @@
+"""A log becomes a scene: readers, seeding, fit, densification, and the assets cut from it. Imports scenes and render only."""
+
+import importlib
+
+_HOME = {"Log": "log", "open_log": "log", "reconstruct": "reconstruct", "extract_assets": "assets"}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str):
+    if name not in _HOME:
+        raise AttributeError(f"module 'recon' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"recon.{_HOME[name]}"), name)

@@ -1,0 +1,107 @@
+"""What moves: which sweep points lie in moving boxes, when each box was really scanned, and what is left as static."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from recon.log import Log, Sweep, Track
+from scenes.poses import inverse
+
+MARGIN = 0.15
+"""Metres around a box within which points count as the object's: annotators cut close."""
+
+SWEPT_MARGIN = 0.4
+"""Metres around a moving box within which points are kept out of the static background."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Points sorted by what they belong to.
+
+    static: xyz `[N, 3]` and the sweep's index `[N]`; actors: per track name local points `[N, 3]` in the box frame and the sweep's
+    index `[N]`; tracks: the moving tracks, their times corrected to when the lidar passed over the box.
+    """
+
+    static: np.ndarray
+    static_sweep: np.ndarray
+    actors: dict[str, tuple[np.ndarray, np.ndarray]]
+    tracks: tuple[Track, ...]
+
+
+def inside(local: np.ndarray, size: np.ndarray, margin: float, below: float = 0.0) -> np.ndarray:
+    """Mask `[N]` of box-frame points within the box grown by `margin` metres; the floor by `below`."""
+    half = size[:2] / 2 + margin
+    return (np.abs(local[:, :2]) <= half).all(1) & (local[:, 2] >= -below) & (local[:, 2] <= size[2] + margin)
+
+
+def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track], report: Callable[[str, float], None] | None = None) -> Split:
+    """Sort the points of `sweeps` into static ones and those of the moving `tracks`.
+
+    A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the
+    points of that moment. So each box's time becomes the median time of the points inside it, where there are enough.
+    """
+    static, static_sweep = [], []
+    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
+    scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
+    stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
+    offsets: list[float] = []
+    for count, sweep in enumerate(sweeps):
+        points = sweep.read()
+        keep = np.ones(len(points.xyz), dtype=bool)
+        for track in tracks:
+            at = stamps[track.name].get(sweep.time_us)
+            if at is None:
+                continue
+            pose = track.world_from_box[at]
+            near = np.flatnonzero(np.abs(points.xyz[:, :2] - pose[:2, 3].numpy()).max(1) < track.size.max() + 1)
+            if not len(near):
+                continue
+            back = inverse(pose).numpy()
+            local = points.xyz[near] @ back[:3, :3].T + back[:3, 3]
+            keep[near[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
+            # the floor is left out: those are points of the road
+            own = inside(local, track.size, MARGIN, below=-0.08)
+            if own.any():
+                found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+            sensor = points.sensor[near] == track.sensor[at]
+            timed = own & sensor if (own & sensor).sum() >= 5 else own
+            if timed.sum() >= 5:
+                scanned[track.name][at] = np.median(points.times_us[near][timed])
+                offsets.append(scanned[track.name][at] - sweep.time_us)
+        keep &= _beside_body(log, sweep, points.xyz)
+        static.append(points.xyz[keep])
+        static_sweep.append(np.full(keep.sum(), sweep.index))
+        if report:
+            report("points", (count + 1) / len(sweeps))
+    usual = float(np.median(offsets)) if offsets else 0.0
+    corrected = tuple(_retimed(t, scanned[t.name], usual) for t in tracks)
+    return Split(
+        np.concatenate(static) if static else np.zeros((0, 3)),
+        np.concatenate(static_sweep) if static_sweep else np.zeros(0, np.int64),
+        {name: (np.concatenate([p for p, _ in got]), np.concatenate([s for _, s in got])) for name, got in found.items() if got},
+        corrected,
+    )
+
+
+def _beside_body(log: Log, sweep: Sweep, xyz: np.ndarray) -> np.ndarray:
+    """Mask of points that are not on the recording car itself."""
+    back = inverse(log.ego.at(sweep.time_us)).numpy()
+    local = xyz @ back[:3, :3].T + back[:3, 3]
+    return ~((np.abs(local[:, 0]) < 2.6) & (np.abs(local[:, 1]) < 1.1) & (local[:, 2] > 0.1))
+
+
+def _retimed(track: Track, scanned: np.ndarray, usual: float) -> Track:
+    """The track at the times its boxes were scanned; boxes without points take the offset of their neighbours in time."""
+    offset = scanned - track.times_us
+    known = offset != 0
+    places = np.arange(len(offset))
+    offset = np.interp(places, places[known], offset[known]) if known.any() else np.full(len(offset), usual)
+    # one odd median must not make a car jump: neighbours in time are scanned at nearly the same phase of the sweep
+    smooth = np.array([np.median(offset[max(0, i - 2) : i + 3]) for i in places])
+    times = np.round(track.times_us + smooth).astype(np.int64)
+    rising = np.concatenate([[True], np.diff(times) > 1000])
+    return replace(track, times_us=times[rising], world_from_box=track.world_from_box[torch.from_numpy(rising)], sensor=track.sensor[rising])

@@ -1,0 +1,107 @@
+"""What lidar does not reach: which pixels are sky and their first picture, and splats for the other unexplained pixels.
+
+Lidar sees about 15 degrees up and loses dark and shiny things. Buildings above it, wires, far blocks and windows get splats at
+the depth of what stands below them in the image, since facades and poles are upright.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from recon.frames import View
+from recon.seed import Cloud
+from scenes.camera import Camera
+
+FAR = 250.0
+"""Metres to things with nothing below them that lidar reaches."""
+
+STEP = 4
+"""Pixels between filling splats."""
+
+
+def sky_mask(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Pixels `[H, W]` of the sky in a uint8 image: smooth, bright enough, bluish or white, and joined to the image's top row.
+
+    `covered` `[H, W]` marks pixels where splats stand already; they are not sky.
+    """
+    rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
+    grey = rgb.mean(-1)
+    edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
+    bluish = rgb[..., 2] > rgb[..., 0] - 6
+    bright = grey > np.percentile(grey[: max(1, len(grey) // 8)], 20) * 0.6
+    smooth = (edge < 3.0) & ~covered & (bluish | (grey > 170)) & bright
+    label, _ = ndimage.label(smooth)
+    top = np.unique(label[:3][smooth[:3]])
+    return ndimage.binary_closing(np.isin(label, top), iterations=2) & ~covered
+
+
+class SkyPicture:
+    """Running sums of sky colours by direction, in the reference exposure, on an equirectangular grid `[H, 2H]`."""
+
+    def __init__(self, height: int):
+        self.sum = np.zeros((height, 2 * height, 3))
+        self.count = np.zeros((height, 2 * height))
+
+    def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray) -> None:
+        """Count the masked pixels of a uint8 image, divided by its camera's gain."""
+        rows, columns = np.nonzero(mask)
+        pixels = torch.from_numpy(np.stack([columns, rows], 1) + 0.5)
+        x, y, z = (camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T).numpy().T
+        h = len(self.sum)
+        c = ((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * h).astype(np.int64) % (2 * h)
+        r = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * h).astype(np.int64).clip(0, h - 1)
+        np.add.at(self.sum, (r, c), image[rows, columns] / 255 / gain)
+        np.add.at(self.count, (r, c), 1)
+
+    def picture(self) -> torch.Tensor:
+        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings; grey without any sample."""
+        if not self.count.any():
+            return torch.full((*self.count.shape, 3), 0.7)
+        out = np.full(self.sum.shape, np.nan)
+        sigma = 0.0
+        while np.isnan(out).any():
+            modes = ("nearest", "wrap")
+            blur = [ndimage.gaussian_filter(a, sigma, mode=modes) if sigma else a for a in (*np.moveaxis(self.sum, -1, 0), self.count)]
+            take = np.isnan(out[..., 0]) & (blur[3] > 1e-3)
+            out[take] = np.stack(blur[:3], -1)[take] / blur[3][take][:, None]
+            sigma = max(1.5, sigma * 2)
+        return torch.from_numpy(out).float()
+
+
+def unexplained(view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray) -> tuple[Cloud, np.ndarray]:
+    """World points with colours for pixels that neither splats (`alpha` `[H, W]`) nor sky explain, and their widths in metres.
+
+    One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`.
+    """
+    half = STEP // 2
+    rows, columns = np.mgrid[half : camera.height : STEP, half : camera.width : STEP]
+    solid = ndimage.uniform_filter((alpha > 0.5).astype(np.float32), STEP)[rows, columns] > 0.3
+    blocked = ndimage.uniform_filter(sky.astype(np.float32), STEP)[rows, columns] > 0.5
+    z = _from_below(np.where(solid, depth[rows, columns], np.nan))
+    want = ~solid & ~blocked
+    pixels = torch.from_numpy(np.stack([columns[want], rows[want]], 1) + 0.5)
+    rays = camera.lens.unproject(pixels).numpy()
+    local = rays * z[want][:, None]
+    pose = camera.world_from_cam.numpy()
+    colour = ndimage.uniform_filter(view.image.numpy().astype(np.float32) / 255, (STEP, STEP, 1))[rows[want], columns[want]] / gain
+    return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z[want] * STEP / float(camera.lens.fx)
+
+
+def _from_below(depth: np.ndarray) -> np.ndarray:
+    """Gaps (NaN) take the depth of the nearest known cell below in their column, else beside, else `FAR`."""
+    known = np.isfinite(depth)
+    rows = np.arange(len(depth))[:, None]
+    below = np.where(known, rows, len(depth))
+    below = np.minimum.accumulate(below[::-1], 0)[::-1]
+    filled = np.where(below < len(depth), np.take_along_axis(depth, np.minimum(below, len(depth) - 1), 0), np.nan)
+    # a single near lidar hit (a wire, a lamp) must not pull a whole column to it: the median of the columns around decides
+    padded = ndimage.generic_filter(filled[::1], _median, size=(1, 5), mode="nearest") if np.isnan(filled).any() else filled
+    filled = np.where(known, depth, padded)
+    return np.where(np.isfinite(filled), filled, FAR)
+
+
+def _median(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else np.nan

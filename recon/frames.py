@@ -1,0 +1,66 @@
+"""The pictures a fit sees: every chosen camera's frames in the chosen span, at working size, kept as uint8."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from recon.log import Log
+
+
+@dataclass(frozen=True)
+class View:
+    """One frame: the camera's place in `Frames.names`, the frame's index in the log, its time, uint8 image `[H, W, 3]`, and whether it is held out."""
+
+    camera: int
+    index: int
+    time_us: int
+    image: torch.Tensor
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera (0, 8, ...) takes no part in it."""
+
+    names: list[str]
+    width: int
+    height: int
+    views: list[View]
+
+    def training(self) -> list[View]:
+        return [v for v in self.views if not v.held_out]
+
+    def held_out(self) -> list[View]:
+        return [v for v in self.views if v.held_out]
+
+    def of(self, camera: int, held_out: bool = False) -> list[View]:
+        return [v for v in self.views if v.camera == camera and v.held_out == held_out]
+
+
+def load_frames(
+    log: Log,
+    names: list[str],
+    span_us: tuple[int, int],
+    size: tuple[int, int],
+    held_out: int,
+    report: Callable[[str, float], None] | None = None,
+) -> Frames:
+    """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
+
+    Raises ValueError where a camera has no frame left to train on, or a file does not decode.
+    """
+    views = []
+    for c, name in enumerate(names):
+        camera = log.camera(name)
+        chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
+        for i in chosen:
+            image = torch.from_numpy(camera.image(i, *size).copy())
+            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == 0))
+            if report:
+                report("images", len(views) / (len(names) * max(len(chosen), 1)))
+        if not any(v.camera == c and not v.held_out for v in views):
+            raise ValueError(f"camera {name} has no frame to train on in the chosen span; it has {len(camera)} frames, of which {len(chosen)} lie there")
+    return Frames(names, *size, views)

@@ -1,0 +1,153 @@
+"""A recorded drive: what every reader makes of its files and all that reconstruction sees of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from scenes.camera import Camera, RigCamera
+from scenes.lens import Pinhole
+from scenes.names import unknown
+from scenes.poses import inverse
+from scenes.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class LogCamera:
+    """A camera of the log: lens and native size, and per frame its file, time (us) and pose `world_from_cam` `[F, 4, 4]`."""
+
+    name: str
+    lens: Pinhole
+    width: int
+    height: int
+    files: tuple[Path, ...]
+    times_us: torch.Tensor
+    world_from_cam: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def image(self, index: int, width: int | None = None, height: int | None = None) -> np.ndarray:
+        """Frame `index` as uint8 sRGB `[H, W, 3]`, area-averaged to `width` x `height`. ValueError naming a file that does not decode."""
+        from PIL import Image
+
+        path = self.files[index]
+        try:
+            with Image.open(path) as opened:
+                picture = opened.convert("RGB")
+        except FileNotFoundError:
+            raise
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:
+            raise ValueError(f"{path} does not decode as an image ({problem}); fetch the file again") from None
+        if picture.size != (self.width, self.height):
+            raise ValueError(f"{path} is {picture.width}x{picture.height}, but the camera's first image is {self.width}x{self.height}")
+        size = (width or self.width, height or self.height)
+        return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.BOX))
+
+    def camera(self, index: int, width: int | None = None, height: int | None = None) -> Camera:
+        """The view of frame `index` at its recorded pose, resized where a size is given."""
+        native = Camera(self.lens, self.width, self.height, self.world_from_cam[index], time_us=int(self.times_us[index]))
+        return native.resized(width or self.width, height or self.height)
+
+
+@dataclass(frozen=True)
+class LidarPoints:
+    """One sweep in the world: `xyz` float64 `[N, 3]` metres, `times_us` int64 `[N]`, `sensor` int64 `[N]`."""
+
+    xyz: np.ndarray
+    times_us: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A lidar sweep, read when its points are asked for."""
+
+    index: int
+    time_us: int
+    read: Callable[[], LidarPoints] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Track:
+    """An annotated box over time. The box frame has its origin at the base centre, x forward, z up; `size` is length, width, height.
+
+    `name` is `veh_3`, `ped_1`, ...: numbered by nearness to the ego; `label` is the class as a slug ("car"); `sensor` `[T]` is the
+    lidar that saw it, -1 where the log does not say; `sources` are the log's own identifiers of the tracks merged here.
+    """
+
+    name: str
+    label: str
+    moving: bool
+    size: np.ndarray
+    times_us: np.ndarray
+    world_from_box: torch.Tensor
+    sensor: np.ndarray
+    sources: tuple[str, ...]
+
+    def trajectory(self) -> Trajectory:
+        return Trajectory(torch.from_numpy(self.times_us), self.world_from_box)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A drive: cameras by name, lidar sweeps (gaps are normal), tracks, and the body's trajectory. The world starts near its first pose."""
+
+    name: str
+    path: Path
+    cameras: dict[str, LogCamera]
+    sweeps: tuple[Sweep, ...]
+    tracks: tuple[Track, ...]
+    ego: Trajectory
+    meta: dict
+
+    def camera(self, name: str) -> LogCamera:
+        """The camera of that name; ValueError naming the nearest where there is none."""
+        if name not in self.cameras:
+            raise ValueError(unknown("camera", name, str(self.path), list(self.cameras)))
+        return self.cameras[name]
+
+    def rig(self, width: int, height: int, names: list[str] | None = None) -> dict[str, RigCamera]:
+        """The cameras as fixed to the body, at one working size: each extrinsic is the mean over its frames."""
+        rig = {}
+        for name in names or list(self.cameras):
+            cam = self.camera(name)
+            lens = cam.lens.scaled(width / cam.width, height / cam.height)
+            rig[name] = RigCamera(lens, width, height, mean_pose(self.offsets(name)), times_us=cam.times_us)
+        return rig
+
+    def offsets(self, name: str) -> torch.Tensor:
+        """`body_from_cam` `[F, 4, 4]` of every frame: the recorded camera pose as seen from the body at that moment."""
+        cam = self.camera(name)
+        bodies = torch.stack([self.ego.at(int(t)) for t in cam.times_us])
+        return inverse(bodies) @ cam.world_from_cam
+
+
+def mean_pose(poses: torch.Tensor) -> torch.Tensor:
+    """The mean of nearby poses `[F, 4, 4]`: mean position, and the rotation nearest to the mean matrix (by SVD)."""
+    u, _, v = torch.linalg.svd(poses[:, :3, :3].mean(0))
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ v))], dtype=torch.float64)) @ v
+    out = torch.eye(4, dtype=torch.float64)
+    out[:3, :3], out[:3, 3] = rotation, poses[:, :3, 3].mean(0)
+    return out
+
+
+def open_log(path: str | Path) -> Log:
+    """The drive in a folder, by the layout of its files; reads no image and no sweep yet.
+
+    Raises FileNotFoundError where there is no such folder and ValueError where its layout is not known or a file is corrupt.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path} is not a folder; give the folder of one drive, as pandaset/002")
+    if (path / "camera").is_dir():
+        from recon.pandaset import read_pandaset
+
+        return read_pandaset(path)
+    inside = sorted(p.name for p in path.iterdir() if (p / "camera").is_dir())
+    hint = f" Did you mean {path / inside[0]}?" if inside else ""
+    raise ValueError(f"{path} is not a known layout of a drive: PandaSet's has a camera/ folder.{hint}")

@@ -1,0 +1,228 @@
+"""Reads a drive in PandaSet's official layout (Xiao et al. 2021): images, json poses, pickled sweeps and cuboids.
+
+What the format means, checked by projecting sweeps and boxes into the images: camera poses are world-from-camera in OpenCV
+axes, pinhole without distortion; points and cuboids stand in the same world; the lidar pose's axes are x right, y forward,
+z up; a cuboid's `dimensions.x, y, z` are width, length, height and its length runs along its own y, so heading is yaw + 90
+degrees. An object seen by two lidars has two cuboid tracks that name each other as siblings.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from recon.unpickle import read_frame
+from scenes.lens import Pinhole
+from scenes.poses import interpolate, pose_from, translation
+from scenes.trajectory import Trajectory
+
+LABELS = {
+    "Medium-sized Truck": "truck",
+    "Semi-truck": "truck",
+    "Pickup Truck": "pickup",
+    "Pedestrian with Object": "pedestrian",
+    "Motorized Scooter": "scooter",
+    "Other Vehicle - Construction Vehicle": "construction-vehicle",
+    "Other Vehicle - Uncommon": "vehicle",
+    "Other Vehicle - Pedicab": "pedicab",
+    "Emergency Vehicle": "emergency-vehicle",
+    "Towed Object": "trailer",
+    "Cones": "cone",
+}
+KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": "cyc"}
+VEHICLES = {"car", "pickup", "truck", "bus", "vehicle", "construction-vehicle", "emergency-vehicle", "trailer", "pedicab", "train", "tram"}
+LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+PICKLES = (".pkl.gz", ".pkl")
+
+
+def read_pandaset(path: Path) -> Log:
+    """The drive in folder `path`. FileNotFoundError and ValueError name the file that is missing or wrong."""
+    lidar_times, lidar_poses = _stamped(path / "lidar")
+    body = lidar_poses @ LIDAR_FROM_BODY
+    origin = body[0, :3, 3].clone()
+    home = translation(*(-origin).tolist())
+    cameras = {folder.name: _camera(folder, home) for folder in sorted((path / "camera").iterdir()) if folder.is_dir()}
+    if not cameras:
+        raise ValueError(f"{path / 'camera'} holds no camera; PandaSet's has front_camera and five more")
+    cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != "front_camera", item[0])))
+    ego = _extended(lidar_times, home @ body)
+    sweeps = tuple(
+        Sweep(i, int(t), lambda file=file: _points(file, origin.numpy()))
+        for i, t in enumerate(lidar_times)
+        if (file := _pickle(path / "lidar", i)) is not None
+    )
+    meta = {
+        "name": f"pandaset-{path.resolve().name}",
+        "source": f"PandaSet drive {path.resolve().name}",
+        "licence": "CC BY 4.0",
+        "attribution": "PandaSet by Hesai and Scale AI",
+        "body": "lidar pose, turned to x forward, y left, z up",
+        "world_origin": origin.tolist(),
+        **_geodetic(path / "meta" / "gps.json"),
+    }
+    return Log(meta["name"], path, cameras, sweeps, _tracks(path, lidar_times, origin.numpy(), home @ body), ego, meta)
+
+
+def _json(path: Path):
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing; PandaSet's layout has it")
+    try:
+        return json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as problem:
+        raise ValueError(f"{path} is not json ({problem}); fetch the file again") from None
+
+
+def _stamped(folder: Path) -> tuple[np.ndarray, torch.Tensor]:
+    """Times int64 us `[F]` and poses float64 `[F, 4, 4]` of a sensor's folder."""
+    times, poses = _json(folder / "timestamps.json"), _json(folder / "poses.json")
+    try:
+        times_us = np.round(np.asarray(times, dtype=np.float64) * 1e6).astype(np.int64)
+        quats = torch.tensor([[p["heading"][k] for k in "wxyz"] for p in poses], dtype=torch.float64)
+        places = torch.tensor([[p["position"][k] for k in "xyz"] for p in poses], dtype=torch.float64)
+    except (KeyError, TypeError, ValueError) as problem:
+        raise ValueError(f"{folder / 'poses.json'} or timestamps.json is not as PandaSet writes it ({problem!r})") from None
+    if times_us.ndim != 1 or len(times_us) != len(poses) or not len(poses):
+        raise ValueError(f"{folder} has {times_us.size} timestamps and {len(poses)} poses; they must be as many, and not none")
+    if not (np.diff(times_us) > 0).all():
+        raise ValueError(f"{folder / 'timestamps.json'} does not rise strictly at entry {int(np.argmin(np.diff(times_us) > 0)) + 1}")
+    if not torch.isfinite(quats).all() or not torch.isfinite(places).all() or (quats.norm(dim=1) < 1e-6).any():
+        raise ValueError(f"{folder / 'poses.json'} holds a pose that is not finite or has no rotation")
+    return times_us, pose_from(quats, places)
+
+
+def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
+    from PIL import Image, UnidentifiedImageError
+
+    times_us, poses = _stamped(folder)
+    files = tuple(folder / f"{i:02d}.jpg" for i in range(len(times_us)))
+    for file in files:
+        if not file.is_file():
+            raise FileNotFoundError(f"{file} is missing; {folder / 'timestamps.json'} names {len(files)} frames")
+    try:
+        with Image.open(files[0]) as first:
+            width, height = first.size
+    except (OSError, UnidentifiedImageError) as problem:
+        raise ValueError(f"{files[0]} does not decode as an image ({problem}); fetch the file again") from None
+    lens = _json(folder / "intrinsics.json")
+    try:
+        pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
+    except (KeyError, TypeError, ValueError) as problem:
+        raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
+    return LogCamera(folder.name, pinhole, width, height, files, torch.from_numpy(times_us), home @ poses)
+
+
+def _extended(times_us: np.ndarray, poses: torch.Tensor) -> Trajectory:
+    """The body's trajectory with one more pose at either end, at constant velocity: cameras fire up to 81 ms before the first stamp."""
+    if len(times_us) > 1:
+        before, after = interpolate(poses[0], poses[1], -1.0), interpolate(poses[-2], poses[-1], 2.0)
+        times_us = np.concatenate([[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]])
+        poses = torch.cat([before[None], poses, after[None]])
+    return Trajectory(torch.from_numpy(times_us), poses)
+
+
+def _pickle(folder: Path, index: int) -> Path | None:
+    return next((folder / f"{index:02d}{end}" for end in PICKLES if (folder / f"{index:02d}{end}").is_file()), None)
+
+
+def _points(file: Path, origin: np.ndarray) -> LidarPoints:
+    table = read_frame(file)
+    missing = [k for k in "xyzt" if k not in table]
+    if missing:
+        raise ValueError(f"{file} has no column {missing[0]!r}; it has {', '.join(table)}")
+    xyz = np.stack([table[k].astype(np.float64) for k in "xyz"], 1) - origin
+    keep = np.isfinite(xyz).all(1)
+    sensor = table["d"].astype(np.int64) if "d" in table else np.zeros(len(xyz), np.int64)
+    return LidarPoints(xyz[keep], np.round(table["t"][keep].astype(np.float64) * 1e6).astype(np.int64), sensor[keep])
+
+
+def _geodetic(path: Path) -> dict:
+    if not path.is_file():
+        return {}
+    try:
+        first = _json(path)[0]
+        return {"geodetic_origin": {k: float(first[k]) for k in ("lat", "long", "height")}}
+    except (KeyError, IndexError, TypeError) as problem:
+        raise ValueError(f"{path} is not as PandaSet writes it ({problem!r})") from None
+
+
+def label_slug(label: str) -> str:
+    """"Medium-sized Truck" -> "truck", "Cones" -> "cone", and unknown classes in lower case with dashes."""
+    return LABELS.get(label) or re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "object"
+
+
+def _observations(path: Path, count: int) -> dict[str, list[dict]]:
+    """Every cuboid by its track's uuid, in time order: frame index and the row."""
+    found: dict[str, list[dict]] = {}
+    for index in range(count):
+        file = _pickle(path / "annotations" / "cuboids", index)
+        if file is None:
+            continue
+        table = read_frame(file)
+        needed = ["uuid", "label", "yaw", "stationary", *(f"{a}.{k}" for a in ("position", "dimensions") for k in "xyz")]
+        missing = [k for k in needed if k not in table]
+        if missing:
+            raise ValueError(f"{file} has no column {missing[0]!r}; it has {', '.join(table)}")
+        for row in range(len(table["uuid"])):
+            entry = {k: table[k][row] for k in needed}
+            entry["sibling"] = str(table["cuboids.sibling_id"][row]) if "cuboids.sibling_id" in table else "-"
+            entry["sensor"] = int(table["cuboids.sensor_id"][row]) if "cuboids.sensor_id" in table else -1
+            found.setdefault(str(entry["uuid"]), []).append({**entry, "frame": index, "file": file})
+    return found
+
+
+def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, bodies: torch.Tensor) -> tuple[Track, ...]:
+    observed = _observations(path, len(times_us))
+    made = []
+    for sources in _families(observed):
+        # the sibling seen longest leads, the spinning lidar's (0) on a tie; the others fill the frames it lacks
+        sources.sort(key=lambda u: (-len(observed[u]), observed[u][0]["sensor"], u))
+        by_frame: dict[int, dict] = {}
+        for uuid in sources:
+            for entry in observed[uuid]:
+                by_frame.setdefault(entry["frame"], entry)
+        entries = [by_frame[f] for f in sorted(by_frame)]
+        lead = observed[sources[0]]
+        size = np.median([[e["dimensions.y"], e["dimensions.x"], e["dimensions.z"]] for e in lead], axis=0)
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} must have positive dimensions, got {size.tolist()}")
+        base = np.array([[e["position.x"], e["position.y"], e["position.z"] - e["dimensions.z"] / 2] for e in entries]) - origin
+        half = (np.array([e["yaw"] for e in entries], dtype=np.float64) + np.pi / 2) / 2
+        poses = pose_from(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), base)
+        if not torch.isfinite(poses).all():
+            raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} stands at a place that is not finite")
+        label = label_slug(str(lead[0]["label"]))
+        moving = any(not bool(e["stationary"]) for u in sources for e in observed[u])
+        times = np.array([times_us[e["frame"]] for e in entries])
+        sensor = np.array([e["sensor"] for e in entries])
+        nearest = float((bodies[[e["frame"] for e in entries], :3, 3] - poses[:, :3, 3]).norm(dim=1).min())
+        made.append((nearest, Track("", label, moving, size, times, poses, sensor, tuple(sources))))
+    named: list[Track] = []
+    numbers: dict[str, int] = {}
+    for _, track in sorted(made, key=lambda item: (item[0], item[1].sources)):
+        kind = "veh" if track.label in VEHICLES else KINDS.get(track.label, "obj")
+        numbers[kind] = numbers.get(kind, 0) + 1
+        named.append(Track(**{**track.__dict__, "name": f"{kind}_{numbers[kind]}"}))
+    return tuple(named)
+
+
+def _families(observed: dict[str, list[dict]]) -> list[list[str]]:
+    """Tracks joined wherever one names another as its sibling."""
+    parent = {u: u for u in observed}
+
+    def root(u: str) -> str:
+        while parent[u] != u:
+            u = parent[u]
+        return u
+
+    for uuid, entries in observed.items():
+        for sibling in {e["sibling"] for e in entries} & observed.keys():
+            parent[root(uuid)] = root(sibling)
+    families: dict[str, list[str]] = {}
+    for uuid in observed:
+        families.setdefault(root(uuid), []).append(uuid)
+    return list(families.values())

@@ -1,0 +1,157 @@
+"""Where the fit starts: splats from lidar points with the images' colours, exposures, and the sky's first guess."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from recon.frames import Frames, View
+from recon.log import Log
+from scenes.gaussians import Gaussians
+from scenes.harmonics import sh_from_rgb
+from scenes.poses import inverse, quat_from_matrix
+
+OPACITY = 0.7
+THICKNESS = 0.25
+"""Of a seed across its surface, as a part of its width."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in some frame with colours in the reference camera's exposure: xyz `[N, 3]` metres, rgb `[N, 3]` 0..1."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+    def select(self, which: np.ndarray) -> Cloud:
+        return Cloud(self.xyz[which], self.rgb[which])
+
+
+def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, local_pose=None) -> np.ndarray:
+    """Colours `[C, N, 3]` of points as each camera's training frame nearest to the point's sweep shows them; NaN where it does not.
+
+    `local_pose(view)` gives world_from_local of points that move; the world otherwise.
+    """
+    out = np.full((len(frames.names), len(points), 3), np.nan, dtype=np.float32)
+    for c, name in enumerate(frames.names):
+        camera, views = log.camera(name), frames.of(c)
+        places = np.array([v.index for v in views])
+        nearest = np.abs(sweep[:, None] - places[None]).argmin(1) if len(sweep) else np.zeros(0, np.int64)
+        for k in np.unique(nearest):
+            view, mine = views[k], np.flatnonzero(nearest == k)
+            cam = camera.camera(view.index, frames.width, frames.height)
+            back = inverse(cam.world_from_cam)
+            if local_pose is not None:
+                placed = local_pose(view)
+                if placed is None:
+                    continue
+                back = back @ placed
+            row, column, seen = project(points[mine], back.numpy(), cam)
+            out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
+    return out
+
+
+def project(points: np.ndarray, cam_from_local: np.ndarray, cam) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column and whether in view, of points `[N, 3]`."""
+    local = points @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
+    z = np.maximum(local[:, 2], 1e-6)
+    column = np.floor(cam.lens.fx * local[:, 0] / z + cam.lens.cx)
+    row = np.floor(cam.lens.fy * local[:, 1] / z + cam.lens.cy)
+    seen = (local[:, 2] > 0.3) & (column >= 0) & (column < cam.width) & (row >= 0) & (row < cam.height)
+    return np.where(seen, row, 0).astype(np.int64), np.where(seen, column, 0).astype(np.int64), seen
+
+
+def first_exposures(seen: np.ndarray) -> np.ndarray:
+    """Gains `[C, 3]` of each camera against the first, from points both see; cameras that share none follow one that does.
+
+    The median ratio of colours between dark and clipped. A camera that shares no point with any keeps 1.
+    """
+    count = len(seen)
+    gains = np.ones((count, 3))
+    done = [0]
+    while len(done) < count:
+        best, found = None, 200
+        for c in set(range(count)) - set(done):
+            for d in done:
+                both = ((seen[c] > 0.08) & (seen[c] < 0.92) & (seen[d] > 0.08) & (seen[d] < 0.92)).all(1)
+                if both.sum() > found:
+                    best, found = (c, d, both), both.sum()
+        if best is None:
+            break
+        c, d, both = best
+        gains[c] = np.clip(gains[d] * np.median(seen[c][both] / seen[d][both], axis=0), 0.4, 2.5)
+        done.append(c)
+    return gains
+
+
+def merged_colours(seen: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """One colour `[N, 3]` a point in the reference exposure: from the first camera that sees it; NaN where none does."""
+    out = np.full(seen.shape[1:], np.nan)
+    for c in range(len(seen)):
+        empty = np.isnan(out[:, 0])
+        out[empty] = seen[c][empty] / gains[c]
+    return out
+
+
+def thin(cloud: Cloud, distance: np.ndarray, budget: int) -> tuple[Cloud, np.ndarray]:
+    """At most about `budget` points: one a voxel whose side grows with distance to the path. Also returns each point's voxel side.
+
+    The side is k times the distance, at least 4 cm, in half octaves; k is found by bisection so that the budget is met.
+    """
+    low, high = 1e-4, 0.3
+    chosen, sides = np.arange(len(cloud.xyz)), np.full(len(cloud.xyz), 0.04)
+    if len(cloud.xyz) > budget:
+        for _ in range(10):
+            k = np.sqrt(low * high)
+            chosen, sides = _voxels(cloud.xyz, distance, k)
+            low, high = (k, high) if len(chosen) > budget else (low, k)
+    return cloud.select(chosen), sides[chosen] if len(sides) == len(cloud.xyz) else sides
+
+
+def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
+    level = np.round(2 * np.log2(np.maximum(k * distance / 0.04, 1.0))).astype(np.int64)
+    side = 0.04 * 2.0 ** (level / 2)
+    cell = np.floor(xyz / side[:, None]).astype(np.int64) + (1 << 17)
+    key = ((level << 54) | (cell[:, 0] << 36) | (cell[:, 1] << 18) | cell[:, 2])
+    return np.sort(np.unique(key, return_index=True)[1]), side
+
+
+def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndarray | float) -> Gaussians:
+    """A flat splat a point: as wide as its neighbours are far, thin across the surface that the neighbours span.
+
+    Widths lie between a third of the point's voxel side and `largest` metres; normals by principal components of 10 neighbours.
+    """
+    n = len(cloud.xyz)
+    if n == 0:
+        return Gaussians.empty(sh_count)
+    count = min(10, n)
+    near, index = cKDTree(cloud.xyz).query(cloud.xyz, k=count, workers=2)
+    near, index = near.reshape(n, count), index.reshape(n, count)
+    width = np.clip(near[:, 1:4].mean(1) if count > 3 else sides, np.maximum(sides / 3, 0.01), largest) * 0.8
+    rotation = np.broadcast_to(np.eye(3), (n, 3, 3))
+    flat = np.zeros(n, dtype=bool)
+    if count >= 6:
+        around = cloud.xyz[index] - cloud.xyz[index].mean(1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+        flat = values[:, 0] < 0.1 * values[:, 1]
+        vectors = vectors * np.sign(np.linalg.det(vectors))[:, None, None]
+        rotation = np.where(flat[:, None, None], vectors, rotation)
+    scales = np.repeat(width[:, None], 3, 1)
+    scales[flat, 0] *= THICKNESS
+    sh = torch.zeros(n, sh_count, 3)
+    sh[:, 0] = sh_from_rgb(torch.from_numpy(cloud.rgb).float())
+    return Gaussians(
+        torch.from_numpy(cloud.xyz).float(),
+        quat_from_matrix(torch.from_numpy(np.ascontiguousarray(rotation))).float(),
+        torch.from_numpy(np.log(scales)).float(),
+        torch.full((n,), float(np.log(OPACITY / (1 - OPACITY)))),
+        sh,
+    )
+
+
+def spread(views: list[View], count: int) -> list[View]:
+    """About `count` views, spread evenly over the drive."""
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))]
