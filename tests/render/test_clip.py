@@ -1,0 +1,94 @@
+import gc
+import weakref
+
+import pytest
+import torch
+from street import START_US, STEP_US
+
+from render import render_clip, render_frame
+from render.clip import clip_cameras, clip_times, frame_rate
+from scenes import Trajectory
+
+
+def test_a_clip_has_the_recorded_frames(street):
+    frames = list(render_clip(street, "front_camera", times_us=street.frame_times("front_camera")[:3]))
+    assert [f.camera.time_us for f in frames] == [START_US, START_US + STEP_US, START_US + 2 * STEP_US]
+    assert torch.equal(frames[1].rgb, render_frame(street, street.camera("front_camera", START_US + STEP_US)).rgb)
+
+
+def test_a_positive_shift_moves_every_camera_to_the_left_of_travel(street):
+    for name in street.rig:
+        recorded, shifted = clip_cameras(street, name), clip_cameras(street, name, shift=2)
+        for a, b in zip(recorded, shifted, strict=True):
+            assert (b.world_from_cam[:3, 3] - a.world_from_cam[:3, 3]).tolist() == pytest.approx([0, 2, 0])
+            assert torch.allclose(a.world_from_cam[:3, :3], b.world_from_cam[:3, :3])
+
+
+def test_any_path_of_the_body_can_be_driven(street):
+    path = Trajectory(street.ego.times_us, street.ego.shifted(vertical=3).world_from_body)
+    (camera,) = clip_cameras(street, "front_camera", path, times_us=[START_US])
+    assert float(camera.world_from_cam[2, 3]) == pytest.approx(4.5)
+
+
+def test_the_left_of_the_road_comes_nearer_when_shifted_left(street):
+    left = next(render_clip(street, "front_camera", 2, outputs=("depth",))).depth
+    right = next(render_clip(street, "front_camera", -2, outputs=("depth",))).depth
+    assert left[20, 4] < right[20, 4]
+    assert left[20, -4] > right[20, -4]
+
+
+def test_flow_links_neighbouring_frames_of_the_clip(street):
+    times = street.frame_times("front_camera")[:3]
+    frames = list(render_clip(street, "front_camera", 1.0, times, outputs=("flow_prev", "flow_next")))
+    assert frames[0].flow_prev is None and frames[-1].flow_next is None
+    assert all(f is not None for f in (frames[0].flow_next, frames[1].flow_prev, frames[1].flow_next, frames[2].flow_prev))
+    assert frames[1].flow_next[-1, 80, 0] > 0  # the road runs outwards and down as the car drives on
+    assert frames[1].flow_prev[-1, 80, 0] < 0
+
+
+def test_other_sizes_show_the_same_view(street):
+    (small,) = render_clip(street, "front_camera", times_us=[START_US])
+    (large,) = render_clip(street, "front_camera", times_us=[START_US], width=192, height=108)
+    assert large.rgb.shape == (108, 192, 3)
+    halved = large.rgb.reshape(54, 2, 96, 2, 3).mean((1, 3))
+    assert (halved - small.rgb).abs().mean() < 0.02
+
+
+def test_frames_are_not_kept(street):
+    stream = render_clip(street, "front_camera")
+    first = next(stream)
+    gone = weakref.ref(first.rgb)
+    del first
+    next(stream)
+    gc.collect()
+    assert gone() is None
+
+
+def test_wrong_arguments_are_refused_before_the_first_frame(street):
+    with pytest.raises(ValueError, match="Did you mean front_camera"):
+        render_clip(street, "front_camra")
+    with pytest.raises(ValueError, match="Did you mean depth"):
+        render_clip(street, "front_camera", outputs=("deepth",))
+    with pytest.raises(ValueError, match="at least one frame"):
+        render_clip(street, "front_camera", times_us=[])
+    with pytest.raises(ValueError, match="outside the trajectory"):
+        render_clip(street, "front_camera", times_us=[0])
+    with pytest.raises(ValueError, match="go together"):
+        render_clip(street, "front_camera", width=64)
+
+
+def test_a_clip_can_start_later_and_end_earlier(street):
+    assert (clip_times(street, "front_camera", 200_000, 300_000) - START_US).tolist() == [200_000, 300_000, 400_000]
+    assert len(clip_times(street, "front_camera")) == 8
+
+
+def test_a_clip_can_run_at_another_rate(street):
+    times = clip_times(street, "front_camera", 0, 500_000, fps=20)
+    assert (times - START_US).tolist() == list(range(0, 500_000, 50_000))
+    assert frame_rate(times) == pytest.approx(20)
+
+
+@pytest.mark.parametrize(("start", "duration"), [(20_000_000, None), (0, 0), (-5_000_000, 1_000_000)])
+def test_a_clip_without_frames_is_refused(street, start, duration):
+    with pytest.raises(ValueError, match="8 frames over 0.7s"):
+        clip_times(street, "front_camera", start, duration)

@@ -1,0 +1,114 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from street import START_US, car
+
+from render import rasterize, render_frame
+from render.frame import world_directions
+from scenes import Gaussians, Placed, Scene
+from scenes.insert import insert
+from scenes.placement import Placement
+
+
+@pytest.fixture(scope="module")
+def camera(street):
+    return street.camera("front_camera", START_US)
+
+
+def empty(street: Scene) -> Scene:
+    return replace(street, background=Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64)), actors=())
+
+
+def test_what_was_not_asked_for_is_none(street, camera):
+    frame = render_frame(street, camera, ("depth",))
+    assert set(frame.outputs()) == {"depth"}
+    assert set(render_frame(street, camera).outputs()) == {"rgb"}
+
+
+def test_an_empty_scene_shows_the_sky(street, camera):
+    frame = render_frame(empty(street), camera, ("rgb", "alpha"))
+    assert torch.allclose(frame.rgb, street.sky.colour(world_directions(camera)))
+    assert (frame.alpha == 0).all()
+
+
+def test_up_is_blue_and_the_road_is_grey(street, camera):
+    rgb = render_frame(street, camera).rgb
+    top, bottom = rgb[0, 48], rgb[-1, 60]
+    assert top[2] > top[0] + 0.1
+    assert (bottom - bottom.mean()).abs().max() < 0.03
+
+
+def test_a_scene_without_a_sky_is_black_where_nothing_stands(street, camera):
+    frame = render_frame(replace(empty(street), sky=None), camera)
+    assert (frame.rgb == 0).all()
+
+
+def test_the_sky_is_behind_the_splats(street, camera):
+    frame = render_frame(street, camera, ("rgb", "alpha"))
+    bare = rasterize(street.placed(START_US), camera, ("rgb", "alpha"), model=street.model)
+    assert torch.equal(frame.alpha, bare.alpha)
+    opaque = bare.alpha > 0.999
+    assert torch.equal(frame.rgb[opaque], bare.rgb[opaque])
+    expected = bare.rgb + (1 - bare.alpha)[..., None] * street.sky.colour(world_directions(camera))
+    assert (frame.rgb - expected).abs().max() < 0.003  # the sky is left out where under 1/512 of it shows
+
+
+def test_exposure_comes_last(street, camera):
+    affine = torch.tensor([[0.5, 0.1, 0.0, 0.02], [0.0, 0.7, 0.0, 0.0], [0.0, 0.2, 0.9, -0.01]])
+    plain = render_frame(street, replace(camera, exposure=None)).rgb
+    exposed = render_frame(street, replace(camera, exposure=affine)).rgb
+    assert torch.allclose(exposed, plain @ affine[:, :3].T + affine[:, 3], atol=1e-6)
+
+
+def test_actors_stand_where_they_are_at_that_time(street):
+    early = render_frame(street, street.camera("front_camera", START_US), ("instance",)).instance
+    late = render_frame(street, street.camera("front_camera", START_US + 700_000), ("instance",)).instance
+    assert 0 < (early == 1).sum() < (late == 1).sum()  # it comes nearer
+
+
+def test_flow_needs_the_other_camera(street, camera):
+    with pytest.raises(ValueError, match="pass previous="):
+        render_frame(street, camera, ("rgb", "flow_prev"))
+
+
+def test_the_sky_flows_by_rotation_only(street, camera):
+    moved = street.camera("front_camera", START_US + 400_000)
+    frame = render_frame(street, camera, ("flow_next", "alpha"), following=moved)
+    sky = frame.alpha < 0.4
+    assert sky.any()
+    assert frame.flow_next[sky].abs().max() < 1e-3  # the car goes straight ahead
+    assert frame.flow_next[~sky].abs().max() > 1
+
+
+def test_unknown_outputs_name_the_nearest(street, camera):
+    with pytest.raises(ValueError, match="Did you mean depth"):
+        render_frame(street, camera, ("dept",))
+
+
+def test_gradients_reach_the_splats_and_the_sky(street, camera):
+    colour = street.sky.linear.clone().requires_grad_()
+    sh = street.background.gaussians.sh.clone().requires_grad_()
+    background = Placed(replace(street.background.gaussians, sh=sh), street.background.world_from_local)
+    scene = replace(street, sky=replace(street.sky, linear=colour), background=background)
+    render_frame(scene, replace(camera, exposure=torch.eye(3, 4) * 0.9)).rgb.sum().backward()
+    assert colour.grad.abs().sum() > 0
+    assert sh.grad.abs().sum() > 0
+
+
+def test_a_contact_shadow_darkens_the_ground_beside_an_inserted_asset_only(street, camera):
+    scene = insert(street, car(), Placement("car", 8, 2.2)).scene
+    lit = render_frame(scene, camera, ("rgb", "instance"), shadows=False)
+    shaded = render_frame(scene, camera, ("rgb", "instance"))
+    darker = (lit.rgb - shaded.rgb).amax(-1) > 0.01
+    assert darker.any()
+    assert (lit.rgb >= shaded.rgb - 1e-6).all()
+    assert not darker[lit.instance == 2].any()
+    rows, columns = (lit.instance == 2).nonzero().unbind(1)
+    y, x = darker.nonzero().unbind(1)
+    assert y.min() > rows.float().mean()  # low
+    assert x.min() >= columns.min() - 12 and x.max() <= columns.max() + 12  # near
+
+
+def test_recorded_actors_keep_the_shadows_of_their_photos(street, camera):
+    assert torch.equal(render_frame(street, camera).rgb, render_frame(street, camera, shadows=False).rgb)
