@@ -93,9 +93,9 @@ def kind_of(path: str | os.PathLike) -> str:
     if path.suffix.lower() in USD_SUFFIXES:
         from scenes.usd import open_stage, own_data
 
-        stage, _ = open_stage(path)
-        root = stage.GetDefaultPrim()
-        return "asset" if root and own_data(root).get("kind") == "asset" else "splats"
+        with open_stage(path) as stage:
+            root = stage.GetDefaultPrim()
+            return "asset" if root and own_data(root).get("kind") == "asset" else "splats"
     raise ValueError(f"{path} is not a kind of file that Sidestep knows: a scene or databank folder, .ply, {', '.join(USD_SUFFIXES)}")
 
 

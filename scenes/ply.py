@@ -8,7 +8,7 @@ properties and ASCII. It maps the file: what the header claims is checked agains
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -169,10 +169,16 @@ def _record(element: _Element, order: str) -> np.dtype:
     return np.dtype([(name, order + kind) for name, kind in element.properties.items()])
 
 
-def _columns(vertices: np.ndarray, names) -> np.ndarray:
+def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """float32 `[N, len(names)]`."""
-    out = np.empty((len(vertices), len(names)), np.float32)
+    have = list(vertices.dtype.names or ())
+    kinds = {vertices.dtype[name] for name in have}
+    first = have.index(names[0]) if names else 0
     with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, which `validate` names
+        if len(kinds) == 1 and have[first : first + len(names)] == list(names):  # as all tools write: one block of a plain table
+            table = vertices.view(kinds.pop()).reshape(len(vertices), len(have))
+            return table[:, first : first + len(names)].astype(np.float32)
+        out = np.empty((len(vertices), len(names)), np.float32)
         for i, name in enumerate(names):
             out[:, i] = vertices[name]
     return out

@@ -5,6 +5,7 @@ Everything that is only Sidestep's own (the splat model, labels, original names)
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pxr import Gf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from scenes.atomic import atomic_file
 from scenes.poses import quat_from_matrix
@@ -39,27 +40,33 @@ def new_stage(path: Path, default_prim: str) -> Iterator[Usd.Stage]:
             raise OSError(f"cannot write {path}: {first_line(error)}") from error
 
 
-def open_stage(path: Path) -> tuple[Usd.Stage, list[str]]:
-    """The composed stage and USD's warnings about it (which would otherwise go to stderr). ValueError where it is not USD."""
+@contextmanager
+def open_stage(path: Path) -> Iterator[Usd.Stage]:
+    """The composed stage of a file, fresh from the disk. What USD finds wrong inside the block becomes a ValueError."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
-    with quiet() as said:
+    with _quiet():
         try:
-            stage = Usd.Stage.Open(str(path))
+            # USD shares layers within a process, also those that have changed on disk since
+            root = Sdf.Layer.FindOrOpen(str(path))
+            root.Reload()
+            stage = Usd.Stage.Open(root)
+            for layer in stage.GetUsedLayers():
+                if os.path.exists(layer.realPath):
+                    layer.Reload()
+            yield stage
         except Tf.ErrorException as error:
             raise ValueError(f"{path} is not a whole USD file: {first_line(error)}") from error
-    return stage, said
 
 
 @contextmanager
-def quiet() -> Iterator[list[str]]:
-    """USD's warnings inside the block, as a list that is complete once it ends, instead of on stderr."""
-    said: list[str] = []
+def _quiet() -> Iterator[None]:
+    """Keep USD's warnings off stderr: a missing file is found, and told in this project's words, by who needs it."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        yield said
+        yield
     finally:
-        said += [d.commentary for d in delegate.TakeUncoalescedDiagnostics()]
+        delegate.TakeUncoalescedDiagnostics()
         del delegate
 
 
@@ -71,11 +78,10 @@ def first_line(error: Tf.ErrorException) -> str:
 
 def usd_problems(path: Path) -> list[str]:
     """What USD's own validators, all that are registered, object to in a file and all that it refers to."""
-    stage, _ = open_stage(path)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    with quiet():
+    with open_stage(path) as stage:
         errors = UsdValidation.ValidationContext(validators).Validate(stage)
-    return [" ".join(f"{e.GetName()}: {e.GetMessage()}".split()) for e in errors]
+        return [" ".join(f"{e.GetName()}: {e.GetMessage()}".split()) for e in errors]
 
 
 def valid_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
@@ -105,6 +111,10 @@ def set_own_data(prim: Usd.Prim, **data) -> None:
 
 def author_pose(prim: Usd.Prim, poses: torch.Tensor, times: list[int] | None = None) -> None:
     """Give a prim a translate and an orient op in double precision: one rigid pose `[4, 4]`, or `[T, 4, 4]` at time codes."""
+    for pose in poses.reshape(-1, 4, 4):
+        _check_rigid(str(prim.GetPath()), pose)
+    if max(map(abs, times or [0])) > 2**53:
+        raise ValueError(f"{prim.GetPath()} has a time {max(map(abs, times or [0]))} us from the drive's first, which USD cannot hold")
     xform = UsdGeom.Xformable(prim)
     translate = xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
     orient = xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
@@ -131,10 +141,15 @@ def world_poses(prim: Usd.Prim) -> tuple[list[float], torch.Tensor]:
 
 def _rigid(prim: Usd.Prim, matrix: Gf.Matrix4d) -> torch.Tensor:
     pose = torch.from_numpy(np.array(matrix).T.copy())
-    turn = pose[:3, :3]
-    if not (turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-6 or not torch.linalg.det(turn) > 0:
-        raise ValueError(f"{prim.GetPath()} has a transform that scales, shears or mirrors; splats here only move and turn")
+    _check_rigid(str(prim.GetPath()), pose)
     return pose
+
+
+def _check_rigid(where: str, pose: torch.Tensor) -> None:
+    turn = pose[:3, :3]
+    off = (turn @ turn.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max()
+    if not off < 1e-6 or not torch.linalg.det(turn) > 0 or not torch.isfinite(pose).all():
+        raise ValueError(f"{where} has a transform that scales, shears, mirrors or is not finite; poses here only move and turn")
 
 
 def array(attribute: Usd.Attribute, width: int) -> np.ndarray | None:

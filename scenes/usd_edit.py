@@ -29,14 +29,13 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     layer = scene / "edits" / f"{name}.usda"
     if layer.exists():
         raise FileExistsError(f"{scene} already has an edit {name}; choose another name")
-    stage, _ = open_stage(scene / "scene.usda")
-    prims = stage.GetPrimAtPath("/World/Actors").GetChildren()
-    standing = {own_data(p).get("track", p.GetName()) for p in prims}
+    with open_stage(scene / "scene.usda") as stage:
+        standing = {own_data(p).get("track", p.GetName()) for p in stage.GetPrimAtPath("/World/Actors").GetChildren()}
     for actor in actors:
         if actor.track in standing:
             raise ValueError(f'{scene} already has an actor "{actor.track}"; give the new one another track name')
         standing.add(actor.track)
-    names = valid_names((a.track for a in actors), [p.GetName() for p in prims])
+    names = valid_names((a.track for a in actors), [p.stem for p in scene.glob("actors/*")])  # also those of deleted edits
     files = [scene / "actors" / f"{names[a.track]}.usdc" for a in actors]
     written: list[Path] = []
     try:

@@ -68,7 +68,11 @@ def save_scene(path: Path, scene: Scene, replace: bool = False, half: bool = Fal
 def load_scene(path: Path, clean: Clean = Gaussians.checked) -> Scene:
     """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta."""
     meta = read_metadata(path)
-    stage, _ = open_stage(path / "scene.usda")
+    with open_stage(path / "scene.usda") as stage:
+        return _read_scene(stage, path, meta, clean)
+
+
+def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene:
     try:
         origin, model = int(meta["origin_us"]), SplatModel(**meta["model"])
         rig = {name: _load_camera(stage, entry, name) for name, entry in meta["cameras"].items()}

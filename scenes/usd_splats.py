@@ -37,11 +37,11 @@ def save_gaussians(path: Path, gaussians: Gaussians, model: SplatModel | None = 
 
 def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
     """The splats of a USD file that has exactly one splat prim, not under a transform."""
-    stage, _ = open_stage(path)
-    prim = only_splats(stage.GetPseudoRoot(), path)
-    if UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
-        raise ValueError(f"{path}: {prim.GetPath()} stands under a transform, which splats alone cannot carry; apply it before export")
-    return clean(read_splats(prim), str(path))
+    with open_stage(path) as stage:
+        prim = only_splats(stage.GetPseudoRoot(), path)
+        if UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
+            raise ValueError(f"{path}: {prim.GetPath()} stands under a transform, which splats alone cannot carry; apply it before export")
+        return clean(read_splats(prim), str(path))
 
 
 def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
@@ -55,11 +55,11 @@ def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
 
 def load_asset(path: Path, clean: Clean = Gaussians.checked) -> Asset:
     """The asset that `save_asset` wrote. ValueError where the file holds something else."""
-    stage, _ = open_stage(path)
-    root = stage.GetDefaultPrim()
-    if not root or own_data(root).get("kind") != "asset":
-        raise ValueError(f"{path} is not an asset: its default prim carries no label and size")
-    return read_asset(root, path, clean)
+    with open_stage(path) as stage:
+        root = stage.GetDefaultPrim()
+        if not root or own_data(root).get("kind") != "asset":
+            raise ValueError(f"{path} is not an asset: its default prim carries no label and size")
+        return read_asset(root, path, clean)
 
 
 def read_asset(root: Usd.Prim, path: Path, clean: Clean) -> Asset:
@@ -129,7 +129,7 @@ def read_splats(prim: Usd.Prim) -> Gaussians:
 
 def read_model(prim: Usd.Prim) -> SplatModel:
     """The model that a splat prim was trained with; the default one where it does not say."""
-    model = dict(own_data(prim).get("model", {}))
+    model = own_data(prim).get("model", {})
     try:
         return SplatModel(**model)
     except TypeError as error:

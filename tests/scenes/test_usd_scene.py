@@ -222,6 +222,22 @@ def test_a_transform_that_scales_is_refused(saved):
         load(saved)
 
 
+@pytest.mark.parametrize("spoil", [2.0, -1.0, float("nan")])
+def test_a_pose_that_is_not_rigid_is_refused_before_anything_is_written(tmp_path, spoil):
+    bad = scene()
+    bad.ego.world_from_body[3, 0, :3] *= spoil
+    with pytest.raises(ValueError, match="/World/Ego has a transform that scales, shears, mirrors or is not finite"):
+        save(bad, tmp_path / "s1")
+    assert not list(tmp_path.iterdir())
+
+
+def test_loading_sees_what_changed_on_disk_while_another_stage_is_open(saved):
+    held = Usd.Stage.Open(str(saved / "scene.usda"))
+    save(scene(tracks=("new",)), saved, overwrite=True)
+    assert [a.track for a in load(saved).actors] == ["new"]
+    assert held
+
+
 def test_a_scene_moved_elsewhere_still_loads(saved, tmp_path):
     shutil.move(saved, tmp_path / "elsewhere")
     same(scene(), load(tmp_path / "elsewhere"))

@@ -1,4 +1,6 @@
 import json
+import os
+import random
 import resource
 import subprocess
 import sys
@@ -197,6 +199,20 @@ def test_cut_and_damaged_usd_files_are_refused(tmp_path):
         load(tmp_path / "text.usda")
 
 
+def test_flipped_bytes_never_do_worse_than_a_value_error(tmp_path):
+    save(asset(count=100), tmp_path / "a.usdc")
+    whole, dice = (tmp_path / "a.usdc").read_bytes(), random.Random(216)
+    for i in range(60):
+        data, path = bytearray(whole), tmp_path / f"flipped{i}.usdc"
+        for _ in range(dice.choice([1, 3, 20])):
+            data[dice.randrange(len(data))] = dice.randrange(256)
+        path.write_bytes(data)
+        try:
+            load(path)
+        except ValueError as error:
+            assert path.name in str(error) or "/Asset" in str(error)
+
+
 def test_a_disk_that_fills_up_leaves_no_file(tmp_path):
     code = f"""
 import resource, sys
@@ -219,8 +235,6 @@ for name in ("new.usdc", "new.ply", "old.usdc", "old.ply"):
 
 
 def environment():
-    import os
-
     return os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 
