@@ -78,6 +78,9 @@ def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
     half_x, half_y = 0.15 * settings.width / v.fx, 0.15 * settings.height / v.fy  # the 0.3 of 1.3 tan, on either side
     v.clamp_left, v.clamp_right = -v.cx / v.fx - half_x, (settings.width - v.cx) / v.fx + half_x
     v.clamp_top, v.clamp_bottom = -v.cy / v.fy - half_y, (settings.height - v.cy) / v.fy + half_y
+    margin = 4 * math.sqrt(settings.model.dilation) + 1
+    v.left, v.right = -(v.cx + margin) / v.fx, (settings.width - v.cx + margin) / v.fx
+    v.top, v.bottom = -(v.cy + margin) / v.fy, (settings.height - v.cy + margin) / v.fy
     v.width, v.height, v.tiles_x, v.tiles_y = settings.width, settings.height, settings.tiles_x, settings.tiles_y
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
     v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count

@@ -14,7 +14,8 @@ from scenes.harmonics import evaluate
 from scenes.poses import inverse, matrix_from_quat
 
 NEAR = 0.1
-NEAREST = 0.25
+NEAREST = 0.5
+REACH = 3.33
 
 
 def to_float64(g: Gaussians) -> dict[str, torch.Tensor]:
@@ -22,28 +23,52 @@ def to_float64(g: Gaussians) -> dict[str, torch.Tensor]:
     return {name: t.detach().double().requires_grad_() for name, t in g.tensors().items()}
 
 
+def sides(lens: torch.Tensor, width: int, height: int, margin: float):
+    """Left, right, top, bottom of the image widened by a margin in pixels (x, y), as x/z and y/z."""
+    fx, fy, cx, cy = lens.detach().tolist()
+    mx, my = margin if isinstance(margin, tuple) else (margin, margin)
+    return -(cx + mx) / fx, (width - cx + mx) / fx, -(cy + my) / fy, (height - cy + my) / fy
+
+
+def clamped(points: torch.Tensor, lens: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """Where the Jacobian is taken: xy / z, no further out than 1.3 times half the view."""
+    left, right, top, bottom = sides(lens, width, height, (0.15 * width, 0.15 * height))
+    x, y, z = points.unbind(-1)
+    return torch.stack([(x / z).clamp(left, right), (y / z).clamp(top, bottom)], -1)
+
+
+def in_view(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, width: int, height: int, dilation: float) -> torch.Tensor:
+    """Mask of splats beyond the near plane whose ellipsoid of 3.33 sigma is not wholly beyond one side of the view."""
+    left, right, top, bottom = sides(lens, width, height, 4 * math.sqrt(dilation) + 1)
+    seen = points[:, 2] > NEAR
+    for plane in ([1, 0, -right], [-1, 0, left], [0, 1, -bottom], [0, -1, top]):
+        normal = torch.tensor(plane, dtype=torch.float64)
+        seen &= points @ normal <= REACH * (axes.transpose(1, 2) @ normal).norm(dim=-1)
+    return seen
+
+
 def project_ewa(points: torch.Tensor, covariance: torch.Tensor, lens: torch.Tensor, width: int, height: int):
     fx, fy, cx, cy = lens
     x, y, z = points.unbind(-1)
-    jx = (x / z).clamp(-(cx / fx + 0.15 * width / fx).item(), ((width - cx) / fx + 0.15 * width / fx).item())
-    jy = (y / z).clamp(-(cy / fy + 0.15 * height / fy).item(), ((height - cy) / fy + 0.15 * height / fy).item())
+    jx, jy = clamped(points, lens, width, height).unbind(-1)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([torch.stack([fx / z, zero, -fx * jx / z], -1), torch.stack([zero, fy / z, -fy * jy / z], -1)], -2)
     mean = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     return mean, jacobian @ covariance @ jacobian.transpose(-1, -2)
 
 
-def project_ut(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor):
-    """Sigma points at +-sqrt(3) along `axes` (columns, scaled); one nearer than a quarter of the centre's depth lies at that quarter."""
+def project_ut(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, width: int, height: int):
+    """Sigma points at +-sqrt(3) along `axes` (columns, scaled); one nearer than half the centre's depth lies at that half."""
     fx, fy, cx, cy = lens
     root = math.sqrt(3.0)
     centre = points[:, :2] / points[:, 2:]
+    n = clamped(points, lens, width, height)
     sigma = []
     for sign in (root, -root):
         offset = sign * axes.transpose(1, 2)  # [N, 3 axes, 3]
         depth = torch.maximum(points[:, None, 2] + offset[..., 2], NEAREST * points[:, None, 2])
-        # the sight line n = xy / z is kept, the offset from it is divided by the sigma point's own depth
-        sigma.append(centre[:, None] + (offset[..., :2] - centre[:, None] * offset[..., 2:]) / depth[..., None])
+        # the offset from the sight line n = xy / z is divided by the sigma point's own depth
+        sigma.append(centre[:, None] + (offset[..., :2] - n[:, None] * offset[..., 2:]) / depth[..., None])
     pixels = torch.cat([centre[:, None], *sigma], 1) * torch.stack([fx, fy]) + torch.stack([cx, cy])  # [N, 7, 2]
     mean_weights = torch.tensor([0.0] + [1 / 6] * 6, dtype=torch.float64)
     covariance_weights = torch.tensor([2.0] + [1 / 6] * 6, dtype=torch.float64)
@@ -78,12 +103,12 @@ def render(
         axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
         parts.append((points, axes, colour, torch.sigmoid(g["logit_opacities"]), torch.full((len(points),), instance)))
     points, axes, colour, opacity, instances = (torch.cat(p) for p in zip(*parts, strict=True))
-    keep = points[:, 2] > NEAR
+    keep = in_view(points, axes, lens, camera.width, camera.height, model.dilation)
     points, axes, colour, opacity, instances = (t[keep] for t in (points, axes, colour, opacity, instances))
     if model.projection == "ewa":
         mean, covariance = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
     else:
-        mean, covariance = project_ut(points, axes, lens)
+        mean, covariance = project_ut(points, axes, lens, camera.width, camera.height)
     dilated = covariance + model.dilation * torch.eye(2, dtype=torch.float64)
     if model.antialias:
         opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()

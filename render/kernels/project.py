@@ -7,8 +7,10 @@ nothing is measured from the image origin. Then
 
     covariance = sum_k w_k e_k e_k' + mu mu',   mu = sum_k b_k e_k,   w = (r+^2 + r-^2) / 6,  b = (r+ - r-) / 6
 
-and its determinant is a sum of squares (Cauchy-Binet), so that needles keep all their digits. A sigma point nearer than a
-quarter of the centre's depth, or behind the camera, is projected as if it lay at that quarter: continuous and bounded.
+and its determinant is a sum of squares (Cauchy-Binet), so that needles keep all their digits. Near the camera plane the moments of
+a perspective Gaussian diverge and a splat beside the car would flood the image, so: a sigma point nearer than half the centre's
+depth, or behind the camera, is projected as if it lay at that half; n is taken no further out than 1.3 times half the view; and
+a splat is not drawn when its ellipsoid of 3.33 sigma lies wholly beyond one side of the view. All continuous where it can be seen.
 """
 
 import warp as wp
@@ -52,7 +54,8 @@ from render.kernels.types import (
 wp.set_module_options(OPTIONS)
 
 ROOT3 = wp.constant(1.7320508075688772)
-NEAREST = wp.constant(0.25)
+NEAREST = wp.constant(0.5)
+REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1/255
 CULLED = wp.constant(2147483647)
 TINY = wp.constant(1.0e-30)
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
@@ -148,9 +151,7 @@ def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
     """axes: the splat's principal directions in the camera, as columns; scale in metres."""
     f = Footprint()
     z = t[2]
-    f.n = wp.vec2(t[0] / z, t[1] / z)
-    if view.unscented == 0:
-        f.n = wp.vec2(wp.clamp(f.n[0], view.clamp_left, view.clamp_right), wp.clamp(f.n[1], view.clamp_top, view.clamp_bottom))
+    f.n = wp.vec2(wp.clamp(t[0] / z, view.clamp_left, view.clamp_right), wp.clamp(t[1] / z, view.clamp_top, view.clamp_bottom))
     f.u = project_axis(scale[0] * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
     f.v = project_axis(scale[1] * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
     f.w = project_axis(scale[2] * wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)
@@ -167,6 +168,19 @@ def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
     f.det0 = f.u.w * f.v.w * uv * uv + f.u.w * f.w.w * uw * uw + f.v.w * f.w.w * vw * vw
     f.det0 += f.u.w * um * um + f.v.w * vm * vm + f.w.w * wm * wm
     return f
+
+
+@wp.func
+def beyond(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, side: wp.vec3):
+    """Whether the splat's ellipsoid lies wholly on the positive side of the plane through the eye with normal `side`."""
+    along = wp.cw_mul(wp.transpose(axes) * side, scale)
+    return wp.dot(side, t) > REACH * wp.length(along)
+
+
+@wp.func
+def in_view(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
+    outside = beyond(t, axes, scale, wp.vec3(1.0, 0.0, -view.right)) or beyond(t, axes, scale, wp.vec3(-1.0, 0.0, view.left))
+    return not (outside or beyond(t, axes, scale, wp.vec3(0.0, 1.0, -view.bottom)) or beyond(t, axes, scale, wp.vec3(0.0, -1.0, view.top)))
 
 
 @wp.func
@@ -195,45 +209,48 @@ def project(
     t = pose.rotation * means[i] + pose.translation
     opacity = sigmoid(logit_opacities[i])
     if t[2] > view.near and wp.log(opacity) + view.log_cutoff > 0.0:
-        f = footprint(t, pose.rotation * rotation(quats[i]), exp_scale(log_scales[i]), view)
-        xx = f.xx + view.dilation
-        yy = f.yy + view.dilation
-        det = f.det0 + view.dilation * (f.xx + f.yy + view.dilation)
-        if view.antialias != 0:
-            opacity = opacity * wp.sqrt(f.det0 / wp.max(det, TINY))
-        s_max = wp.log(wp.max(opacity, TINY)) + view.log_cutoff
-        # written so that a NaN anywhere culls the splat instead of spreading
-        if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
-            k2 = 0.5 * yy / det
-            k = wp.sqrt(k2)
-            m = f.xy / yy
-            h = 0.5 / yy
-            c = k2 * m * m + h
-            records[j, X] = view.fx * t[0] / t[2] + view.cx + f.mu[0]
-            records[j, Y] = view.fy * t[1] / t[2] + view.cy + f.mu[1]
-            records[j, K] = k
-            records[j, M] = m
-            records[j, H] = h
-            records[j, OPACITY] = opacity
-            records[j, S_MAX] = s_max
-            records[j, Z] = t[2]
-            records[j, INSTANCE] = pose.instance
-            records[j, Y_EXT] = wp.sqrt(s_max / h)
-            records[j, INV_K] = 1.0 / k
-            records[j, INV_C] = 1.0 / c
-            records[j, Y_AT_EXT] = k * m * wp.sqrt(s_max / (c * h))
-            rows = tile_rows(records, j, view.tiles_y)
-            total = int(0)
-            for ty in range(rows[0], rows[1] + 1):
-                columns = tile_columns(records, j, ty, view.tiles_x)
-                total += wp.max(columns[1] - columns[0] + 1, 0)
-            counts[j] = total
-            if total > 0:
-                depth_keys[j] = wp.cast(t[2], int)
-                colour = harmonics(sh, i, view.sh_count, wp.normalize(means[i] - pose.eye))
-                records[j, RED] = wp.max(colour[0], 0.0)
-                records[j, GREEN] = wp.max(colour[1], 0.0)
-                records[j, BLUE] = wp.max(colour[2], 0.0)
+        axes = pose.rotation * rotation(quats[i])
+        scale = exp_scale(log_scales[i])
+        if in_view(t, axes, scale, view):
+            f = footprint(t, axes, scale, view)
+            xx = f.xx + view.dilation
+            yy = f.yy + view.dilation
+            det = f.det0 + view.dilation * (f.xx + f.yy + view.dilation)
+            if view.antialias != 0:
+                opacity = opacity * wp.sqrt(f.det0 / wp.max(det, TINY))
+            s_max = wp.log(wp.max(opacity, TINY)) + view.log_cutoff
+            # written so that a NaN anywhere culls the splat instead of spreading
+            if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
+                k2 = 0.5 * yy / det
+                k = wp.sqrt(k2)
+                m = f.xy / yy
+                h = 0.5 / yy
+                c = k2 * m * m + h
+                records[j, X] = view.fx * t[0] / t[2] + view.cx + f.mu[0]
+                records[j, Y] = view.fy * t[1] / t[2] + view.cy + f.mu[1]
+                records[j, K] = k
+                records[j, M] = m
+                records[j, H] = h
+                records[j, OPACITY] = opacity
+                records[j, S_MAX] = s_max
+                records[j, Z] = t[2]
+                records[j, INSTANCE] = pose.instance
+                records[j, Y_EXT] = wp.sqrt(s_max / h)
+                records[j, INV_K] = 1.0 / k
+                records[j, INV_C] = 1.0 / c
+                records[j, Y_AT_EXT] = k * m * wp.sqrt(s_max / (c * h))
+                rows = tile_rows(records, j, view.tiles_y)
+                total = int(0)
+                for ty in range(rows[0], rows[1] + 1):
+                    columns = tile_columns(records, j, ty, view.tiles_x)
+                    total += wp.max(columns[1] - columns[0] + 1, 0)
+                counts[j] = total
+                if total > 0:
+                    depth_keys[j] = wp.cast(t[2], int)
+                    colour = harmonics(sh, i, view.sh_count, wp.normalize(means[i] - pose.eye))
+                    records[j, RED] = wp.max(colour[0], 0.0)
+                    records[j, GREEN] = wp.max(colour[1], 0.0)
+                    records[j, BLUE] = wp.max(colour[2], 0.0)
 
 
 @wp.func

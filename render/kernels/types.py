@@ -36,7 +36,11 @@ class View:
     fy: float
     cx: float
     cy: float
-    clamp_left: float  # EWA evaluates its Jacobian no further out than these x/z, y/z (Kerbl et al. 2023: 1.3 tan of half the view)
+    left: float  # the sides of the view, as x/z and y/z, widened by the dilation's reach
+    right: float
+    top: float
+    bottom: float
+    clamp_left: float  # the Jacobian is taken no further out than these (Kerbl et al. 2023: 1.3 tan of half the view)
     clamp_right: float
     clamp_top: float
     clamp_bottom: float
