@@ -27,15 +27,8 @@ def load(path: str | os.PathLike) -> Scene | Asset | Gaussians:
 
 def load_dropping(path: str | os.PathLike) -> tuple[Scene | Asset | Gaussians, int]:
     """As `load`, but leaves out splats whose values are not finite or not a rotation, and says how many those were."""
-    dropped = 0
-
-    def clean(gaussians: Gaussians, where: str) -> Gaussians:
-        nonlocal dropped
-        bad = gaussians.invalid()
-        dropped += int(bad.sum())
-        return gaussians.select(~bad)
-
-    return read(path, clean), dropped
+    clean = Dropping()
+    return read(path, clean), clean.count
 
 
 def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: bool = False, half: bool = False) -> None:
@@ -97,6 +90,18 @@ def kind_of(path: str | os.PathLike) -> str:
             root = stage.GetDefaultPrim()
             return "asset" if root and own_data(root).get("kind") == "asset" else "splats"
     raise ValueError(f"{path} is not a kind of file that Sidestep knows: a scene or databank folder, .ply, {', '.join(USD_SUFFIXES)}")
+
+
+class Dropping:
+    """Leaves out splats whose values are not finite or not a rotation, and counts them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, gaussians: Gaussians, where: str) -> Gaussians:
+        bad = gaussians.invalid()
+        self.count += int(bad.sum())
+        return gaussians.select(~bad)
 
 
 def as_is(gaussians: Gaussians, where: str) -> Gaussians:

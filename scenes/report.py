@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import torch
 
 from scenes.asset import Asset
 from scenes.databank import Databank, Entry
-from scenes.files import USD_SUFFIXES, kind_of, read, splats_of
+from scenes.files import USD_SUFFIXES, as_is, kind_of, read, splats_of
 from scenes.gaussians import Gaussians
 from scenes.lens import Pinhole
 from scenes.scene import Scene
@@ -47,11 +47,12 @@ def summary(told: dict) -> list[str]:
     return [line for key, value in told.items() for line in _lines(key, value)]
 
 
-def validate(path: str | os.PathLike) -> list[str]:
+def validate(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = as_is) -> list[str]:
     """What is wrong with a scene, databank, PLY or USD file, one sentence a problem; [] where nothing is.
 
     Checks that everything loads, that values are finite and rotations are rotations, that scales are plausible, that no file
-    is missing, and runs USD's own validators. FileNotFoundError where the path itself does not exist.
+    is missing, and runs USD's own validators. With `clean` a `Dropping`, splats that it leaves out are counted there and are no
+    problem. FileNotFoundError where the path itself does not exist.
     """
     path = Path(path)
     try:
@@ -60,9 +61,9 @@ def validate(path: str | os.PathLike) -> list[str]:
         return [str(error)]
     problems: list[str] = []
     if kind == "databank":
-        return list(_databank_problems(path))
+        return list(_databank_problems(path, clean))
     try:
-        thing = read(path)
+        thing = read(path, clean)
     except (ValueError, OSError) as error:
         problems.append(str(error))
     else:
@@ -204,7 +205,7 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
             yield f"{where}: edit {edit['name']} is missing: edits/{edit['name']}.usda was deleted"
 
 
-def _databank_problems(path: Path) -> Iterator[str]:
+def _databank_problems(path: Path, clean: Callable[[Gaussians, str], Gaussians]) -> Iterator[str]:
     try:
         bank = Databank(path)
         entries = bank.entries()
@@ -218,12 +219,13 @@ def _databank_problems(path: Path) -> Iterator[str]:
         if file in lost:
             continue
         try:
-            asset = bank.load(entry.id, clean=lambda gaussians, where: gaussians)
+            asset = bank.load(entry.id, clean)
         except (ValueError, OSError) as error:
             yield str(error)
             continue
         yield from _splat_problems(asset.gaussians, entry.id)
-        if len(asset.gaussians) != entry.splats or asset.label != entry.label or asset.size.tolist() != list(entry.size):
+        counted = clean is not as_is or len(asset.gaussians) == entry.splats
+        if not counted or asset.label != entry.label or asset.size.tolist() != list(entry.size):
             yield f"{entry.id} differs from what index.json says of it: {len(asset.gaussians)} splats, {asset.label}, {asset.size.tolist()}"
         yield from _usd_problems(file)
     known = {path / Path(e.asset).parent for e in entries}

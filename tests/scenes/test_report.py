@@ -5,6 +5,7 @@ import torch
 from randomized import asset, gaussians, scene, trajectory
 
 from scenes import Actor, Databank, Gaussians, add_edit, describe, save, validate
+from scenes.files import Dropping
 from scenes.report import summary
 
 
@@ -88,6 +89,8 @@ def test_bad_splats_are_problems_and_counted(tmp_path, monkeypatch):
     told, problems = describe(tmp_path / "a.ply"), validate(tmp_path / "a.ply")
     assert told["invalid_splats"] == 2 and "invalid splats" in text(tmp_path / "a.ply")
     assert len(problems) == 2 and "splat 4 has nan in means" in problems[0] and "splat 3 has the scales 3.27e+06" in problems[1]
+    dropping = Dropping()
+    assert len(validate(tmp_path / "a.ply", dropping)) == 1 and dropping.count == 2
 
 
 def test_missing_and_foreign_files_are_problems(saved, bank, tmp_path):
