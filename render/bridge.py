@@ -129,7 +129,7 @@ class Rasterize(torch.autograd.Function):
             planes, last = _composite(settings, lists, records)
         ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
         ctx.records, ctx.counts, ctx.last, ctx.final_t = records, counts, last, planes[0]
-        ctx.pose_dtype, ctx.lens_dtype = cam_from_local.dtype, lens.dtype
+        ctx.like_pose, ctx.like_lens = cam_from_local.new_empty(0), lens.new_empty(0)
         rgb = settings.crop(planes[1:4])
         alpha = 1 - settings.crop(planes[0])
         z, weights = settings.crop(planes[4:6]) if settings.depth else (None, None)
@@ -171,7 +171,7 @@ class Rasterize(torch.autograd.Function):
         g_pose = sums.new_zeros(len(sums), 4, 4)
         g_pose[:, :3, :3] = sums[:, :9].reshape(-1, 3, 3)
         g_pose[:, :3, 3] = sums[:, 9:12]
-        return None, g_pose.to(ctx.pose_dtype), sums[:, 12:].sum(0).to(ctx.lens_dtype), *outputs
+        return None, g_pose.to(ctx.like_pose), sums[:, 12:].sum(0).to(ctx.like_lens), *outputs
 
 
 def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
