@@ -38,9 +38,13 @@ class Validate:
     """Count splats with values that are not finite, and check what is left without them."""
 
     def run(self) -> None:
+        from scenes.files import Dropping, as_is
         from scenes.report import validate
 
-        problems = validate(self.path)
+        dropping = Dropping()
+        problems = validate(self.path, dropping if self.drop_invalid else as_is)
+        if dropping.count:
+            print(f"{dropping.count} splats dropped: their values are not finite")
         for problem in problems:
             print(problem)
         if problems:
