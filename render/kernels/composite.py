@@ -44,6 +44,7 @@ from render.kernels.types import (
 
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
+ROLLED = OPTIONS | {"max_unroll": 8}  # loops over a tile's 16 rows stay loops: unrolled they compile ten times as long and run no faster
 EARLY = wp.constant(16)  # entries between two looks at whether the whole tile has terminated
 
 
@@ -87,7 +88,7 @@ def composite(depth: bool, instance: bool, squarings: int):
     scale = 0.5**squarings
     root = scale**0.5
 
-    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
         tiles_x: int, tiles: int, bands: int, alpha_max: float, termination: float,
@@ -174,7 +175,7 @@ def composite_gradient(depth: bool, squarings: int):
     scale = 0.5**squarings
     root = scale**0.5
 
-    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
+    @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
         tiles_x: int, tiles: int, bands: int, alpha_max: float,
