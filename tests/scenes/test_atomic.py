@@ -1,4 +1,6 @@
 import errno
+import subprocess
+import sys
 
 import pytest
 
@@ -50,6 +52,18 @@ def test_a_folder_is_replaced_only_when_asked_to(tmp_path):
     with atomic_folder(target, replace=True) as partial:
         (partial / "new").write_text("new")
     assert listing(tmp_path) == ["s1"] and listing(target) == ["new"]
+
+
+def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path):
+    code = f"""
+import os, signal
+from scenes.atomic import atomic_file, atomic_folder
+with atomic_folder({str(tmp_path / "s1")!r}) as folder, atomic_file({str(tmp_path / "a.ply")!r}) as file:
+    (folder / "half").write_text("half"); file.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -9
+    assert all(name.startswith(".") for name in listing(tmp_path))
 
 
 def test_writing_into_a_missing_folder_names_it(tmp_path):

@@ -1,3 +1,4 @@
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -58,8 +59,6 @@ def test_gaussians_of_the_wrong_shape_type_or_device_are_refused(change, said):
 def test_impossible_values_are_refused_with_what_was_wanted_and_what_came(make, said):
     with pytest.raises(ValueError) as error:
         make()
-    import re
-
     assert said in str(error.value) or re.search(said, str(error.value))
 
 
