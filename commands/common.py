@@ -25,16 +25,28 @@ def fresh(path: Path, overwrite: bool) -> Path:
 
 
 def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
-    """The scene of a folder, and what was dropped from it. ValueError where it is something else, or empty."""
-    from scenes import Scene, load
-    from scenes.files import load_dropping
+    """The scene of a folder, and what was dropped from it. ValueError where it is something else, empty, or not finite."""
+    from scenes import Scene
+    from scenes.files import Dropping, read
 
-    thing, dropped = load_dropping(path) if drop_invalid else (load(path), 0)
+    dropping = Dropping()
+    thing = read(path, dropping if drop_invalid else _refuse)
     if not isinstance(thing, Scene):
         raise ValueError(f"{path} holds {_kind(thing)}, not a scene; give a folder that sidestep recon wrote")
     if not len(thing.background.gaussians) and not thing.actors:
         raise ValueError(f"{path} is empty: it has no splats and no actors; reconstruct it again with sidestep recon")
-    return thing, [f"dropped {dropped} splats with values that are not finite"] if dropped else []
+    return thing, [dropped(dropping.count)] if dropping.count else []
+
+
+def dropped(count: int) -> str:
+    return f"dropped {count} splat{'s' * (count != 1)} with values that are not finite"
+
+
+def _refuse(gaussians: Gaussians, where: str) -> Gaussians:
+    try:
+        return gaussians.checked(where)
+    except ValueError as error:
+        raise ValueError(f"{error}; give --drop-invalid to leave them out") from error
 
 
 def _kind(thing: Asset | Gaussians | Scene) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from commands.common import dropped
 from commands.written import AnyPath, Flag
 
 
@@ -43,10 +44,10 @@ class Validate:
 
         dropping = Dropping()
         problems = validate(self.path, dropping if self.drop_invalid else as_is)
-        if dropping.count:
-            print(f"{dropping.count} splats dropped: their values are not finite")
         for problem in problems:
             print(problem)
+        if dropping.count:
+            print(dropped(dropping.count))
         if problems:
             raise ValueError(f"{self.path} has {len(problems)} problem{'s' * (len(problems) > 1)}")
         print(f"{self.path} is valid")

@@ -1,0 +1,280 @@
+"""The front door as a user meets it: separate processes where exit codes and output count, small scenes everywhere."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import street as made
+import torch
+
+from render.video import VideoWriter, read_video
+from scenes import Databank, Gaussians, Placed, load, save
+from scenes.usd_splats import save_gaussians
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory) -> Path:
+    """A folder with a scene, a databank and a clip; read-only by agreement."""
+    folder = tmp_path_factory.mktemp("desk")
+    save(made.street(), folder / "street")
+    bank = Databank(folder / "bank")
+    bank.add(made.car())
+    bank.add(made.car("van", (0.8, 0.8, 0.2)))
+    with VideoWriter(folder / "clip.mp4", 10, 64, 48) as video:
+        for _ in range(3):
+            video.write(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(1)))
+    return folder
+
+
+def sidestep(folder: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess:
+    """Run the command line in a folder and check its exit code; never a traceback."""
+    run = subprocess.run([sys.executable, "-m", "sidestep", *words], cwd=folder, env=environment(), capture_output=True, text=True)
+    assert run.returncode == code, run.stderr
+    assert "Traceback" not in run.stderr
+    return run
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(REPOSITORY), "COLUMNS": "400"}
+
+
+@pytest.fixture
+def door(desk, monkeypatch, capsys):
+    """Call the front door in this process, which has its packages loaded: (words, exit code) -> (stdout, stderr)."""
+    import sidestep as front
+
+    monkeypatch.chdir(desk)
+    monkeypatch.setenv("COLUMNS", "400")
+    before = signal.getsignal(signal.SIGTERM)
+
+    def call(words: list[str], code: int = 0) -> tuple[str, str]:
+        try:
+            front.main(words)
+            ended = 0
+        except SystemExit as end:
+            ended = end.code
+        out, errors = capsys.readouterr()
+        assert ended == code, errors
+        return out, errors
+
+    yield call
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_the_main_job_makes_a_video_and_a_report(desk, tmp_path):
+    sidestep(
+        desk, "render", "street", "--camera", "front_camera", "--lateral-shift", "2m", "--size", "64x36", "--duration", "300ms",
+        "--insert", "car/0001@9m,2.5m", "--insert", "van/0001@7m,-300cm,yaw=5deg,speed=8m/s", "--databank", "bank",
+        "-o", str(tmp_path / "out.mp4"), "--outputs", "instance",
+    )  # fmt: skip
+    assert len(list(read_video(tmp_path / "out.mp4"))) == 3
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["lateral_shift_m"] == 2
+    assert [i["label"] for i in told["inserted"]] == ["car", "van"]
+    seen = np.load(tmp_path / "out" / "instance" / "000000.npy")
+    assert {2, 3} <= set(np.unique(seen))
+
+
+def test_an_inserted_asset_stays_in_the_scene_until_its_layer_goes(desk, tmp_path):
+    shutil.copytree(desk / "street", tmp_path / "street")
+    before = (tmp_path / "street" / "background.usdc").read_bytes()
+    place = ["--at", "20m,-3.5m", "--yaw", "-5deg", "--speed", "8m/s"]
+    run = sidestep(tmp_path, "insert", "street", "--asset", "car/0001", *place, "--databank", str(desk / "bank"))
+    assert "edits/inserted_car_0001.usda" in run.stdout
+    scene = load(tmp_path / "street")
+    (actor,) = [a for a in scene.actors if a.asset.meta.get("inserted")]
+    assert actor.trajectory.at(made.START_US)[:2, 3].tolist() == pytest.approx([20, -3.5])
+    assert (tmp_path / "street" / "background.usdc").read_bytes() == before
+    (tmp_path / "street" / "edits" / "inserted_car_0001.usda").unlink()
+    assert len(load(tmp_path / "street").actors) == 1
+
+
+def test_an_asset_can_follow_a_csv(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.5,15,0\n")
+    path = ["--trajectory", str(tmp_path / "t.csv")]
+    door(["insert", str(tmp_path / "street"), "--asset", "car/0001", *path, "--databank", "bank"])
+    actor = load(tmp_path / "street").actors[-1]
+    assert actor.trajectory.at(made.START_US + 250_000)[:2, 3].tolist() == pytest.approx([12.5, 0])
+
+
+def test_the_databank_is_listed_and_shown(door):
+    listed, _ = door(["assets", "list", "--databank", "bank"])
+    assert "car/0001" in listed and "van/0001" in listed and "2 assets" in listed
+    shown, _ = door(["assets", "show", "van/0001", "--databank", "bank"])
+    for part in ("4.20 m long", "van", "860", "3", "CC0-1.0", "made for tests"):
+        assert part in shown
+
+
+@pytest.mark.parametrize("path", ["street", "bank", "street/background.usdc", "bank/assets/car/0001/asset.usdc"])
+def test_info_and_validate_take_all_kinds_of_path(door, path):
+    assert "splats" in door(["info", path])[0]
+    assert json.loads(door(["info", path, "--json"])[0])["splats"] > 0
+    assert "is valid" in door(["validate", path])[0]
+
+
+SHOOT = ["render", "street", "--camera", "front_camera", "-o", "x.mp4"]
+INSERT = ["insert", "street", "--asset", "car/0001"]
+USAGE = [
+    (["rendr"], 'command "rendr" is not in sidestep; it has recon, assets,', "Did you mean render?"),
+    ([*SHOOT, "--lateral-shift", "2"], "--lateral-shift", '"2" has no unit; write 2m (metres) or 200cm'),
+    ([*SHOOT, "--lateral-shift", "2deg"], "--lateral-shift", "an angle, not a length"),
+    ([*SHOOT, "--start", "3"], "--start", '"3" has no unit; write 3s (seconds) or 3000ms'),
+    ([*SHOOT, "--size", "640"], "--size", "as 640x360"),
+    ([*SHOOT, "--outputs", "dept"], "--outputs", "Did you mean depth?"),
+    ([*SHOOT, "--insert", "car/0001"], "--insert", "write ID@X,Y"),
+    ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, as 10"),
+    ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
+    (["render", "street", "-o", "x.mp4"], "--camera", "required"),
+    (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
+    ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
+    ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
+    (["assets", "lst"], "lst", "list"),
+]
+
+
+@pytest.mark.parametrize(("words", "what", "fix"), USAGE, ids=[" ".join(case[0][-2:]) for case in USAGE])
+def test_wrong_usage_says_what_and_the_fix_and_exits_2(door, words, what, fix):
+    _, errors = door(words, 2)
+    message = " ".join(errors.replace("│", " ").split())
+    assert what in message and fix in message
+
+
+CAMERAS = "it has front_camera, left_camera. Did you mean front_camera?"
+DATA = [
+    (["render", "street", "--camera", "frnt", "-o", "x.mp4"], f'camera "frnt" is not in street; {CAMERAS}'),
+    (["render", "stret", *SHOOT[2:]], "stret does not exist. Did you mean street?"),
+    (["render", "bank", *SHOOT[2:]], "bank is a databank"),
+    (["render", "street/background.usdc", *SHOOT[2:]], "street/background.usdc holds splats, not a scene"),
+    ([*SHOOT[:-1], "clip.mp4"], "clip.mp4 exists; give -w to replace it"),
+    ([*SHOOT[:-1], "x.gif"], "must end in .mp4"),
+    ([*SHOOT[:-1], "no/x.mp4"], "the folder no does not exist; create it first"),
+    ([*SHOOT, "--start", "20s"], "front_camera has 8 frames over 0.7s"),
+    ([*SHOOT, "--insert", "van/2@5m,0m", "--databank", "bank"], "it has car/0001, van/0001. Did you mean van/0001?"),
+    ([*SHOOT, "--insert", "car/0001@5m,0m"], "databank is not a databank"),
+    ([*SHOOT, "--insert", "car/0001@trajectory=t.csv", "--databank", "bank"], "t.csv"),
+    ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "outside the trajectory"),
+    (["assets", "show", "cra/0001", "--databank", "bank"], "Did you mean car/0001?"),
+    (["enhance", "street/metadata.json", "-o", "x.mp4"], "street/metadata.json cannot be decoded as video"),
+    (["enhance", "gone.mp4", "-o", "x.mp4"], "gone.mp4"),
+    (["enhance", "clip.mp4", "-o", "clip.mp4"], "clip.mp4 exists"),
+    (["enhance", "clip.mp4", "-o", "x.mp4", "--weights", "gone.safetensors"], "gone.safetensors"),
+    (["recon", "nowhere", "-o", "x"], "nowhere"),
+    (["recon", "bank", "-o", "x"], "not a known layout"),
+    (["info", "clip.mp4"], "clip.mp4 is not a kind of file that Sidestep knows"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), DATA, ids=[f"{case[0][0]} {case[1][:30]}" for case in DATA])
+def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
+    _, errors = door(words, 1)
+    (line,) = [line for line in errors.splitlines() if line.startswith("sidestep: ")]
+    assert message in line
+    assert not list(desk.glob("x*")) and not list(desk.glob(".x*"))
+
+
+def test_an_empty_scene_is_refused(door, tmp_path):
+    scene = replace(made.street(), background=Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64)), actors=())
+    save(scene, tmp_path / "empty")
+    _, errors = door(["render", str(tmp_path / "empty"), *SHOOT[2:]], 1)
+    assert "empty is empty" in errors
+
+
+def test_a_databank_entry_with_a_missing_file_is_named(door, tmp_path):
+    shutil.copytree("bank", tmp_path / "bank")
+    (tmp_path / "bank" / "assets" / "car" / "0001" / "asset.usdc").unlink()
+    _, errors = door([*SHOOT, "--insert", "car/0001@5m,0m", "--databank", str(tmp_path / "bank")], 1)
+    assert "asset.usdc" in errors
+    assert "car/0001 lacks its file" in door(["validate", str(tmp_path / "bank")], 1)[0]
+
+
+@pytest.fixture
+def spoiled(tmp_path) -> Path:
+    """A PLY of ten splats, two of which are not finite."""
+    from scenes.ply import save_ply
+
+    splats = made.splats(torch.rand(10, 3, generator=torch.Generator().manual_seed(0)), (0.5, 0.5, 0.5), (0.1, 0.1, 0.1))
+    splats.means[3, 1], splats.sh[7] = float("nan"), float("inf")
+    save_ply(tmp_path / "a.ply", splats)
+    return tmp_path / "a.ply"
+
+
+def test_nan_in_a_splat_file_is_named_and_refused(door, spoiled):
+    out, errors = door(["validate", str(spoiled)], 1)
+    assert "splat 3 has nan in means" in out
+    assert "problem" in errors
+    assert json.loads(door(["info", str(spoiled), "--json"])[0])["invalid_splats"] == 2
+
+
+def test_nan_is_dropped_and_counted_when_asked(door, spoiled):
+    out, _ = door(["validate", str(spoiled), "--drop-invalid"])
+    assert "dropped 2 splats" in out and "is valid" in out
+
+
+def test_nan_in_a_scene_is_refused_or_dropped(door, tmp_path, monkeypatch):
+    shutil.copytree("street", tmp_path / "street")
+    splats = made.street().background.gaussians
+    splats.log_scales[5] = float("nan")
+    save_gaussians(tmp_path / "street" / "background.usdc", splats, made.street().model)
+    monkeypatch.chdir(tmp_path)
+    words = [*SHOOT, "--size", "32x18", "--duration", "100ms"]
+    assert "splat 5" in (errors := door(words, 1)[1]) and "--drop-invalid" in errors
+    door([*words, "--drop-invalid"])
+    assert "dropped 1 splat with" in json.loads((tmp_path / "x.json").read_text())["warnings"][0]
+
+
+def test_existing_outputs_are_replaced_with_w(door, tmp_path):
+    words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "--duration", "100ms"]
+    (tmp_path / "out.json").write_text("precious")
+    assert "out.json exists" in door(words, 1)[1]
+    assert not (tmp_path / "out.mp4").exists()
+    door([*words, "-w"])
+    assert json.loads((tmp_path / "out.json").read_text())["size"] == [32, 18]
+
+
+def begin(folder: Path, desk: Path) -> subprocess.Popen:
+    """Start a long render and wait until it writes."""
+    words = ["render", str(desk / "street"), "--camera", "front_camera", "--size", "320x180", "--fps", "500", "-o", "out.mp4"]
+    process = subprocess.Popen([sys.executable, "-m", "sidestep", *words], cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not any(p.name.startswith(".out") for p in folder.iterdir()):
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.05)
+    return process
+
+
+@pytest.mark.parametrize(("stop", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_a_stopped_render_leaves_no_half_file_under_the_final_name(desk, tmp_path, stop, code):
+    process = begin(tmp_path, desk)
+    time.sleep(0.3)
+    process.send_signal(stop)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors
+    left = [p.name for p in tmp_path.iterdir()]
+    assert "out.mp4" not in left and "out.json" not in left
+    if stop != signal.SIGKILL:
+        assert left == []
+    if stop == signal.SIGINT:
+        assert "sidestep: interrupted" in errors
+
+
+def test_a_full_disk_leaves_no_half_file(desk, tmp_path):
+    """A limit on the size of files stands in for the disk: the write fails in the middle."""
+    code = "import resource, sys, signal, sidestep; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+    code += "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); sidestep.main(sys.argv[1:])"
+    words = ["render", str(desk / "street"), "--camera", "front_camera", "--size", "320x180", "-o", "out.mp4"]
+    run = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert run.returncode == 1, run.stderr
+    assert "Traceback" not in run.stderr
+    assert os.listdir(tmp_path) == []
