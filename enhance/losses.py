@@ -22,13 +22,32 @@ def pixel_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor) ->
     error = out - target
     total = error.new_zeros(())
     for part, weight in ((region, 1.0), (1 - region, 0.5)):
-        area = part.sum((1, 2, 3)) * 3
-        some = area > 30
-        absolute = (error.abs() * part).sum((1, 2, 3)) / area.clamp_min(1)
-        squared = (error.square() * part).sum((1, 2, 3)) / area.clamp_min(1)
-        each = absolute + 0.02 * torch.log(squared + 5e-5)
-        total = total + weight * torch.where(some, each, 0).sum() / some.sum().clamp_min(1)
+        absolute, some = _part_mean(error.abs(), part)
+        squared, _ = _part_mean(error.square(), part)
+        each = absolute + 0.05 * torch.log(squared + 1e-4)
+        total = total + weight * (each * some).sum() / some.sum().clamp_min(1)
     return total
+
+
+def gate_loss(logits: torch.Tensor, ungated: torch.Tensor, target: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """Teaches the gate its region and the change its target apart from each other.
+
+    Only their product reaches the picture: a closed gate hides the change's error and a useless change closes the gate, and
+    training would end there. Cross entropy of the gate's `logits` `[B, 1, H, W]`, and the error of the `ungated` frame in the region.
+    """
+    total = logits.new_zeros(())
+    for part, sign in ((region, -1.0), (1 - region, 1.0)):
+        each, some = _part_mean(F.softplus(sign * logits), part)
+        total = total + 0.05 * (each * some).sum() / some.sum().clamp_min(1)
+    absolute, some = _part_mean((ungated - target).abs(), region)
+    return total + (absolute * some).sum() / some.sum().clamp_min(1)
+
+
+def _part_mean(value: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Means `[B]` of `value` `[B, C, H, W]` weighted by `part` `[B, 1, H, W]`, and which samples have any such pixels, 0 or 1."""
+    area = part.sum((1, 2, 3)) * value.shape[1]
+    some = (area > 30).to(value.dtype)
+    return (value * part).sum((1, 2, 3)) / area.clamp_min(1), some
 
 
 def temporal_loss(out: torch.Tensor, previous: torch.Tensor, flow: torch.Tensor, visible: torch.Tensor) -> torch.Tensor:

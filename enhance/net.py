@@ -197,11 +197,13 @@ def hard_gate(logits: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Enhanced:
-    """What one step gives: the frame `[B, 3, H, W]`, its latent `[B, 16, H/8, W/8]` for the history, and the gate `[B, 1, H, W]`."""
+    """What one step gives: the frame `[B, 3, H, W]`, its latent `[B, 16, H/8, W/8]` for the history, the gate's logits `[B, 1, H, W]`,
+    and what the frame would be with an open gate `[B, 3, H, W]`."""
 
     rgb: torch.Tensor
     latent: torch.Tensor
-    gate: torch.Tensor
+    logits: torch.Tensor
+    ungated: torch.Tensor
 
 
 class Net(nn.Module):
@@ -243,9 +245,9 @@ class Net(nn.Module):
         tokens = self.norm(x).permute(0, 3, 1, 2)
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
         coefficients, residual, logits = self.decoder(tokens, enhanced, half, quarter, eighth)
-        gate = hard_gate(logits.float())
+        logits = logits.float()
         change = colour_change(rgb.float(), coefficients.float()) + residual.float()
-        return Enhanced(rgb + gate * change, enhanced.float(), gate)
+        return Enhanced(rgb + hard_gate(logits) * change, enhanced.float(), logits, rgb + change)
 
     def _history(self, latents: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Tokens of the history `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""

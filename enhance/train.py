@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional as F
 
 from enhance.autoencoder import STRIDE, Autoencoder
-from enhance.losses import PatchPerceptual, pixel_loss, temporal_loss
+from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, temporal_loss
 from enhance.net import Net, NetConfig
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
@@ -238,8 +238,9 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
             out = net(sample.input[:, t], sample.mask[:, t], latents, valid)
             with torch.no_grad():
                 wanted = net.encoder(sample.target[:, t].contiguous(memory_format=torch.channels_last))
-            seen = perceptual(out.rgb, sample.target[:, t], rng)
+            seen = perceptual(out.rgb, sample.target[:, t], rng) if c.perceptual else 0.0
         loss = pixel_loss(out.rgb, sample.target[:, t], sample.region[:, t]) + c.perceptual * seen
+        loss = loss + gate_loss(out.logits, out.ungated, sample.target[:, t], sample.region[:, t])
         loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
         if previous is not None:
             loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])
