@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -120,8 +120,8 @@ class _Clip:
         self.scene, self.start = scene, start
         height = round(config.width * camera.height / camera.width)
         indices = range(start, min(start + config.frames, len(camera)))
-        exposure = scene.rig[camera.name].exposure
-        self.cameras = [replace(camera.camera(i, config.width, height), exposure=exposure) for i in indices]
+        # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
+        self.cameras = [scene.camera(camera.name, int(camera.times_us[i])).resized(config.width, height) for i in indices]
         self.target = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in indices])
         # Seeded by name: a clip is the same whichever others are made beside it.
         digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from enhance.autoencoder import Encoder
-from enhance.losses import PatchPerceptual, pixel_loss, temporal_loss
+from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, temporal_loss
 
 
 def test_pixel_loss_is_least_at_the_target_and_counts_small_regions_fully():
@@ -21,6 +21,15 @@ def test_pixel_loss_has_a_gradient_without_region():
     out = torch.rand(1, 3, 16, 16, requires_grad=True)
     pixel_loss(out, torch.zeros(1, 3, 16, 16), torch.zeros(1, 1, 16, 16)).backward()
     assert out.grad is not None and torch.isfinite(out.grad).all() and out.grad.abs().sum() > 0
+
+
+def test_gate_loss_opens_the_gate_in_the_region_and_closes_it_elsewhere():
+    target, region = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
+    region[:, :, :16] = 1
+    right, wrong = (2 * region - 1) * 8, (1 - 2 * region) * 8
+    assert gate_loss(right, target, target, region) < 0.001 < 0.1 < gate_loss(wrong, target, target, region)
+    assert gate_loss(right, target + 0.1 * region, target, region) > 0.09
+    assert gate_loss(right, target + 0.1 * (1 - region), target, region) < 0.001
 
 
 def test_temporal_loss_is_zero_for_a_picture_that_moves_with_its_flow():
