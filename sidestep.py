@@ -16,6 +16,7 @@ import tyro
 from tyro.conf import subcommand
 
 from commands.common import UsageError
+from commands.demo import Demo
 from commands.files import Info, Validate
 from commands.reconstruct import Assets, Recon
 from commands.repair import Enhance, Pairs, Train
@@ -25,7 +26,7 @@ from scenes.names import unknown
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
 COMMANDS = {
     "recon": Recon, "assets": Assets, "insert": Insert, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
-    "info": Info, "validate": Validate,
+    "info": Info, "validate": Validate, "demo": Demo,
 }  # fmt: skip
 
 

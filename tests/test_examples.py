@@ -1,0 +1,78 @@
+"""The examples and the demo run, on a small scene."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+import street as made
+
+from enhance.net import Net
+from enhance.weights_file import save_net
+from render.video import read_image, read_video
+from scenes import Databank, save
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SMALL = {"width": 64, "height": 48}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """A folder like examples/data, of a made-up street, and the weights of an untrained network, which changes nothing."""
+    folder = tmp_path_factory.mktemp("data")
+    save(made.street(), folder / "drive002")
+    for _ in range(2):
+        Databank(folder / "databank").add(made.car())
+    save_net(Net(), folder / "weights.safetensors", {})
+    return folder
+
+
+def example(number: str):
+    (path,) = EXAMPLES.glob(f"{number}_*.py")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_examples_are_short_and_numbered():
+    for i, path in enumerate(sorted(EXAMPLES.glob("*.py")), 1):
+        assert path.name.startswith(f"{i:02d}_")
+        assert 20 <= len(path.read_text().splitlines()) <= 90
+
+
+def test_splats_are_rendered(tmp_path, capsys):
+    example("01").main(tmp_path / "ring.png")
+    picture = read_image(tmp_path / "ring.png")
+    assert picture.shape == (360, 640, 3)
+    assert picture.std() > 0.1
+    assert "depth" in capsys.readouterr().out
+
+
+def test_a_drive_is_shifted(data, tmp_path):
+    example("02").main(data / "drive002", width=64, output=tmp_path / "shifted.png")
+    assert read_image(tmp_path / "shifted.png").std() > 0.1
+
+
+def test_assets_are_inserted(data, tmp_path):
+    example("03").main(data / "drive002", data / "databank", 2, **SMALL, output=tmp_path / "inserted.mp4")
+    assert len(list(read_video(tmp_path / "inserted.mp4"))) == 2
+
+
+def test_a_clip_is_enhanced(data, tmp_path):
+    weights = str(data / "weights.safetensors")
+    example("04").main(data / "drive002", weights, 2, **SMALL, output=tmp_path / "enhanced.mp4")
+    assert len(list(read_video(tmp_path / "enhanced.mp4"))) == 2
+
+
+def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monkeypatch):
+    from commands import demo
+
+    monkeypatch.setattr(demo, "WIDTH", 64)
+    monkeypatch.setattr(demo, "HEIGHT", 48)
+    demo.demonstrate(data, tmp_path, str(data / "weights.safetensors"))
+    assert len(list(read_video(tmp_path / "out.mp4"))) == 8
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["lateral_shift_m"] == 2 and len(told["inserted"]) == 2
+    assert {"render", "enhance", "write"} <= set(told["ms_per_frame"])
+    assert read_image(tmp_path / "contact.png").shape[1] > 4 * 64
