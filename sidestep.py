@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command.run()
     except UsageError as error:
         fail(error, 2)
-    except KeyboardInterrupt:
-        fail("interrupted", 130)
+    except KeyboardInterrupt as stop:
+        fail(stop if str(stop) else "interrupted", 130)
     except BrokenPipeError:
         os._exit(1)  # whoever read our output has gone: there is nobody left to tell
     except (ValueError, OSError) as error:

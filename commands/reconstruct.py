@@ -36,7 +36,10 @@ class Recon:
 
         fresh(self.output, self.overwrite)
         log = open_log(self.data)
-        reconstruct(log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume)
+        try:
+            reconstruct(log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
 
 
 @dataclass

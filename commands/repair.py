@@ -63,7 +63,10 @@ class Train:
 
         with Progress("train", 1000) as steps:
             say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
-            weights = train(self.pairs, self.output, minutes=self.time / 60e6, seed=self.seed, resume=self.resume, progress=say)
+            try:
+                weights = train(self.pairs, self.output, minutes=self.time / 60e6, seed=self.seed, resume=self.resume, progress=say)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
         print(f"wrote {weights}; use it with --weights {weights}")
 
 

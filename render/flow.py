@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
@@ -22,16 +23,18 @@ def image_flow(
     device = depth.device
     other_from_world = inverse(other.world_from_cam)
     moved = {p.instance: p.world_from_local for p in there}
-    rays = camera.lens.unproject(camera.pixel_centres().to(device)).to(torch.float32)
+    rays = camera_rays(camera).to(device)
     sky = depth.isinf() | (instance < 0)
     points = rays * torch.where(sky, torch.ones_like(depth), depth)[..., None]
     turn = (other_from_world @ camera.world_from_cam)[:3, :3].to(device, torch.float32)
     out = points @ turn.T
+    seen = set(instance.unique().tolist())
     for p in placed:
+        if p.instance not in seen:
+            continue
         end = moved.get(p.instance, p.world_from_local)
         motion = (other_from_world @ end @ inverse(p.world_from_local) @ camera.world_from_cam).to(device, torch.float32)
         mine = (instance == p.instance) & ~sky
-        if mine.any():
-            out[mine] = points[mine] @ motion[:3, :3].T + motion[:3, 3]
+        out[mine] = points[mine] @ motion[:3, :3].T + motion[:3, 3]
     flow = other.lens.project(out) - camera.lens.project(points)
     return torch.where(out[..., 2:] > 0, flow, torch.nan).to(torch.float32)

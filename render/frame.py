@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import torch
 
 from render.frame_types import Frame, RenderConfig
 from render.outputs import check_outputs
 from render.rasterize import rasterize
+from render.rays import world_directions
 from render.shadow import cast, shadow_casters
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -72,7 +72,7 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Ca
     through = alpha.detach() < 1 - SKY_SHOWS
     if not through.any():
         return rgb
-    behind = sky.colour(world_directions(camera)[through]) * (1 - alpha[through])[..., None]
+    behind = sky.colour(world_directions(camera).to(alpha.device)[through]) * (1 - alpha[through])[..., None]
     return rgb.index_put((through,), behind, accumulate=True)
 
 
@@ -82,17 +82,3 @@ def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     if torch.equal(exposure, torch.eye(3, 4).to(exposure)):
         return rgb
     return rgb @ exposure[:, :3].T + exposure[:, 3]
-
-
-def world_directions(camera: Camera) -> torch.Tensor:
-    """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length."""
-    params = tuple(camera.lens.params().tolist())
-    rays = _rays(type(camera.lens), params, camera.width, camera.height)  # type: ignore[arg-type]  # mypy hashes the instance
-    return rays @ camera.world_from_cam[:3, :3].detach().to(torch.float32).T
-
-
-@lru_cache(maxsize=16)
-def _rays(lens_type: type, params: tuple[float, ...], width: int, height: int) -> torch.Tensor:
-    """float32 `[H, W, 3]` directions in the camera: the same for every frame of a clip."""
-    camera = Camera(lens_type(*params), width, height, torch.eye(4, dtype=torch.float64))
-    return camera.lens.unproject(camera.pixel_centres()).to(torch.float32)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from render.frame_types import Frame
+from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -52,14 +53,16 @@ def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
     camera, rgb = frame.camera, frame.rgb.clone()
     for caster in casters:
         x0, y0, x1, y1 = caster.window
+        receives = frame.instance[y0:y1, x0:x1] != caster.instance
         depth = frame.depth[y0:y1, x0:x1].detach()
-        receives = (frame.instance[y0:y1, x0:x1] != caster.instance) & torch.isfinite(depth)
-        depth = torch.where(receives, depth, torch.ones_like(depth)).double()
-        rays = camera.lens.unproject(camera.pixel_centres()[y0:y1, x0:x1].to(depth.device))
-        asset_from_cam = (caster.asset_from_world @ camera.world_from_cam).to(depth.device)
-        points = (rays * depth[..., None]) @ asset_from_cam[:3, :3].T + asset_from_cam[:3, 3]
-        shade = shade_at(points, caster.half) * receives
-        rgb[y0:y1, x0:x1] = rgb[y0:y1, x0:x1] * (1 - shade)[..., None].to(rgb)
+        receives &= torch.isfinite(depth)
+        rows, columns = receives.nonzero(as_tuple=True)
+        rays = camera_rays(camera)[y0:y1, x0:x1].to(depth.device)[rows, columns]
+        asset_from_cam = (caster.asset_from_world @ camera.world_from_cam).to(depth.device, torch.float32)
+        points = (rays * depth[rows, columns, None]) @ asset_from_cam[:3, :3].T + asset_from_cam[:3, 3]
+        light = rgb.new_ones(y1 - y0, x1 - x0)
+        light[rows, columns] = 1 - shade_at(points, caster.half).to(rgb)
+        rgb[y0:y1, x0:x1] *= light[..., None]
     return rgb
 
 

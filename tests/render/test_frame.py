@@ -5,7 +5,7 @@ import torch
 from street import START_US, car
 
 from render import rasterize, render_frame
-from render.frame import world_directions
+from render.rays import world_directions
 from scenes import Gaussians, Placed, Scene
 from scenes.insert import insert
 from scenes.placement import Placement
