@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from scenes import Actor, Asset, Gaussians, Ground, Pinhole, Placed, RigCamera, Scene, Sky, SplatModel, Trajectory
+from scenes import Actor, Asset, Gaussians, Ground, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import pose_from, translation
 
@@ -93,7 +93,6 @@ def street() -> Scene:
         sky=sky(),
         ego=Trajectory(times, ego),
         rig=rig(),
-        model=SplatModel(projection="ewa"),  # the unscented transform of the houses abeam covers the whole image
         ground=Ground(torch.zeros(40, 60), (-10.0, -20.0), 1.0),
         meta={"name": "street", "source": "made for tests", "licence": "CC0-1.0"},
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
+COMMANDS = ["recon", "assets", "insert", "render", "pairs", "train", "enhance", "info", "validate", "demo"]
 ORDER = ["scenes", "render", "recon", "enhance", "commands"]
 
 
@@ -55,7 +56,7 @@ def test_importing_scenes_loads_torch_and_numpy_only():
     "arguments",
     [
         ["--help"],
-        ["render", "--help"],
+        *([command, "--help"] for command in COMMANDS),
         ["render", "somewhere", "--camera", "front_camera", "--lateral-shift", "2", "-o", "out.mp4"],
         ["render", "somewhere", "--camera", "front_camera", "--insert", "car/0003@12,3.5m", "-o", "out.mp4"],
         ["insert", "somewhere", "--asset", "car/0003", "--at", "20m"],
