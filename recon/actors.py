@@ -104,4 +104,5 @@ def _retimed(track: Track, scanned: np.ndarray, usual: float) -> Track:
     smooth = np.array([np.median(offset[max(0, i - 2) : i + 3]) for i in places])
     times = np.round(track.times_us + smooth).astype(np.int64)
     rising = np.concatenate([[True], np.diff(times) > 1000])
-    return replace(track, times_us=times[rising], world_from_box=track.world_from_box[torch.from_numpy(rising)], sensor=track.sensor[rising])
+    poses = track.world_from_box[torch.from_numpy(rising)]
+    return replace(track, times_us=times[rising], world_from_box=poses, sensor=track.sensor[rising])

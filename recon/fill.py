@@ -17,7 +17,7 @@ from scenes.camera import Camera
 FAR = 250.0
 """Metres to things with nothing below them that lidar reaches."""
 
-STEP = 4
+STEP = 6
 """Pixels between filling splats."""
 
 
@@ -70,7 +70,9 @@ class SkyPicture:
         return torch.from_numpy(out).float()
 
 
-def unexplained(view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray) -> tuple[Cloud, np.ndarray]:
+def unexplained(
+    view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray
+) -> tuple[Cloud, np.ndarray]:
     """World points with colours for pixels that neither splats (`alpha` `[H, W]`) nor sky explain, and their widths in metres.
 
     One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`.

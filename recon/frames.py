@@ -12,7 +12,7 @@ from recon.log import Log
 
 @dataclass(frozen=True)
 class View:
-    """One frame: the camera's place in `Frames.names`, the frame's index in the log, its time, uint8 image `[H, W, 3]`, and whether it is held out."""
+    """One frame: the camera's place in `Frames.names`, its index in the log, time, uint8 image `[H, W, 3]`; held out or not."""
 
     camera: int
     index: int
@@ -62,5 +62,5 @@ def load_frames(
             if report:
                 report("images", len(views) / (len(names) * max(len(chosen), 1)))
         if not any(v.camera == c and not v.held_out for v in views):
-            raise ValueError(f"camera {name} has no frame to train on in the chosen span; it has {len(camera)} frames, of which {len(chosen)} lie there")
+            raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
     return Frames(names, *size, views)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def read_pandaset(path: Path) -> Log:
     cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != "front_camera", item[0])))
     ego = _extended(lidar_times, home @ body)
     sweeps = tuple(
-        Sweep(i, int(t), lambda file=file: _points(file, origin.numpy()))
+        Sweep(i, int(t), partial(_points, file, origin.numpy()))
         for i, t in enumerate(lidar_times)
         if (file := _pickle(path / "lidar", i)) is not None
     )
@@ -151,7 +152,7 @@ def _geodetic(path: Path) -> dict:
 
 
 def label_slug(label: str) -> str:
-    """"Medium-sized Truck" -> "truck", "Cones" -> "cone", and unknown classes in lower case with dashes."""
+    """A class as a slug: `Medium-sized Truck` is truck, `Cones` cone; unknown classes in lower case with dashes."""
     return LABELS.get(label) or re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "object"
 
 

@@ -25,9 +25,12 @@ NUMPY_NAMES = {
 class Record:
     """What stands in for a pandas object: its arguments and its state, and nothing that runs."""
 
+    args: tuple = ()
+    state: object = None
+
     def __new__(cls, *args, **_kwargs):
         self = object.__new__(cls)
-        self.args, self.state = args, None
+        self.args = args
         return self
 
     def __init__(self, *args, **kwargs):
@@ -69,7 +72,7 @@ def read_frame(path: str | Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is not read: {problem}") from None
     except (EOFError, gzip.BadGzipFile, zlib.error) as problem:
         raise ValueError(f"{path} is cut off or corrupt ({problem}); fetch the file again") from None
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError, ImportError, MemoryError, OverflowError, RecursionError) as problem:
+    except (AttributeError, LookupError, TypeError, ValueError, ImportError, MemoryError, OverflowError, RecursionError) as problem:
         raise ValueError(f"{path} does not hold a pandas table ({type(problem).__name__}: {problem})") from None
 
 

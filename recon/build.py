@@ -1,0 +1,167 @@
+"""The public call: a log becomes a scene on disk."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
+from recon.fit import POSE_UNITS, Fit, FitConfig, run, scaled
+from recon.frames import Frames, load_frames
+from recon.log import Log, Track
+from recon.model import MODEL, Knots, small_poses
+from recon.report import held_out_table, table_text
+from recon.start import Start, prepare
+from render.progress import Progress
+from scenes.asset import Actor, Asset
+from scenes.camera import RigCamera
+from scenes.files import save
+from scenes.gaussians import Placed
+from scenes.poses import inverse
+from scenes.scene import Scene
+from scenes.sky import Sky, linear_from_srgb
+from scenes.trajectory import Trajectory
+
+DEFAULT_CAMERAS = ("front_camera", "front_left_camera", "front_right_camera")
+SIZE = (960, 540)
+
+
+def reconstruct(
+    log: Log,
+    output: str | Path,
+    cameras: Sequence[str] | None = None,
+    start_us: int = 0,
+    duration_us: int | None = None,
+    size: tuple[int, int] = SIZE,
+    held_out: int = 8,
+    resume: bool = False,
+    config: FitConfig = FitConfig(),  # noqa: B008 - frozen
+    half: bool = False,
+) -> Scene:
+    """Fit a scene to a log's images and write it to the folder `output`; it must not exist.
+
+    cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
+    are fitted. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr. An interrupted fit
+    leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
+    half: splats in half precision, where the file's size matters.
+
+    Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
+    """
+    output = Path(output)
+    if output.exists():
+        raise FileExistsError(f"{output} exists already; choose another folder or remove it")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
+    began = time.monotonic()
+    names = list(cameras or [n for n in DEFAULT_CAMERAS if n in log.cameras] or list(log.cameras)[:1])
+    span = _span(log, names, start_us, duration_us)
+    options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
+    options["config"] = plain_config(config)
+    checkpoint = checkpoint_path(output)
+    saved = load_checkpoint(checkpoint, options) if resume else None
+
+    with Progress("images") as steps:
+        frames = load_frames(log, names, span, size, held_out, lambda _what, _part: steps.step())
+    with Progress("prepare") as steps:
+        coefficients = (config.sh_degree + 1) ** 2
+        start = saved[0] if saved else prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))
+    fit = _fit(frames, start, config)
+    if saved:
+        fit.restore(saved[1])
+    spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
+
+    def keep() -> None:
+        save_checkpoint(checkpoint, options, start, fit.tensors() | {"seconds": spent_before + time.monotonic() - began})
+
+    with Progress("fit", total=config.steps) as steps:
+        steps.step(fit.step_count)
+        run(fit, keep, lambda f: steps.step(note=f"loss {f.recent_loss:.4f}  {len(f.splats)} splats"))
+    keep()  # the report and the writing below may be interrupted too
+    scene = assemble(fit, start, log, {"options": options})
+    rows = held_out_table(scene, frames)
+    scene.meta["held_out"] = rows
+    scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
+    print(table_text(rows), file=sys.stderr)
+    save(scene, output, half=half)
+    checkpoint.unlink(missing_ok=True)
+    return scene
+
+
+def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) -> tuple[int, int]:
+    """First and last moment, counted from the first frame of the first camera."""
+    times = log.camera(names[0]).times_us
+    for name in names:
+        log.camera(name)
+    length = int(times[-1] - times[0])
+    if not 0 <= start_us <= length:
+        raise ValueError(f"start {start_us / 1e6:g}s is outside the drive, which lasts {length / 1e6:g}s")
+    if duration_us is not None and duration_us <= 0:
+        raise ValueError(f"duration {duration_us / 1e6:g}s must be positive; the drive lasts {length / 1e6:g}s")
+    # the cameras of a rig fire up to a tenth of a second apart: half a step around keeps whole frames together
+    slack = int(times.diff().double().median()) // 2 if len(times) > 1 else 0
+    first = int(times[0]) + start_us
+    last = int(times[-1]) if duration_us is None else min(int(times[-1]), first + duration_us - 2 * slack)
+    return first - slack, max(last, first) + slack
+
+
+def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
+    actors = [Knots(t.trajectory()) for t in start.tracks]
+    boxes = [t.size for t in start.tracks]
+    return Fit(frames, start.rig, start.splats, start.sky, start.exposures, Knots(start.ego), actors, boxes, config)
+
+
+def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
+    """The scene that a fit's present state stands for."""
+    groups = [g.detach() for g in fit.splats.groups(fit.sh_count())]
+    ego = _baked(fit.ego, "ego")
+    rig = {}
+    for c, name in enumerate(fit.frames.names):
+        r = start.rig[name]
+        correction = small_poses(scaled(fit.extrinsics[c].detach(), *POSE_UNITS["extrinsic"]))
+        span = [v.time_us for v in fit.frames.views if v.camera == c]
+        exposure = fit.exposures[c].detach().clone()
+        rig[name] = RigCamera(r.lens, r.width, r.height, r.body_from_cam @ correction, exposure, torch.tensor(span))
+    share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
+    actors = []
+    for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
+        trajectory = _baked(fit.actors[i], "actor")
+        meta = {**share, "track": track.name, "views": count_views(rig, ego, trajectory, track.size)}
+        actors.append(Actor(Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta), trajectory, track.name))
+    parked = [
+        {"track": t.name, "label": t.label, "size": t.size.tolist(), "world_from_box": middle_pose(t).tolist()}
+        for t in log.tracks
+        if not t.moving and t.name.startswith("veh")
+    ]
+    sky = Sky(linear_from_srgb(fit.sky.detach().clamp(0, 1)))
+    background = Placed(groups[0], torch.eye(4, dtype=torch.float64))
+    meta = {**log.meta, "parked": parked, **(extra or {})}
+    return Scene(background, tuple(actors), sky, ego, rig, MODEL, start.ground, meta)
+
+
+def _baked(knots: Knots, kind: str) -> Trajectory:
+    return Knots(knots.trajectory, scaled(knots.deltas.detach(), *POSE_UNITS[kind])).corrected()
+
+
+def middle_pose(track: Track) -> torch.Tensor:
+    """A standing box's pose: that of its middle observation."""
+    return track.world_from_box[len(track.world_from_box) // 2]
+
+
+def count_views(rig: dict[str, RigCamera], ego: Trajectory, box: Trajectory, size: np.ndarray) -> int:
+    """Frames of all cameras in which the middle of a box is in view."""
+    count = 0
+    middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
+    for camera in rig.values():
+        times = np.array([t for t in camera.times_us.tolist() if box.covers(t) and ego.covers(t)], dtype=np.int64)
+        if len(times):
+            from_world = inverse(Knots(ego).base(times)[0] @ camera.body_from_cam)
+            local = (from_world @ Knots(box).base(times)[0] @ middle)[:, :3]
+            pixels = camera.lens.project(local)
+            size_of = torch.tensor([camera.width, camera.height])
+            count += int(((local[:, 2] > 0.5) & (pixels >= 0).all(1) & (pixels < size_of).all(1)).sum())
+    return count

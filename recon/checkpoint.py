@@ -1,0 +1,86 @@
+"""A fit on disk: one file beside the scene that it will become, replaced whole, read without running anything foreign."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.fit import FitConfig
+from recon.log import Track
+from recon.start import Start
+from scenes.atomic import atomic_file
+from scenes.camera import RigCamera
+from scenes.ground import Ground
+from scenes.lens import Pinhole
+from scenes.trajectory import Trajectory
+
+VERSION = 1
+
+
+def checkpoint_path(output: Path) -> Path:
+    """Where the fit of a scene keeps its state: beside the scene's folder."""
+    return output.with_name(f"{output.name}.fit")
+
+
+def save_checkpoint(path: Path, options: dict, start: Start, fit: dict) -> None:
+    """Write the fit's state; the former one stays until this one is whole."""
+    data = {"version": VERSION, "options": options, "start": _plain_start(start), "fit": fit}
+    with atomic_file(path) as partial:
+        torch.save(data, partial)
+
+
+def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:
+    """Start (its splats are the fit's) and state. FileNotFoundError without one, ValueError where it is corrupt or of other options."""
+    if not path.is_file():
+        raise FileNotFoundError(f"nothing to resume: {path} does not exist; run without --resume")
+    try:
+        data = torch.load(path, weights_only=True)
+        version, saved = data["version"], data["options"]
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError) as problem:
+        raise ValueError(f"{path} is not a fit that can go on ({problem}); delete it and run without --resume") from None
+    if version != VERSION:
+        raise ValueError(f"{path} is of version {version}, and this is {VERSION}; delete it and run without --resume")
+    for name, value in options.items():
+        if saved.get(name) != value:
+            raise ValueError(f"{path} was made with {name} {saved.get(name)!r}, not {value!r}; repeat its options, or delete it")
+    return _start(data["start"], data["fit"]), data["fit"]
+
+
+def plain_config(config: FitConfig) -> dict:
+    """The configuration as lists and numbers, to be compared after a round trip."""
+    return {k: [list(x) if isinstance(x, tuple) else x for x in v] if isinstance(v, tuple) else v for k, v in asdict(config).items()}
+
+
+def _plain_start(start: Start) -> dict:
+    return {
+        "tracks": [
+            {
+                "name": t.name, "label": t.label, "moving": t.moving,
+                "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us), "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
+            }
+            for t in start.tracks
+        ],
+        "ego": [start.ego.times_us, start.ego.world_from_body],
+        "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
+        "rig": {n: [r.lens.params(), r.width, r.height, r.body_from_cam, r.times_us] for n, r in start.rig.items()},
+    }  # fmt: skip
+
+
+def _start(plain: dict, fit: dict) -> Start:
+    from recon.model import Splats
+
+    tracks = [
+        Track(
+            t["name"], t["label"], t["moving"], t["size"].numpy(), t["times_us"].numpy(),
+            t["world_from_box"], t["sensor"].numpy(), tuple(t["sources"]),
+        )
+        for t in plain["tracks"]
+    ]  # fmt: skip
+    rig = {n: RigCamera(Pinhole(*r[0].tolist()), r[1], r[2], r[3], times_us=r[4]) for n, r in plain["rig"].items()}
+    heights, origin, cell = plain["ground"]
+    splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
+    return Start(splats, tracks, fit["sky"], fit["exposures"], Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell), rig)

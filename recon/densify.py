@@ -1,0 +1,107 @@
+"""How many splats, and where: split where the gradient pulls hardest, drop what does not show or leaves its box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from recon.model import FIELDS, Splats
+
+FAINT = 0.02
+"""Opacity under which a splat is dropped."""
+
+LARGEST = 0.03
+"""Of a splat's reach: its standard deviation at most; 30 pixels at a focal length of 1000."""
+
+THINNEST = 1e-4
+"""Of a splat's reach: its standard deviation at least."""
+
+LONGEST = 12.0
+"""Times a splat's middle axis that its longest may be: needles look right along one ray only."""
+
+BOX_MARGIN = 0.25
+"""Metres beyond its box that an actor's splat may stand."""
+
+
+@dataclass
+class Growth:
+    """How hard pictures pulled at each splat since the last densification: sum of gradients in pixels, and times seen."""
+
+    pull: torch.Tensor
+    seen: torch.Tensor
+
+    @staticmethod
+    def none(count: int) -> Growth:
+        return Growth(torch.zeros(count), torch.zeros(count))
+
+    def see(self, gradient: torch.Tensor, reach: torch.Tensor) -> None:
+        """Count one picture's gradient of means `[N, 3]`; far splats by their smaller motion in the image."""
+        size = gradient.norm(dim=1) * reach
+        self.pull += size
+        self.seen += (size > 0).to(size)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        return {"pull": self.pull, "seen": self.seen}
+
+
+def adjusted(splats: Splats) -> None:
+    """Keep scales within what the cameras can tell, in place."""
+    scales, reach = splats.fields["log_scales"], splats.reach.log()[:, None]
+    torch.minimum(scales, reach + float(np.log(LARGEST)), out=scales)
+    torch.maximum(scales, reach + float(np.log(THINNEST)), out=scales)
+    middle = scales.sum(1) - scales.amax(1) - scales.amin(1)
+    torch.minimum(scales, (middle + float(np.log(LONGEST)))[:, None], out=scales)
+
+
+def grow(splats: Splats, moments: dict, growth: Growth, budget: int, rounds_left: int, boxes: list[np.ndarray]):
+    """Splats after one round, and their Adam moments: new splats start with none.
+
+    Dropped: fainter than `FAINT`, outside their actor's box. Split: those with the largest mean pull, as many as make the budget
+    last `rounds_left` rounds, in two along their longest axis.
+    """
+    fields = {k: v.detach() for k, v in splats.fields.items()}
+    group = splats.group_of()
+    keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
+    pull = torch.where(keep & (growth.seen > 0), growth.pull / growth.seen.clamp_min(1), torch.zeros_like(growth.pull))
+    count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((pull > 0).sum()))
+    parents = pull.topk(count).indices if count else torch.zeros(0, dtype=torch.long)
+
+    scales = fields["log_scales"][parents]
+    axis = scales.argmax(1)
+    direction = _axes(fields["quats"][parents], axis)
+    offset = direction * (0.5 * scales.exp().amax(1))[:, None]
+    smaller = scales - 0.1
+    smaller[torch.arange(count), axis] = scales.amax(1) + float(np.log(0.6))
+    children = {k: fields[k][parents] for k in FIELDS}
+    children["means"] = fields["means"][parents] - offset
+    children["log_scales"] = smaller
+    fields["means"] = fields["means"].index_add(0, parents, offset)
+    fields["log_scales"] = fields["log_scales"].index_copy(0, parents, smaller)
+
+    kept = keep.nonzero()[:, 0]
+    order = torch.argsort(torch.cat([group[kept], group[parents]]), stable=True)
+
+    def assembled(old: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
+        return torch.cat([old[kept], new])[order]
+
+    after = {k: assembled(fields[k], children[k]) for k in FIELDS}
+    sizes = torch.bincount(assembled(group, group[parents]), minlength=len(splats.sizes)).tolist()
+    carried = {}
+    for k, pair in moments.items():
+        carried[k] = tuple(None if m is None else assembled(m, torch.zeros_like(m[parents])) for m in pair)
+    return Splats(after, sizes, assembled(splats.reach, splats.reach[parents])), carried
+
+
+def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -> torch.Tensor:
+    """Mask of splats that stand in their actor's box; the background has none."""
+    half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)[group] + BOX_MARGIN
+    return (means[:, :2].abs() <= half[:, :2]).all(1) & (means[:, 2] <= half[:, 2]) & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
+
+
+def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
+    """The world direction `[N, 3]` of each splat's `axis`th axis."""
+    from scenes.poses import matrix_from_quat
+
+    return matrix_from_quat(quats).gather(2, axis[:, None, None].expand(-1, 3, 1))[..., 0]

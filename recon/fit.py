@@ -1,0 +1,300 @@
+"""The fit: rendered pictures are compared with recorded ones, and splats, sky, exposures and poses follow the gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from recon.densify import Growth, adjusted, grow
+from recon.frames import Frames, View
+from recon.losses import PictureLoss
+from recon.model import FIELDS, Knots, Splats, draw, placed_groups, small_poses
+from scenes.camera import Camera, RigCamera
+from scenes.poses import inverse
+from scenes.sky import sample_equirect
+
+SKY_STEP = 8
+"""Pixels between sky samples; between them the sky is interpolated. It is smooth, and a lookup a pixel would cost as much as the splats."""
+
+POSE_UNITS = {"ego": (1e-3, 1e-2), "extrinsic": (1e-3, 1e-3), "actor": (1e-2, 5e-2)}
+"""Radians and metres of one unit of a pose correction: the size of the errors found in recorded logs."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How long and how finely to fit."""
+
+    steps: int = 4000
+    """Pictures rendered and compared."""
+    budget: int = 200_000
+    """Splats at most, all groups together."""
+    sh_degree: int = 1
+    """Harmonics of the splats' colours; they rise from 0 a quarter of the way in."""
+    stages: tuple[tuple[float, int], ...] = ((0.0, 4), (0.2, 2), (0.5, 1))
+    """From which part of the fit on pictures are shrunk by which factor: coarse to fine."""
+    grow_every: int = 100
+    """Steps between densifications."""
+    grow_span: tuple[float, float] = (0.08, 0.7)
+    """Part of the fit within which splats are added."""
+    poses_from: float = 0.1
+    """Part of the fit from which poses are corrected."""
+    dissimilarity: float = 0.2
+    """Weight of 1 - SSIM against L1."""
+    still_weight: float = 0.4
+    """How often a view is drawn while the car stands, against one while it drives."""
+    seed: int = 0
+    """Of the order of views."""
+
+
+RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "dc": 5e-3, "rest": 5e-4}
+"""Adam's step a field; of means in parts of each splat's reach (0.1 pixel at a focal length of 1000)."""
+
+
+class Fit:
+    """The state of a fit: step it, checkpoint it with `state`, go on with `restore`."""
+
+    def __init__(
+        self,
+        frames: Frames,
+        rig: dict[str, RigCamera],
+        splats: Splats,
+        sky: torch.Tensor,
+        exposures: torch.Tensor,
+        ego: Knots,
+        actors: list[Knots],
+        boxes: list[np.ndarray],
+        config: FitConfig,
+    ):
+        self.frames, self.rig, self.config = frames, rig, config
+        self.splats, self.sky, self.exposures = splats, sky, exposures
+        self.ego, self.actors, self.boxes = ego, actors, boxes
+        self.extrinsics = torch.zeros(len(frames.names), 6)
+        self.step_count = 0
+        self.training = frames.training()
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.growth = Growth.none(len(splats))
+        self.recent_loss = 0.0
+        self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
+        self._tabulate()
+        self._optimise()
+
+    def _tabulate(self) -> None:
+        """Uncorrected poses of the body and of every actor at every view's time, and how often a view is drawn."""
+        views = self.frames.views
+        times = np.array([v.time_us for v in views])
+        self._row = {(v.camera, v.index): i for i, v in enumerate(views)}
+        self._body = self.ego.base(times)
+        self._boxes = [knots.base(times) for knots in self.actors]
+        self._covers = np.array([[k.trajectory.covers(t) for k in self.actors] for t in times]).reshape(len(times), len(self.actors))
+        drawn = [self._row[v.camera, v.index] for v in self.training]
+        before, after = (self.ego.base(times + d)[0][:, :3, 3] for d in (-50_000, 50_000))
+        moving = ((after - before).norm(dim=1) > 0.05)[drawn]
+        self._weights = torch.where(moving, 1.0, self.config.still_weight)
+
+    def _optimise(self) -> None:
+        """Optimisers over the present tensors. The splats' own is made anew whenever their number changes; its moments are carried over."""
+        poses = [self.extrinsics, self.ego.deltas, *(a.deltas for a in self.actors)]
+        for tensor in [*self.splats.fields.values(), self.sky, self.exposures, *poses]:
+            tensor.requires_grad_(True)
+        self.splat_adam = adam([{"params": [self.splats.fields[k]], "lr": RATES[k]} for k in FIELDS], eps=1e-15)
+        self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": [self.exposures], "lr": 5e-4}], eps=1e-12)
+        self.pose_adam = adam([{"params": poses, "lr": 0.03}], eps=1e-12)
+
+    @property
+    def progress(self) -> float:
+        return self.step_count / self.config.steps
+
+    def sh_count(self) -> int:
+        degree = min(self.config.sh_degree, int(self.progress * 4))
+        return (degree + 1) ** 2
+
+    def shrink(self) -> int:
+        return next(factor for start, factor in reversed(self.config.stages) if self.progress >= start)
+
+    # ---- one step
+
+    def step(self) -> float:
+        """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
+        if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
+            self._grow()
+        view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
+        camera = self.camera(view).resized(*self._size(self.shrink()))
+        target = self._target(view, self.shrink())
+        rgb, _ = self.render(view, camera)
+        loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
+        regular = 1e-4 * self.ego.unrest() + sum(1e-4 * a.unrest() for a in self.actors)
+        (loss + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        self._follow()
+        self.step_count += 1
+        value = float(loss.detach())
+        self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
+        return value
+
+    def render(self, view: View, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+        """Picture `[H, W, 3]` and alpha of a view by the present state, exposed as its camera exposes."""
+        placed = placed_groups(self.splats.groups(self.sh_count()), self._actor_poses(view, camera))
+        rgb, alpha = draw(placed, camera, "rgb", "alpha")
+        rgb = rgb + (1 - alpha)[..., None] * self._sky_behind(camera)
+        exposure = self.exposures[view.camera]
+        return rgb @ exposure[:, :3].T + exposure[:, 3], alpha
+
+    def camera(self, view: View) -> Camera:
+        """The view's camera at its corrected pose."""
+        poses, knots, shares = self._body
+        row = self._row[view.camera, view.index]
+        rig = self.rig[self.frames.names[view.camera]]
+        rotation, metres = POSE_UNITS["ego"]
+        body = poses[row] @ small_poses(scaled(self.ego.correction(knots[row], shares[row]), rotation, metres))
+        pose = body @ rig.body_from_cam @ small_poses(scaled(self.extrinsics[view.camera], *POSE_UNITS["extrinsic"]))
+        return Camera(rig.lens, rig.width, rig.height, pose, time_us=view.time_us)
+
+    def _actor_poses(self, view: View, camera: Camera) -> dict[int, torch.Tensor]:
+        """Poses by group of the actors that may be in view."""
+        row = self._row[view.camera, view.index]
+        from_world = inverse(camera.world_from_cam.detach())
+        near, deltas = [], []
+        for i in np.flatnonzero(self._covers[row]):
+            poses, knots, shares = self._boxes[i]
+            x, _, z = (from_world @ poses[row])[:3, 3].tolist()
+            radius = float(np.linalg.norm(self.boxes[i]))
+            if z > -radius and abs(x) - radius * 1.5 < max(z, 0) * camera.width / (1.6 * float(camera.lens.fx)) + radius:
+                near.append(i)
+                deltas.append(self.actors[i].correction(knots[row], shares[row]))
+        if not near:
+            return {}
+        moved = small_poses(scaled(torch.stack(deltas), *POSE_UNITS["actor"]))
+        return {int(i) + 1: self._boxes[i][0][row] @ m for i, m in zip(near, moved, strict=True)}
+
+    def _sky_behind(self, camera: Camera) -> torch.Tensor:
+        """Sky colour `[H, W, 3]` at every pixel, sampled every few pixels."""
+        small = camera.resized(max(2, camera.width // SKY_STEP), max(2, camera.height // SKY_STEP))
+        rays = small.lens.unproject(small.pixel_centres()) @ small.world_from_cam[:3, :3].detach().T
+        colours = sample_equirect(self.sky, rays).permute(2, 0, 1)[None]
+        return F.interpolate(colours, (camera.height, camera.width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+
+    def _size(self, shrink: int) -> tuple[int, int]:
+        return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
+
+    def _target(self, view: View, shrink: int) -> torch.Tensor:
+        if shrink == 1:
+            return view.image.float() / 255
+        key = (shrink, self._row[view.camera, view.index])
+        if key not in self._pyramid:
+            width, height = self._size(shrink)
+            small = F.interpolate(view.image.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].permute(1, 2, 0)
+            self._pyramid = {k: v for k, v in self._pyramid.items() if k[0] == shrink}
+            self._pyramid[key] = small.contiguous()
+        return self._pyramid[key] / 255
+
+    def _window(self, camera: Camera) -> tuple[int, int, int, int]:
+        """Where similarity is taken: all of a small picture, a random part of a large one."""
+        height, width = min(camera.height, 270), min(camera.width, 480)
+        top, left = (int(torch.randint(0, n + 1, (1,), generator=self.generator)) for n in (camera.height - height, camera.width - width))
+        return top, left, height, width
+
+    def _follow(self) -> None:
+        fields, decay = self.splats.fields, 0.01**self.progress
+        gradient = fields["means"].grad
+        if gradient is not None:
+            self.growth.see(gradient, self.splats.reach)
+        self.splat_adam.param_groups[0]["lr"] = RATES["means"] * decay
+        before = fields["means"].detach().clone()
+        if fields["rest"].grad is None:
+            fields["rest"].grad = torch.zeros_like(fields["rest"])
+        self.splat_adam.step()
+        with torch.no_grad():
+            # Adam's step has one length for all; a far splat must move further to move a pixel
+            fields["means"].sub_(before).mul_(self.splats.reach[:, None]).add_(before)
+            adjusted(self.splats)
+        if self.exposures.grad is not None:
+            self.exposures.grad[0] = 0  # the first camera is the reference
+        self.rest_adam.step()
+        if self.progress >= self.config.poses_from:
+            self.pose_adam.param_groups[0]["lr"] = 0.03 * max(0.1, 1 - self.progress)
+            self.pose_adam.step()
+        for optimiser in (self.splat_adam, self.rest_adam, self.pose_adam):
+            optimiser.zero_grad(set_to_none=True)
+
+    # ---- growth
+
+    def _growing(self) -> bool:
+        return self.config.grow_span[0] <= self.progress <= self.config.grow_span[1]
+
+    def _grow(self) -> None:
+        """Split where the gradient pulls, drop what does not show."""
+        left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
+        moments = {k: self.splat_adam.state.get(self.splats.fields[k], {}) for k in FIELDS}
+        steps = {k: m.get("step") for k, m in moments.items()}
+        pairs = {k: (m.get("exp_avg"), m.get("exp_avg_sq")) for k, m in moments.items()}
+        self.splats, carried = grow(self.splats, pairs, self.growth, self.config.budget, left, self.boxes)
+        self.growth = Growth.none(len(self.splats))
+        for tensor in self.splats.fields.values():
+            tensor.requires_grad_(True)
+        self.splat_adam = adam([{"params": [self.splats.fields[k]], "lr": RATES[k]} for k in FIELDS], eps=1e-15)
+        for k, (first, second) in carried.items():
+            if first is not None:
+                self.splat_adam.state[self.splats.fields[k]] = {"step": steps[k], "exp_avg": first, "exp_avg_sq": second}
+
+    # ---- checkpoints
+
+    def tensors(self) -> dict:
+        """All that changes, as tensors and numbers: what a checkpoint holds."""
+        return {
+            "fields": {k: v.detach() for k, v in self.splats.fields.items()},
+            "sizes": self.splats.sizes,
+            "reach": self.splats.reach,
+            "growth": self.growth.tensors(),
+            "sky": self.sky.detach(),
+            "exposures": self.exposures.detach(),
+            "extrinsics": self.extrinsics.detach(),
+            "ego": self.ego.deltas.detach(),
+            "actors": [a.deltas.detach() for a in self.actors],
+            "adam": [o.state_dict() for o in (self.splat_adam, self.rest_adam, self.pose_adam)],
+            "generator": self.generator.get_state(),
+            "step": self.step_count,
+            "loss": self.recent_loss,
+        }
+
+    def restore(self, state: dict) -> None:
+        """Go on from `tensors()` of another run: the same steps follow as would have followed there."""
+        self.splats = Splats(state["fields"], state["sizes"], state["reach"])
+        self.growth = Growth(**state["growth"])
+        self.sky, self.exposures, self.extrinsics = state["sky"], state["exposures"], state["extrinsics"]
+        self.ego.deltas = state["ego"]
+        for knots, deltas in zip(self.actors, state["actors"], strict=True):
+            knots.deltas = deltas
+        self._optimise()
+        for optimiser, saved in zip((self.splat_adam, self.rest_adam, self.pose_adam), state["adam"], strict=True):
+            optimiser.load_state_dict(saved)
+        self.generator.set_state(state["generator"])
+        self.step_count, self.recent_loss = state["step"], state["loss"]
+
+
+def adam(groups: list[dict], eps: float) -> torch.optim.Adam:
+    return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=eps, fused=True)
+
+
+def scaled(raw: torch.Tensor, radians: float, metres: float) -> torch.Tensor:
+    """A correction `[..., 6]` in its units as radians and metres."""
+    return raw * raw.new_tensor([radians] * 3 + [metres] * 3)
+
+
+def run(fit: Fit, save: Callable[[], None], report: Callable[[Fit], None], every_seconds: float = 45.0) -> None:
+    """Step to the end, calling `report` each step and `save` now and then, and on Ctrl-C before it goes on up."""
+    import time
+
+    saved = time.monotonic()
+    try:
+        while fit.step_count < fit.config.steps:
+            fit.step()
+            report(fit)
+            if time.monotonic() - saved > every_seconds:
+                save()
+                saved = time.monotonic()
+    except KeyboardInterrupt:
+        save()
+        raise

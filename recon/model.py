@@ -1,0 +1,107 @@
+"""What the fit changes: the splats of background and actors, the sky, the exposures, and small corrections of poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from render import rasterize
+from scenes.camera import Camera
+from scenes.gaussians import Gaussians, Placed, SplatModel
+from scenes.poses import interpolate
+from scenes.trajectory import Trajectory
+
+FIELDS = ("means", "quats", "log_scales", "logits", "dc", "rest")
+
+
+@dataclass
+class Splats:
+    """Splats of all groups (background first, then the actors) in one set of tensors, so that one optimiser step moves all.
+
+    means `[N, 3]`, quats `[N, 4]`, log_scales `[N, 3]`, logits `[N]`, dc `[N, 1, 3]`, rest `[N, K - 1, 3]`; sizes: splats a group;
+    reach `[N]`: metres to the nearest camera position, by which steps and limits of a splat scale.
+    """
+
+    fields: dict[str, torch.Tensor]
+    sizes: list[int]
+    reach: torch.Tensor
+
+    @staticmethod
+    def of(groups: list[Gaussians], reach: list[torch.Tensor]) -> Splats:
+        g = Gaussians.cat(groups)
+        fields = dict(means=g.means, quats=g.quats, log_scales=g.log_scales, logits=g.logit_opacities, dc=g.sh[:, :1], rest=g.sh[:, 1:])
+        return Splats({k: v.clone() for k, v in fields.items()}, [len(p) for p in groups], torch.cat(reach))
+
+    def __len__(self) -> int:
+        return len(self.reach)
+
+    def groups(self, sh_count: int) -> list[Gaussians]:
+        """The splats of each group with the first `sh_count` coefficients; gradients flow back through one split a field."""
+        f = self.fields
+        sh = f["dc"] if sh_count == 1 else torch.cat([f["dc"], f["rest"][:, : sh_count - 1]], 1)
+        parts = [torch.split(t, self.sizes) for t in (f["means"], f["quats"], f["log_scales"], f["logits"], sh)]
+        return [Gaussians(*part) for part in zip(*parts, strict=True)]
+
+    def group_of(self) -> torch.Tensor:
+        """Group index `[N]` of every splat."""
+        return torch.repeat_interleave(torch.arange(len(self.sizes)), torch.tensor(self.sizes))
+
+
+def small_poses(deltas: torch.Tensor) -> torch.Tensor:
+    """Poses `[..., 4, 4]` of small motions `[..., 6]`: rotation vector (radians), then translation (metres), by the exponential map."""
+    x, y, z, u, v, w = deltas.to(torch.float64).unbind(-1)
+    o = torch.zeros_like(x)
+    rows = [torch.stack(r, -1) for r in ([o, -z, y, u], [z, o, -x, v], [-y, x, o, w], [o, o, o, o])]
+    return torch.linalg.matrix_exp(torch.stack(rows, -2))
+
+
+class Knots:
+    """A trajectory with a small correction at each of its poses; corrections `[T, 6]` act in the body's own frame."""
+
+    def __init__(self, trajectory: Trajectory, deltas: torch.Tensor | None = None):
+        self.trajectory = trajectory
+        self.deltas = torch.zeros(len(trajectory), 6) if deltas is None else deltas
+
+    def base(self, times_us: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Uncorrected poses `[V, 4, 4]` at times, and for each the earlier knot and the share of the later one."""
+        t = self.trajectory.times_us.numpy()
+        if len(t) == 1:
+            zero = torch.zeros(len(times_us))
+            return self.trajectory.world_from_body.expand(len(times_us), 4, 4), zero.long(), zero
+        k = np.searchsorted(t, times_us).clip(1, len(t) - 1) - 1
+        u = torch.from_numpy((times_us - t[k]) / (t[k + 1] - t[k]))
+        poses = self.trajectory.world_from_body
+        return interpolate(poses[k], poses[k + 1], u), torch.from_numpy(k), u
+
+    def correction(self, knot: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+        """Small motions `[..., 6]` between knots; differentiable in `deltas`."""
+        after = (knot + 1).clamp_max(len(self.deltas) - 1)
+        share = share.to(self.deltas)[..., None]
+        return self.deltas[knot] * (1 - share) + self.deltas[after] * share
+
+    def corrected(self) -> Trajectory:
+        """The trajectory with its corrections applied."""
+        return replace(self.trajectory, world_from_body=self.trajectory.world_from_body @ small_poses(self.deltas.detach()))
+
+    def unrest(self) -> torch.Tensor:
+        """Sum of squared second differences of the corrections: bodies do not shake."""
+        d = self.deltas
+        return (d[2:] - 2 * d[1:-1] + d[:-2]).square().sum() if len(d) > 2 else d.sum() * 0
+
+
+MODEL = SplatModel(projection="ewa")
+"""What is trained: EWA costs less than UT, and splats this small look the same under both."""
+
+
+def draw(placed: list[Placed], camera: Camera, *outputs: str) -> list[torch.Tensor]:
+    """The named outputs of one picture under `MODEL`."""
+    frame = rasterize(placed, camera, outputs, model=MODEL)
+    return [getattr(frame, name) for name in outputs]
+
+
+def placed_groups(groups: list[Gaussians], poses: dict[int, torch.Tensor]) -> list[Placed]:
+    """The background, and the actors that have a pose; the instance is the group's index."""
+    world = torch.eye(4, dtype=torch.float64)
+    return [Placed(groups[0], world)] + [Placed(groups[i], pose, instance=i) for i, pose in poses.items()]

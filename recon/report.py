@@ -1,0 +1,57 @@
+"""How good a reconstruction is: held-out frames rendered from the finished scene and compared with the recording."""
+
+from __future__ import annotations
+
+import torch
+
+from recon.frames import Frames, View
+from render import render_frame
+from render.compare import psnr, ssim
+from scenes.scene import Scene
+
+DRIVING = 0.5
+"""Metres a second above which the car counts as driving: while it stands, nearly the same picture has been trained on."""
+
+
+def held_out_table(scene: Scene, frames: Frames) -> list[dict]:
+    """A row a camera, all held-out frames and those while driving: PSNR and SSIM of the scene and of the mean training image.
+
+    Rows: camera, frames ("0-72" or "driving"), count, psnr, ssim, mean_psnr, mean_ssim; figures are means over frames.
+    """
+    rows = []
+    for c, name in enumerate(frames.names):
+        training = frames.of(c)
+        mean = torch.stack([v.image for v in training]).sum(0, dtype=torch.int32).float() / (255 * len(training))
+        scored = []
+        for view in frames.of(c, held_out=True):
+            recorded = view.image.float() / 255
+            with torch.no_grad():
+                rgb = render_frame(scene, scene.camera(name, view.time_us)).rgb
+            assert rgb is not None
+            scored.append((view, psnr(rgb, recorded), ssim(rgb, recorded), psnr(mean, recorded), ssim(mean, recorded)))
+        rows += [_row(name, "all", scored), _row(name, "driving", [s for s in scored if _driving(scene, s[0])])]
+    return [r for r in rows if r is not None]
+
+
+def _driving(scene: Scene, view: View) -> bool:
+    before, after = (max(scene.ego.span_us()[0], view.time_us - 50_000), min(scene.ego.span_us()[1], view.time_us + 50_000))
+    moved = (scene.ego.at(after) - scene.ego.at(before))[:3, 3].norm()
+    return float(moved) / max((after - before) * 1e-6, 1e-6) > DRIVING
+
+
+def _row(name: str, which: str, scored: list[tuple]) -> dict | None:
+    if not scored:
+        return None
+    figures = torch.tensor([s[1:] for s in scored], dtype=torch.float64).mean(0).tolist()
+    row = {"camera": name, "which": which, "frames": [s[0].index for s in scored]}
+    return row | dict(zip(("psnr", "ssim", "mean_psnr", "mean_ssim"), (round(f, 4) for f in figures), strict=True))
+
+
+def table_text(rows: list[dict]) -> str:
+    """The rows for people."""
+    lines = [f"{'held out':<34} {'frames':>7} {'PSNR':>7} {'SSIM':>7}   mean image: {'PSNR':>6} {'SSIM':>7}"]
+    for r in rows:
+        where = f"{r['camera']}, {r['which']}"
+        figures = f"{r['psnr']:>7.2f} {r['ssim']:>7.3f} {r['mean_psnr']:>20.2f} {r['mean_ssim']:>7.3f}"
+        lines.append(f"{where:<34} {len(r['frames']):>7} {figures}")
+    return "\n".join(lines)

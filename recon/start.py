@@ -1,0 +1,183 @@
+"""Everything a fit starts from, made from a log and its frames: seeds of background and actors, sky, exposures, trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from recon.actors import split_points
+from recon.fill import SkyPicture, sky_mask, unexplained
+from recon.frames import Frames, View
+from recon.ground import estimate_ground
+from recon.log import Log, Track
+from recon.model import Splats, draw
+from recon.seed import Cloud, colours, first_exposures, merged_colours, splats_from, spread, thin
+from scenes.camera import Camera, RigCamera
+from scenes.gaussians import Gaussians, Placed
+from scenes.ground import Ground
+from scenes.poses import interpolate, inverse
+from scenes.trajectory import Trajectory
+
+SEED_PART = 0.5
+"""Of the splat budget that lidar may take: the rest grows where pictures ask for it."""
+
+SKY_HEIGHT = 512
+FILL_VIEWS = 6
+"""Views a camera that are searched for what lidar does not explain."""
+
+WIDEST_SEED = 0.012
+"""Of its reach: a seed's width at most."""
+
+
+@dataclass
+class Start:
+    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig."""
+
+    splats: Splats
+    tracks: list[Track]
+    sky: torch.Tensor
+    exposures: torch.Tensor
+    ego: Trajectory
+    ground: Ground
+    rig: dict[str, RigCamera]
+
+
+def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_count: int, report: Callable[[str], None]) -> Start:
+    """Read the sweeps of the span and make the start of a fit. ValueError where a drive has no lidar point in view."""
+    rig = log.rig(frames.width, frames.height, frames.names)
+    ego = body_path(log, frames, rig)
+    sweeps = [s for s in log.sweeps if span_us[0] - 200_000 <= s.time_us <= span_us[1] + 200_000]
+    movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
+    report("sorting lidar points")
+    split = split_points(log, sweeps, movers)
+    ground = estimate_ground(split.static, log.ego)
+
+    report("colouring points")
+    seen = colours(log, frames, split.static, split.static_sweep)
+    gains = first_exposures(seen)
+    rgb = merged_colours(seen, gains)
+    known = np.isfinite(rgb[:, 0])
+    if not known.any():
+        raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
+    cloud = Cloud(split.static[known], rgb[known])
+    path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
+    cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
+    reach = np.maximum(path.query(cloud.xyz)[0], 1.0)
+    background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
+
+    groups, reaches, tracks = [], [], []
+    for track in split.tracks:
+        points, index = split.actors.get(track.name, (np.zeros((0, 3)), np.zeros(0, np.int64)))
+        made = _actor(log, frames, track, points, index, gains, sh_count)
+        if len(made):
+            groups.append(made)
+            tracks.append(track)
+            middle = track.world_from_box[:, :3, 3].numpy()
+            near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)
+            reaches.append(torch.full((len(made),), near))
+
+    report("filling what lidar missed")
+    filled, sky = _fill(log, frames, rig, background, groups, tracks, gains, sh_count)
+    reach = torch.from_numpy(np.maximum(path.query(filled.means.numpy())[0], 1.0)).float()
+    exposures = torch.zeros(len(frames.names), 3, 4)
+    exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
+    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig)
+
+
+def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:
+    """The body at the first camera's moments, from its recorded poses, one step longer at either end.
+
+    Camera poses are recorded closer to the pictures than the lidar's are. Held-out moments are left out, but for the ends: the
+    corrections that the fit finds at training frames then carry the body smoothly through them.
+    """
+    name = frames.names[0]
+    camera, back = log.camera(name), inverse(rig[name].body_from_cam)
+    views = [v for v in frames.views if v.camera == 0]
+    chosen = [v for i, v in enumerate(views) if not v.held_out or i in (0, len(views) - 1)]
+    times = [v.time_us for v in chosen]
+    poses = [camera.world_from_cam[v.index] @ back for v in chosen]
+    if len(times) > 1:
+        step = (times[-1] - times[0]) / (len(views) - 1)
+        share = step / (times[1] - times[0])
+        times, poses = [round(times[0] - step), *times], [interpolate(poses[0], poses[1], -share), *poses]
+        share = step / (times[-1] - times[-2])
+        times, poses = [*times, round(times[-1] + step)], [*poses, interpolate(poses[-2], poses[-1], 1 + share)]
+    return Trajectory(torch.tensor(times), torch.stack(poses))
+
+
+def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np.ndarray, gains: np.ndarray, sh_count: int) -> Gaussians:
+    """Seeds of a mover in its box frame: its own lidar points, and where they are few, the skin of its box."""
+    trajectory = track.trajectory()
+    if len(points) < 100:
+        skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
+        when = frames.of(0)
+        nearest = min(when, key=lambda v: _separation(log, track, v)).index if when else 0
+        points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), nearest)])
+    seen = colours(
+        log, frames, points, sweep, lambda view: trajectory.at(view.time_us) if trajectory.covers(view.time_us) else None
+    )
+    rgb = merged_colours(seen, gains)
+    known = np.isfinite(rgb[:, 0])
+    if not known.any():
+        return Gaussians.empty(sh_count)
+    cloud, sides = thin(Cloud(points[known], rgb[known]), np.ones(known.sum()), 3000)
+    return splats_from(cloud, sides, sh_count, 0.15)
+
+
+def _separation(log: Log, track: Track, view: View) -> float:
+    """Metres between body and box at a view's time; inf where there is no box then."""
+    trajectory = track.trajectory()
+    if not trajectory.covers(view.time_us):
+        return float("inf")
+    return float((trajectory.at(view.time_us)[:3, 3] - log.ego.at(view.time_us)[:3, 3]).norm())
+
+
+def box_skin(size: np.ndarray, step: float) -> np.ndarray:
+    """Points on sides and top of a box `[length, width, height]` whose base centre is the origin."""
+    axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in size]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    on = (np.abs(np.abs(grid) - size / 2) < 1e-9)
+    return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
+
+
+def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussians], tracks: list[Track], gains, sh_count):
+    """Background with splats added where views show neither splats nor sky, and the sky `[H, 2H, 3]`."""
+    picture = SkyPicture(SKY_HEIGHT)
+    world = torch.eye(4, dtype=torch.float64)
+    for c, name in enumerate(frames.names):
+        for view in spread(frames.of(c), FILL_VIEWS):
+            camera = log.camera(name).camera(view.index, frames.width, frames.height)
+            placed = [Placed(background, world)]
+            hidden = np.zeros((frames.height, frames.width), dtype=bool)
+            for track, splats in zip(tracks, actors, strict=True):
+                trajectory = track.trajectory()
+                if trajectory.covers(view.time_us):
+                    placed.append(Placed(splats, trajectory.at(view.time_us)))
+                    _shade(hidden, camera, trajectory.at(view.time_us), track.size)
+            alpha, depth = (t.numpy() for t in draw(placed, camera, "alpha", "depth"))
+            sky = sky_mask(view.image.numpy(), (alpha > 0.3) | hidden)
+            picture.add(view.image.numpy(), sky, camera, gains[c])
+            depth = np.where(hidden & (alpha < 0.5), np.inf, depth)
+            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c])
+            if len(cloud.xyz):
+                more = splats_from(cloud, width, sh_count, width)
+                background = Gaussians.cat([background, more])
+    return background, picture.picture()
+
+
+def _shade(mask: np.ndarray, camera: Camera, world_from_box: torch.Tensor, size: np.ndarray) -> None:
+    """Set the image rectangle around a box, in place."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * size
+    pose = (inverse(camera.world_from_cam) @ world_from_box).numpy()
+    local = corners @ pose[:3, :3].T + pose[:3, 3]
+    if local[:, 2].max() < 0.2:
+        return
+    local[:, 2] = np.maximum(local[:, 2], 0.2)
+    pixels = camera.lens.project(torch.from_numpy(local)).numpy()
+    low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
+    high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
+    mask[low[1] : high[1], low[0] : high[0]] = True
