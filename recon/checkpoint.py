@@ -60,7 +60,8 @@ def _plain_start(start: Start) -> dict:
         "tracks": [
             {
                 "name": t.name, "label": t.label, "moving": t.moving,
-                "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us), "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
+                "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us),
+                "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
             }
             for t in start.tracks
         ],
