@@ -1,8 +1,10 @@
 """A first contact shadow: inserted assets darken the ground below and beside them, softly, by their footprint.
 
 No light is traced. What a rough sky does under a car is near enough a function of the distance to its footprint:
-dark underneath, fading over about half the height of the body's underside above the ground (an ambient-occlusion
-look). Inserted assets are those with `inserted` in their meta; recorded actors keep the shadows of their photos.
+dark underneath, fading over about the height of the body's underside above the ground (an ambient-occlusion look).
+Where a pixel's ray meets the plane that the asset stands on says how dark; the rendered depth only says whether that
+plane is what the pixel sees, with much tolerance, since the depth of splatted asphalt is rough.
+Inserted assets are those with `inserted` in their meta; recorded actors keep the shadows of their photos.
 """
 
 from __future__ import annotations
@@ -20,60 +22,60 @@ from scenes.scene import Scene
 DARKNESS = 0.62  # how much of the light the middle of a footprint loses
 REACH = 0.55  # metres beside the footprint at which the shadow has gone
 INSET = 0.35  # metres inside the footprint's edge at which it is full
-CEILING = 0.3  # metres above the asset's base up to which surfaces receive it; a kerb does, a house front does not
+RECEIVES = 0.3  # surfaces up to so many metres above the plane receive all of it: asphalt, a kerb
+CEILING = 0.8  # and those from here on none: other cars, people
+SKIRT = 0.35  # of the asset itself only what is lower receives some: tyres, and the rim of asphalt that was cut out with it
 
 
 @dataclass(frozen=True)
 class Caster:
-    """A footprint in the view: instance id, `asset_from_world` `[4, 4]`, and half length and width in metres."""
+    """A footprint in the view: instance id, `asset_from_cam` `[4, 4]`, half length and width in metres, and the pixels
+    `x0, y0, x1, y1` that its shadow can fall into."""
 
     instance: int
-    asset_from_world: torch.Tensor
+    asset_from_cam: torch.Tensor
     half: tuple[float, float]
     window: tuple[int, int, int, int]
 
 
 def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
-    """The inserted assets whose shadow can fall into the view, with the pixel window `x0, y0, x1, y1` it falls into."""
+    """The inserted assets whose shadow can fall into the view."""
     found = []
     for i, actor in enumerate(scene.actors):
         if not actor.asset.meta.get("inserted") or not actor.trajectory.covers(camera.time_us):
             continue
-        world_from_asset = actor.trajectory.at(camera.time_us)
+        asset_from_cam = inverse(actor.trajectory.at(camera.time_us)) @ camera.world_from_cam.detach()
         half = (float(actor.asset.size[0]) / 2, float(actor.asset.size[1]) / 2)
-        window = _window(world_from_asset, half, camera)
+        window = _window(asset_from_cam, half, camera)
         if window is not None:
-            found.append(Caster(i + 1, inverse(world_from_asset), half, window))
+            found.append(Caster(i + 1, asset_from_cam, half, window))
     return found
 
 
 def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
     """The frame's rgb `[H, W, 3]`, darkened by the casters; needs rgb, depth and instance. Only their windows are touched."""
     assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
-    camera, rgb = frame.camera, frame.rgb.clone()
+    rgb = frame.rgb.clone()
     for caster in casters:
         x0, y0, x1, y1 = caster.window
-        receives = frame.instance[y0:y1, x0:x1] != caster.instance
         depth = frame.depth[y0:y1, x0:x1].detach()
-        receives &= torch.isfinite(depth)
-        rows, columns = receives.nonzero(as_tuple=True)
-        rays = camera_rays(camera)[y0:y1, x0:x1].to(depth.device)[rows, columns]
-        asset_from_cam = (caster.asset_from_world @ camera.world_from_cam).to(depth.device, torch.float32)
-        points = (rays * depth[rows, columns, None]) @ asset_from_cam[:3, :3].T + asset_from_cam[:3, 3]
-        light = rgb.new_ones(y1 - y0, x1 - x0)
-        light[rows, columns] = 1 - shade_at(points, caster.half).to(rgb)
-        rgb[y0:y1, x0:x1] *= light[..., None]
+        pose = caster.asset_from_cam.to(depth.device, torch.float32)
+        rays = camera_rays(frame.camera)[y0:y1, x0:x1].to(depth.device) @ pose[:3, :3].T
+        down = rays[..., 2].clamp_max(-1e-6)  # rays that rise never meet the plane: their point lies far off, where no shadow is
+        plane = pose[:2, 3] - (pose[2, 3] / down)[..., None] * rays[..., :2]
+        height = pose[2, 3] + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth)) * rays[..., 2]
+        own = frame.instance[y0:y1, x0:x1] == caster.instance
+        receives = torch.where(own, _smooth(1 - height / SKIRT), _smooth((CEILING - height) / (CEILING - RECEIVES)))
+        rgb[y0:y1, x0:x1] *= (1 - receives * shade_at(plane, caster.half))[..., None].to(rgb)
     return rgb
 
 
 def shade_at(points: torch.Tensor, half: tuple[float, float]) -> torch.Tensor:
-    """The share of light `[...]` that points `[..., 3]` in the asset's frame lose to a footprint of that half size."""
-    beside = points[..., :2].abs() - torch.tensor(half, dtype=points.dtype, device=points.device)
+    """The share of light `[...]` that points `[..., 2]` on the asset's plane lose to a footprint of that half length and width."""
+    beside = points.abs() - torch.tensor(half, dtype=points.dtype, device=points.device)
     # signed distance to the rectangle: negative inside
     distance = beside.clamp_min(0).norm(dim=-1) + beside.amax(-1).clamp_max(0)
-    near = _smooth((REACH - distance) / (REACH + INSET))
-    low = _smooth((CEILING - points[..., 2].abs()) / (CEILING / 2))
-    return DARKNESS * near * low
+    return DARKNESS * _smooth((REACH - distance) / (REACH + INSET))
 
 
 def _smooth(u: torch.Tensor) -> torch.Tensor:
@@ -81,11 +83,13 @@ def _smooth(u: torch.Tensor) -> torch.Tensor:
     return u * u * (3 - 2 * u)
 
 
-def _window(world_from_asset: torch.Tensor, half: tuple[float, float], camera: Camera) -> tuple[int, int, int, int] | None:
-    """Pixels that the footprint's reach projects into; None where that is outside the image or behind the camera."""
+def _window(asset_from_cam: torch.Tensor, half: tuple[float, float], camera: Camera) -> tuple[int, int, int, int] | None:
+    """Pixels that the footprint's reach projects into; None where that is outside the image or seen from below."""
+    if not asset_from_cam[2, 3] > 0:
+        return None
     x, y = half[0] + REACH, half[1] + REACH
-    corners = torch.tensor([[a * x, b * y, c * CEILING] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], dtype=torch.float64)
-    cam_from_asset = inverse(camera.world_from_cam) @ world_from_asset
+    corners = torch.tensor([[a * x, b * y, 0.0] for a in (-1, 1) for b in (-1, 1)], dtype=torch.float64)
+    cam_from_asset = inverse(asset_from_cam)
     seen = corners @ cam_from_asset[:3, :3].T + cam_from_asset[:3, 3]
     if not (seen[:, 2] > 0).any():
         return None

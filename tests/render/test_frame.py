@@ -96,17 +96,16 @@ def test_gradients_reach_the_splats_and_the_sky(street, camera):
     assert sh.grad.abs().sum() > 0
 
 
-def test_a_contact_shadow_darkens_the_ground_beside_an_inserted_asset_only(street, camera):
+def test_a_contact_shadow_darkens_the_ground_below_an_inserted_asset_only(street, camera):
     scene = insert(street, car(), Placement("car", 8, 2.2)).scene
     lit = render_frame(scene, camera, ("rgb", "instance"), shadows=False)
     shaded = render_frame(scene, camera, ("rgb", "instance"))
     darker = (lit.rgb - shaded.rgb).amax(-1) > 0.01
     assert darker.any()
     assert (lit.rgb >= shaded.rgb - 1e-6).all()
-    assert not darker[lit.instance == 2].any()
     rows, columns = (lit.instance == 2).nonzero().unbind(1)
     y, x = darker.nonzero().unbind(1)
-    assert y.min() > rows.float().mean()  # low
+    assert y.min() > rows.float().mean()  # low: of the asset itself only tyres and skirts
     assert x.min() >= columns.min() - 12 and x.max() <= columns.max() + 12  # near
 
 

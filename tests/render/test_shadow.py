@@ -2,15 +2,16 @@ import pytest
 import torch
 from street import START_US, car
 
-from render.shadow import CEILING, DARKNESS, REACH, shade_at, shadow_casters
+from render.frame_types import Frame
+from render.shadow import DARKNESS, REACH, cast, shade_at, shadow_casters
 from scenes.insert import insert
 from scenes.placement import Placement
 
 HALF = (2.1, 0.9)
 
 
-def shade(x, y, z=0.0) -> float:
-    return float(shade_at(torch.tensor([x, y, z], dtype=torch.float64), HALF))
+def shade(x, y) -> float:
+    return float(shade_at(torch.tensor([x, y], dtype=torch.float64), HALF))
 
 
 def test_the_middle_of_the_footprint_is_darkest():
@@ -24,10 +25,22 @@ def test_beyond_its_reach_there_is_no_shadow():
     assert shade(HALF[0] + 0.8 * REACH, HALF[1] + 0.8 * REACH) == 0  # corners are round
 
 
-def test_surfaces_above_the_ceiling_receive_none():
-    assert shade(0, 0, CEILING) == 0
-    assert shade(0, 0, -CEILING) == 0
-    assert shade(0, 0, CEILING / 2) == pytest.approx(DARKNESS)
+def test_only_surfaces_near_the_plane_receive_it(street):
+    """A pixel that sees the plane, something on it, something high, and nothing at all."""
+    camera = street.camera("front_camera", START_US)
+    scene = insert(street, car(), Placement("car", 9, 0)).scene
+    (caster,) = shadow_casters(scene, camera)
+    y, x = 40, 48  # 9 m ahead of the body, under the car
+    down = (y + 0.5 - 27) / 57.6
+    depths = {"ground": 1.5 / down, "kerb": 1.35 / down, "roof": 0.5 / down, "nothing": float("inf")}
+    light = {}
+    for name, depth in depths.items():
+        flat = torch.full((54, 96), depth)
+        frame = Frame(camera, rgb=torch.ones(54, 96, 3), depth=flat, instance=torch.zeros(54, 96, dtype=torch.int32))
+        light[name] = float(cast(frame, [caster])[y, x, 0])
+    assert light["ground"] == pytest.approx(light["kerb"])
+    assert light["ground"] < 0.7
+    assert light["roof"] == light["nothing"] == 1
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (1.0, 0.4), (2.3, 1.0), (0.0, 1.3)])
