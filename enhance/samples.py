@@ -114,7 +114,9 @@ class Sampler:
         return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
 
     def _window(self, rng: np.random.Generator, kind: str, frames: int, size: int) -> Window:
-        shards = [s for s in self.shards[kind] or [x for of in self.shards.values() for x in of] if s.frames >= frames]
+        # Colour changes are made afresh and clean frames are targets, so any stored clip serves for those two.
+        stored = self.shards["underfit"] if kind == "underfit" else [s for of in self.shards.values() for s in of]
+        shards = [s for s in stored if s.frames >= frames]
         if not shards and self.photos is None:
             raise ValueError(f"no training clip has {frames} frames; make pairs of longer clips")
         if self.photos is not None and (not shards or (kind != "underfit" and rng.random() < 0.4)):
