@@ -36,11 +36,13 @@ class Growth:
     def none(count: int) -> Growth:
         return Growth(torch.zeros(count), torch.zeros(count))
 
-    def see(self, gradient: torch.Tensor, reach: torch.Tensor) -> None:
-        """Count one picture's gradient of means `[N, 3]`; far splats by their smaller motion in the image."""
+    def see(self, gradient: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
+        """Count one picture's gradient of means `[N, 3]`, far splats by their smaller motion in it; 1 where a splat is seen, else 0."""
         size = gradient.norm(dim=1) * reach
         self.pull += size
-        self.seen += (size > 0).to(size)
+        seen = (size > 0).to(size)
+        self.seen += seen
+        return seen
 
     def tensors(self) -> dict[str, torch.Tensor]:
         return {"pull": self.pull, "seen": self.seen}

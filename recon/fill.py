@@ -22,19 +22,25 @@ STEP = 6
 
 
 def sky_mask(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Pixels `[H, W]` of the sky in a uint8 image: smooth, bright enough, bluish or white, and joined to the image's top row.
+    """Pixels `[H, W]` of the sky in a uint8 image: smooth, bright enough, bluish, and joined to the image's top row.
 
     `covered` `[H, W]` marks pixels where splats stand already; they are not sky.
     """
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     grey = rgb.mean(-1)
     edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
-    bluish = rgb[..., 2] > rgb[..., 0] - 6
-    bright = grey > np.percentile(grey[: max(1, len(grey) // 8)], 20) * 0.6
-    smooth = (edge < 3.0) & ~covered & (bluish | (grey > 170)) & bright
+    bluish = rgb[..., 2] > rgb[..., 0] + 2
+    smooth = (edge < 3.0) & ~covered & bluish & (grey > 90)
     label, _ = ndimage.label(smooth)
-    top = np.unique(label[:3][smooth[:3]])
-    return ndimage.binary_closing(np.isin(label, top), iterations=2) & ~covered
+    large = np.bincount(label.ravel()) > 1e-3 * grey.size
+    top = np.array([k for k in np.unique(label[:3][smooth[:3]]) if large[k]], dtype=label.dtype)
+    sky = ndimage.binary_closing(np.isin(label, top), iterations=2) & ~covered
+    if not sky.any():
+        return sky
+    # what looks like the nearest sky is sky between leaves and wires: splats of its colour would float before the houses
+    away, nearest = ndimage.distance_transform_edt(~sky, return_indices=True)
+    alike = np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 28
+    return sky | (alike & (away < 40) & ~covered)
 
 
 class SkyPicture:

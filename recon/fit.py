@@ -50,6 +50,9 @@ class FitConfig:
     """Of the order of views."""
 
 
+FADE = 12.0
+"""Logit that a splat loses over a fit in which it is always seen, unless the pictures hold it up: what nothing needs, goes."""
+
 RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "dc": 5e-3, "rest": 5e-4}
 """Adam's step a field; of means in parts of each splat's reach (0.1 pixel at a focal length of 1000)."""
 
@@ -198,9 +201,8 @@ class Fit:
 
     def _follow(self) -> None:
         fields, decay = self.splats.fields, 0.01**self.progress
-        gradient = fields["means"].grad
-        if gradient is not None:
-            self.growth.see(gradient, self.splats.reach)
+        assert fields["means"].grad is not None
+        seen = self.growth.see(fields["means"].grad, self.splats.reach)
         self.splat_adam.param_groups[0]["lr"] = RATES["means"] * decay
         before = fields["means"].detach().clone()
         if fields["rest"].grad is None:
@@ -209,6 +211,7 @@ class Fit:
         with torch.no_grad():
             # Adam's step has one length for all; a far splat must move further to move a pixel
             fields["means"].sub_(before).mul_(self.splats.reach[:, None]).add_(before)
+            fields["logits"].sub_(seen, alpha=FADE / self.config.steps)
             adjusted(self.splats)
         if self.exposures.grad is not None:
             self.exposures.grad[0] = 0  # the first camera is the reference

@@ -9,7 +9,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.frames import Frames, View
-from recon.log import Log
+from recon.log import Log, Track
+from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import inverse, quat_from_matrix
@@ -30,10 +31,11 @@ class Cloud:
         return Cloud(self.xyz[which], self.rgb[which])
 
 
-def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, local_pose=None) -> np.ndarray:
+def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, movers: list[Track], local_pose=None) -> np.ndarray:
     """Colours `[C, N, 3]` of points as each camera's training frame nearest to the point's sweep shows them; NaN where it does not.
 
-    `local_pose(view)` gives world_from_local of points that move; the world otherwise.
+    `local_pose(view)` gives world_from_local of points that move; the world otherwise. Points behind the boxes of `movers` are not
+    seen: the lidar stands higher than the cameras and looks over cars that hide the road from them.
     """
     out = np.full((len(frames.names), len(points), 3), np.nan, dtype=np.float32)
     for c, name in enumerate(frames.names):
@@ -49,19 +51,42 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, loc
                 if placed is None:
                     continue
                 back = back @ placed
-            row, column, seen = project(points[mine], back.numpy(), cam)
+            row, column, z, seen = project(points[mine], back.numpy(), cam)
+            seen &= z <= nearest_box(cam, movers)[row, column]
             out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
     return out
 
 
-def project(points: np.ndarray, cam_from_local: np.ndarray, cam) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row, column and whether in view, of points `[N, 3]`."""
+def project(points: np.ndarray, cam_from_local: np.ndarray, cam: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column, depth and whether in view, of points `[N, 3]`."""
     local = points @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
     z = np.maximum(local[:, 2], 1e-6)
     column = np.floor(cam.lens.fx * local[:, 0] / z + cam.lens.cx)
     row = np.floor(cam.lens.fy * local[:, 1] / z + cam.lens.cy)
     seen = (local[:, 2] > 0.3) & (column >= 0) & (column < cam.width) & (row >= 0) & (row < cam.height)
-    return np.where(seen, row, 0).astype(np.int64), np.where(seen, column, 0).astype(np.int64), seen
+    return np.where(seen, row, 0).astype(np.int64), np.where(seen, column, 0).astype(np.int64), z, seen
+
+
+def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
+    """Depth `[H, W]` of the nearest corner of the boxes around whose image rectangles a pixel lies; inf where there is none."""
+    depth = np.full((camera.height, camera.width), np.inf)
+    from_world = inverse(camera.world_from_cam)
+    for track in tracks:
+        trajectory = track.trajectory()
+        if not trajectory.covers(camera.time_us):
+            continue
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * track.size
+        pose = (from_world @ trajectory.at(camera.time_us)).numpy()
+        local = corners @ pose[:3, :3].T + pose[:3, 3]
+        if local[:, 2].max() < 0.2:
+            continue
+        local[:, 2] = np.maximum(local[:, 2], 0.2)
+        pixels = camera.lens.project(torch.from_numpy(local)).numpy()
+        low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
+        high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
+        part = (slice(low[1], high[1]), slice(low[0], high[0]))
+        depth[part] = np.minimum(depth[part], local[:, 2].min())
+    return depth
 
 
 def first_exposures(seen: np.ndarray) -> np.ndarray:

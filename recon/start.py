@@ -15,8 +15,8 @@ from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
 from recon.model import Splats, draw
-from recon.seed import Cloud, colours, first_exposures, merged_colours, splats_from, spread, thin
-from scenes.camera import Camera, RigCamera
+from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
 from scenes.poses import interpolate, inverse
@@ -25,7 +25,7 @@ from scenes.trajectory import Trajectory
 SEED_PART = 0.5
 """Of the splat budget that lidar may take: the rest grows where pictures ask for it."""
 
-SKY_HEIGHT = 512
+SKY_HEIGHT = 256
 FILL_VIEWS = 6
 """Views a camera that are searched for what lidar does not explain."""
 
@@ -57,7 +57,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     ground = estimate_ground(split.static, log.ego)
 
     report("colouring points")
-    seen = colours(log, frames, split.static, split.static_sweep)
+    seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
     gains = first_exposures(seen)
     rgb = merged_colours(seen, gains)
     known = np.isfinite(rgb[:, 0])
@@ -117,9 +117,10 @@ def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np
         when = frames.of(0)
         nearest = min(when, key=lambda v: _separation(log, track, v)).index if when else 0
         points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), nearest)])
-    seen = colours(
-        log, frames, points, sweep, lambda view: trajectory.at(view.time_us) if trajectory.covers(view.time_us) else None
-    )
+    def pose(view: View) -> torch.Tensor | None:
+        return trajectory.at(view.time_us) if trajectory.covers(view.time_us) else None
+
+    seen = colours(log, frames, points, sweep, [], pose)
     rgb = merged_colours(seen, gains)
     known = np.isfinite(rgb[:, 0])
     if not known.any():
@@ -152,12 +153,11 @@ def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussian
         for view in spread(frames.of(c), FILL_VIEWS):
             camera = log.camera(name).camera(view.index, frames.width, frames.height)
             placed = [Placed(background, world)]
-            hidden = np.zeros((frames.height, frames.width), dtype=bool)
+            hidden = np.isfinite(nearest_box(camera, tracks))
             for track, splats in zip(tracks, actors, strict=True):
                 trajectory = track.trajectory()
                 if trajectory.covers(view.time_us):
                     placed.append(Placed(splats, trajectory.at(view.time_us)))
-                    _shade(hidden, camera, trajectory.at(view.time_us), track.size)
             alpha, depth = (t.numpy() for t in draw(placed, camera, "alpha", "depth"))
             sky = sky_mask(view.image.numpy(), (alpha > 0.3) | hidden)
             picture.add(view.image.numpy(), sky, camera, gains[c])
@@ -167,17 +167,3 @@ def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussian
                 more = splats_from(cloud, width, sh_count, width)
                 background = Gaussians.cat([background, more])
     return background, picture.picture()
-
-
-def _shade(mask: np.ndarray, camera: Camera, world_from_box: torch.Tensor, size: np.ndarray) -> None:
-    """Set the image rectangle around a box, in place."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * size
-    pose = (inverse(camera.world_from_cam) @ world_from_box).numpy()
-    local = corners @ pose[:3, :3].T + pose[:3, 3]
-    if local[:, 2].max() < 0.2:
-        return
-    local[:, 2] = np.maximum(local[:, 2], 0.2)
-    pixels = camera.lens.project(torch.from_numpy(local)).numpy()
-    low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
-    high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
-    mask[low[1] : high[1], low[0] : high[0]] = True
