@@ -18,7 +18,7 @@ CHUNKS = 8
 class TileLists:
     """What every tile composites, front to back. All int32.
 
-    starts `[tiles + 1]`, ids `[I]` (record of each entry), slot_of `[I]` (its gradient slot), first_slot `[N]` (where a record's
+    starts `[tiles + 1]`, ids `[I]` (record of each entry; the first starts[-1] count), slot_of `[I]` (its gradient slot), first_slot `[N]` (where a record's
     slots begin; they lie side by side, so that a record's gradient is one contiguous sum in fixed order).
     """
 
@@ -41,7 +41,10 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
 
 
 def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, counting: bool = True) -> TileLists:
-    """Sort the visible records by depth once, then deal them to tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles."""
+    """Sort the visible records by depth once, then deal them to tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
+
+    counts `[N]`: entries to set aside for each record; replaced by how many it has.
+    """
     device, tiles = records.device, tiles_x * tiles_y
     order = depth_order(keys)
     visible = order.shape[0]
@@ -59,7 +62,7 @@ def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, 
         histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
         tile_keys = torch.empty(total, dtype=torch.int32)
         args = [view(records, float), view(order, int), visible, chunk, tiles_x, tiles_y, view(first_slot, int)]
-        run(count_chunks, CHUNKS, [*args, view(histogram, int), view(tile_keys, int)], device)
+        run(count_chunks, CHUNKS, [*args, view(counts, int), view(histogram, int), view(tile_keys, int)], device)
         by_tile = histogram.t().reshape(-1)
         after = by_tile.cumsum(0, dtype=torch.int32)
         starts[1:] = after[CHUNKS - 1 :: CHUNKS]
@@ -69,7 +72,7 @@ def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, 
     elif total:
         pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
         owner = torch.empty(total, dtype=torch.int32, device=device)
-        args = [view(records, float), view(order, int), tiles_x, tiles_y, view(first_slot, int)]
+        args = [view(records, float), view(order, int), tiles_x, tiles_y, view(first_slot, int), view(counts, int)]
         run(emit_pairs, visible, [*args, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
         sort_pairs(pair[0], pair[1], total)
         slot_of = pair[1, :total].clone()

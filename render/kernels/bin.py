@@ -1,6 +1,7 @@
 """Which tiles a splat touches, exactly, and the tiles' lists in depth order.
 
-`tile_rows` and `tile_columns` are the only place that decides: counting and emitting cannot disagree.
+Room for a splat's entries is set aside by the box around its ellipse; `tile_columns` then finds the exact tiles, once, and their
+number replaces the box's. So nothing is computed twice, and counting and emitting cannot disagree.
 """
 
 import warp as wp
@@ -15,13 +16,11 @@ FAR = wp.constant(1.0e6)
 
 
 @wp.func
-def tile_rows(records: wp.array2d[float], j: int, tiles_y: int):
-    """First and last tile row whose pixel centres the ellipse s <= s_max reaches; empty where last < first."""
-    y = records[j, Y]
-    reach = records[j, Y_EXT] + SLACK
-    top = wp.ceil((wp.clamp(y - reach, -FAR, FAR) - LAST_CENTRE) / TILE_SIZE)
-    bottom = wp.floor((wp.clamp(y + reach, -FAR, FAR) - 0.5) / TILE_SIZE)
-    return wp.vec2i(wp.max(int(top), 0), wp.min(int(bottom), tiles_y - 1))
+def tile_span(centre: float, reach: float, tiles: int):
+    """First and last tile whose pixel centres lie within `reach` of `centre` along one direction; empty where last < first."""
+    first = wp.ceil((wp.clamp(centre - reach - SLACK, -FAR, FAR) - LAST_CENTRE) / TILE_SIZE)
+    last = wp.floor((wp.clamp(centre + reach + SLACK, -FAR, FAR) - 0.5) / TILE_SIZE)
+    return wp.vec2i(wp.max(int(first), 0), wp.min(int(last), tiles - 1))
 
 
 @wp.func
@@ -37,26 +36,24 @@ def tile_columns(records: wp.array2d[float], j: int, ty: int, tiles_x: int):
     below = above + LAST_CENTRE - 0.5 + 2.0 * SLACK
     dy_right = wp.clamp(y_at_ext, above, below)
     dy_left = wp.clamp(-y_at_ext, above, below)
-    right = m * dy_right + wp.sqrt(wp.max(s_max - h * dy_right * dy_right, 0.0)) * inv_k + SLACK
-    left = m * dy_left - wp.sqrt(wp.max(s_max - h * dy_left * dy_left, 0.0)) * inv_k - SLACK
-    first = wp.ceil((wp.clamp(x + left, -FAR, FAR) - LAST_CENTRE) / TILE_SIZE)
-    last = wp.floor((wp.clamp(x + right, -FAR, FAR) - 0.5) / TILE_SIZE)
-    return wp.vec2i(wp.max(int(first), 0), wp.min(int(last), tiles_x - 1))
+    right = m * dy_right + wp.sqrt(wp.max(s_max - h * dy_right * dy_right, 0.0)) * inv_k
+    left = m * dy_left - wp.sqrt(wp.max(s_max - h * dy_left * dy_left, 0.0)) * inv_k
+    return tile_span(x + 0.5 * (left + right), 0.5 * (right - left), tiles_x)
 
 
 @wp.kernel
 def count_chunks(
     records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, tiles_x: int, tiles_y: int, starts: wp.array[int],
-    histogram: wp.array2d[int], tile_keys: wp.array[int],
+    counts: wp.array[int], histogram: wp.array2d[int], tile_keys: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """A thread takes one chunk of the depth-ordered splats: the tile of every slot, and how many of them each tile has,
-    `[chunks, tiles]`, zeroed before."""
+    """A thread takes one chunk of the depth-ordered splats: the tile of every slot, each splat's exact count, and the histogram
+    `[chunks, tiles]` of entries a tile, zeroed before."""
     part = first + wp.tid()
     for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
         j = order[d]
         slot = starts[j]
-        rows = tile_rows(records, j, tiles_y)
+        rows = tile_span(records[j, Y], records[j, Y_EXT], tiles_y)
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(records, j, ty, tiles_x)
             for tx in range(columns[0], columns[1] + 1):
@@ -64,6 +61,7 @@ def count_chunks(
                 tile_keys[slot] = tile
                 histogram[part, tile] = histogram[part, tile] + 1
                 slot += 1
+        counts[j] = slot - starts[j]
 
 
 @wp.kernel
@@ -87,13 +85,13 @@ def emit_chunks(
 @wp.kernel
 def emit_pairs(
     records: wp.array2d[float], order: wp.array[int], tiles_x: int, tiles_y: int, starts: wp.array[int],
-    tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
+    counts: wp.array[int], tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
     first: int,
 ):  # fmt: skip
     """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists."""
     j = order[first + wp.tid()]
     slot = starts[j]
-    rows = tile_rows(records, j, tiles_y)
+    rows = tile_span(records[j, Y], records[j, Y_EXT], tiles_y)
     for ty in range(rows[0], rows[1] + 1):
         columns = tile_columns(records, j, ty, tiles_x)
         for tx in range(columns[0], columns[1] + 1):
@@ -101,3 +99,8 @@ def emit_pairs(
             slot_of[slot] = slot
             owner[slot] = j
             slot += 1
+    for spare in range(slot, starts[j] + counts[j]):
+        tile_keys[spare] = tiles_x * tiles_y  # behind every tile
+        slot_of[spare] = spare
+        owner[spare] = j
+    counts[j] = slot - starts[j]

@@ -15,7 +15,7 @@ a splat is not drawn when its ellipsoid of 3.33 sigma lies wholly beyond one sid
 
 import warp as wp
 
-from render.kernels.bin import tile_columns, tile_rows
+from render.kernels.bin import tile_span
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
@@ -201,7 +201,7 @@ def project(
     records: wp.array2d[float], depth_keys: wp.array[int], counts: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """Records, depth keys (the bits of a positive float sort as an int) and tile counts of one instance, from record `base`."""
+    """Records, depth keys (the bits of a positive float sort as an int) and tiles at most of one instance, from record `base`."""
     i = first + wp.tid()
     j = base + i
     counts[j] = 0
@@ -238,12 +238,11 @@ def project(
                 records[j, Y_EXT] = wp.sqrt(s_max / h)
                 records[j, INV_K] = 1.0 / k
                 records[j, INV_C] = 1.0 / c
-                records[j, Y_AT_EXT] = k * m * wp.sqrt(s_max / (c * h))
-                rows = tile_rows(records, j, view.tiles_y)
-                total = int(0)
-                for ty in range(rows[0], rows[1] + 1):
-                    columns = tile_columns(records, j, ty, view.tiles_x)
-                    total += wp.max(columns[1] - columns[0] + 1, 0)
+                root = wp.sqrt(s_max / (c * h))
+                records[j, Y_AT_EXT] = k * m * root
+                rows = tile_span(records[j, Y], records[j, Y_EXT], view.tiles_y)
+                columns = tile_span(records[j, X], c * root / k, view.tiles_x)
+                total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
                 counts[j] = total
                 if total > 0:
                     depth_keys[j] = wp.cast(t[2], int)
