@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the front door does, before anything loads torch
+
 REPOSITORY = Path(__file__).parents[1]
 
 
