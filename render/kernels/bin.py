@@ -1,7 +1,8 @@
 """Which tiles a splat touches, exactly, and the tiles' lists in depth order.
 
 Room for a splat's entries is set aside by the box around its ellipse; `tile_columns` then finds the exact tiles, once, and their
-number replaces the box's. So nothing is computed twice, and counting and emitting cannot disagree.
+number replaces the box's. So nothing is computed twice, and counting and emitting cannot disagree; entries past the room, which
+rounding alone could ask for, are not written.
 """
 
 import warp as wp
@@ -53,10 +54,11 @@ def count_chunks(
     for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
         j = order[d]
         slot = starts[j]
+        end = slot + counts[j]
         rows = tile_span(records[j, Y], records[j, Y_EXT], tiles_y)
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(records, j, ty, tiles_x)
-            for tx in range(columns[0], columns[1] + 1):
+            for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
                 tile = ty * tiles_x + tx
                 tile_keys[slot] = tile
                 histogram[part, tile] = histogram[part, tile] + 1
@@ -91,15 +93,16 @@ def emit_pairs(
     """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists."""
     j = order[first + wp.tid()]
     slot = starts[j]
+    end = slot + counts[j]
     rows = tile_span(records[j, Y], records[j, Y_EXT], tiles_y)
     for ty in range(rows[0], rows[1] + 1):
         columns = tile_columns(records, j, ty, tiles_x)
-        for tx in range(columns[0], columns[1] + 1):
+        for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
             tile_keys[slot] = ty * tiles_x + tx
             slot_of[slot] = slot
             owner[slot] = j
             slot += 1
-    for spare in range(slot, starts[j] + counts[j]):
+    for spare in range(slot, end):
         tile_keys[spare] = tiles_x * tiles_y  # behind every tile
         slot_of[spare] = spare
         owner[spare] = j

@@ -62,8 +62,10 @@ def exp_series(z: lanes):
 
 
 @wp.func
-def row_range(records: wp.array2d[float], i: int, px: float, py: float):
-    """First and last row of a tile that the ellipse reaches within the tile's columns; px, py: its centre from the tile's first pixel."""
+def row_range(records: wp.array2d[float], i: int, x0: float, y0: float):
+    """First and last row that the ellipse reaches within the columns of the tile whose first pixel centre is x0, y0."""
+    px = records[i, X] - x0
+    py = records[i, Y] - y0
     k = records[i, K]
     m = records[i, M]
     h = records[i, H]
@@ -114,7 +116,11 @@ def composite(depth: bool, instance: bool, squarings: int):
                     state[band, 6, r] = lanes(-1.0)
                 last[row0 + r, tx] = start
             row_max = lanes(1.0)
-            for n in range(start, tile_starts[tile + 1]):
+            stop = tile_starts[tile + 1]
+            next_rows = wp.vec2i(0, -1)
+            if stop > start:
+                next_rows = row_range(records, ids[start], x0, y0)
+            for n in range(start, stop):
                 if (n - start) % EARLY == EARLY - 1:
                     for r in range(TILE):
                         row_max[r] = wp.max(state[band, 0, r])
@@ -131,7 +137,10 @@ def composite(depth: bool, instance: bool, squarings: int):
                 red = records[i, RED]
                 green = records[i, GREEN]
                 blue = records[i, BLUE]
-                rows = row_range(records, i, px, py)
+                rows = wp.vec2i(next_rows[0], next_rows[1])  # a copy: plain assignment would be another name for the same variable
+                # the next entry's rows are found before this one's are drawn: the branch that ends a loop of unknown
+                # length is mispredicted, and then only what came before it is already done
+                next_rows = row_range(records, ids[wp.min(n + 1, stop - 1)], x0, y0)
                 for r in range(rows[0], rows[1] + 1):
                     if row_max[r] >= termination:
                         dy = float(r) - py
@@ -213,6 +222,9 @@ def composite_gradient(depth: bool, squarings: int):
                 slot = slot_of[n]
                 for c in range(GRADIENTS):
                     slots[slot, c] = 0.0
+            next_rows = wp.vec2i(0, -1)
+            if stop > start:
+                next_rows = row_range(records, ids[stop - 1], x0, y0)
             for back in range(stop - start):
                 n = stop - 1 - back
                 i = ids[n]
@@ -233,7 +245,8 @@ def composite_gradient(depth: bool, squarings: int):
                 sum_e = lanes(0.0)  # of dL/da e = -dL/ds / opacity
                 sum_ey = lanes(0.0)
                 sum_eyy = lanes(0.0)
-                rows = row_range(records, i, px, py)
+                rows = wp.vec2i(next_rows[0], next_rows[1])  # a copy: plain assignment would be another name for the same variable
+                next_rows = row_range(records, ids[wp.max(n - 1, start)], x0, y0)
                 # moments are taken about a point of the ridge amid these rows: about the centre, which may lie
                 # hundreds of pixels away, the sums of a needle would cancel
                 middle = 0.5 * float(rows[0] + rows[1])

@@ -38,6 +38,7 @@ from render.kernels.types import (
     OPTIONS,
     RED,
     S_MAX,
+    SLACK,
     UNIFORM_GRADIENTS,
     Y_AT_EXT,
     Y_EXT,
@@ -58,6 +59,7 @@ NEAREST = wp.constant(0.5)
 REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1/255
 CULLED = wp.constant(2147483647)
 TINY = wp.constant(1.0e-30)
+ROOM = wp.constant(1.0001)  # the box that sets room aside is this much wider than the ellipse, whatever rounding does to either
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
 vec_axis = wp.types.vector(length=8, dtype=wp.float32)
 vec_uniform = wp.types.vector(length=UNIFORM_GRADIENTS, dtype=wp.float32)
@@ -240,8 +242,8 @@ def project(
                 records[j, INV_C] = 1.0 / c
                 root = wp.sqrt(s_max / (c * h))
                 records[j, Y_AT_EXT] = k * m * root
-                rows = tile_span(records[j, Y], records[j, Y_EXT], view.tiles_y)
-                columns = tile_span(records[j, X], c * root / k, view.tiles_x)
+                rows = tile_span(records[j, Y], ROOM * records[j, Y_EXT] + SLACK, view.tiles_y)
+                columns = tile_span(records[j, X], ROOM * c * root / k + SLACK, view.tiles_x)
                 total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
                 counts[j] = total
                 if total > 0:

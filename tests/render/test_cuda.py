@@ -49,15 +49,17 @@ class Captured:
         pass
 
 
-def lane_result():
-    """Forward and backward of the lane kernels with depth and instance: outputs, kept state, output gradients, field gradients."""
-    g = random_splats(80, 1)
-    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), True, True, (5,))
-    pose = translation(0, 0, 5)[None]
-    lens = Pinhole(30.0, 30.0, 18.0, 14.0).params()
+def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole):
+    """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
     kept.needs_input_grad = (False,) * 8
-    outputs = Rasterize.forward(kept, settings, pose, lens, *g.tensors().values())
+    return kept, Rasterize.forward(kept, settings, pose[None], lens.params(), *gaussians.tensors().values())
+
+
+def lane_result():
+    """Forward of the lane kernels with depth and instance: settings, kept state, outputs."""
+    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), True, True, (5,))
+    kept, outputs = keep_forward(settings, random_splats(80, 1), translation(0, 0, 5), Pinhole(30.0, 30.0, 18.0, 14.0))
     return settings, kept, outputs
 
 
