@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
@@ -22,7 +21,6 @@ from scenes.asset import Actor, Asset
 from scenes.camera import RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
-from scenes.poses import inverse
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 from scenes.trajectory import Trajectory
@@ -42,18 +40,19 @@ def reconstruct(
     resume: bool = False,
     config: FitConfig = FitConfig(),  # noqa: B008 - frozen
     half: bool = False,
+    overwrite: bool = False,
 ) -> Scene:
-    """Fit a scene to a log's images and write it to the folder `output`; it must not exist.
+    """Fit a scene to a log's images and write it to the folder `output`.
 
     cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
     are fitted. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr. An interrupted fit
     leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
-    half: splats in half precision, where the file's size matters.
+    half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
 
     Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
     """
     output = Path(output)
-    if output.exists():
+    if output.exists() and not overwrite:
         raise FileExistsError(f"{output} exists already; choose another folder or remove it")
     if not output.parent.is_dir():
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
@@ -87,7 +86,7 @@ def reconstruct(
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
     print(table_text(rows), file=sys.stderr)
-    save(scene, output, half=half)
+    save(scene, output, overwrite, half)
     checkpoint.unlink(missing_ok=True)
     return scene
 
@@ -130,7 +129,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
         trajectory = _baked(fit.actors[i], "actor")
-        meta = {**share, "track": track.name, "views": count_views(rig, ego, trajectory, track.size)}
+        meta = {**share, "track": track.name}
         actors.append(Actor(Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta), trajectory, track.name))
     parked = [
         {"track": t.name, "label": t.label, "size": t.size.tolist(), "world_from_box": middle_pose(t).tolist()}
@@ -150,18 +149,3 @@ def _baked(knots: Knots, kind: str) -> Trajectory:
 def middle_pose(track: Track) -> torch.Tensor:
     """A standing box's pose: that of its middle observation."""
     return track.world_from_box[len(track.world_from_box) // 2]
-
-
-def count_views(rig: dict[str, RigCamera], ego: Trajectory, box: Trajectory, size: np.ndarray) -> int:
-    """Frames of all cameras in which the middle of a box is in view."""
-    count = 0
-    middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
-    for camera in rig.values():
-        times = np.array([t for t in camera.times_us.tolist() if box.covers(t) and ego.covers(t)], dtype=np.int64)
-        if len(times):
-            from_world = inverse(Knots(ego).base(times)[0] @ camera.body_from_cam)
-            local = (from_world @ Knots(box).base(times)[0] @ middle)[:, :3]
-            pixels = camera.lens.project(local)
-            size_of = torch.tensor([camera.width, camera.height])
-            count += int(((local[:, 2] > 0.5) & (pixels >= 0).all(1) & (pixels < size_of).all(1)).sum())
-    return count

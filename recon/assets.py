@@ -1,0 +1,215 @@
+"""Assets cut from a reconstructed scene: what moved, and the parked vehicles whose boxes the log knows."""
+
+from __future__ import annotations
+
+import io
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from render import Frame, rasterize
+from scenes.asset import Asset
+from scenes.camera import Camera
+from scenes.databank import Databank
+from scenes.files import load
+from scenes.gaussians import Gaussians
+from scenes.harmonics import basis
+from scenes.lens import Pinhole
+from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
+from scenes.scene import Scene
+from scenes.trajectory import Trajectory
+
+FLOOR = 0.06
+"""Metres above the base of a box under which splats are road, not wheel."""
+
+FAINT = 0.05
+"""Opacity under which a splat is left behind."""
+
+FEWEST_SPLATS = 400
+FEWEST_VIEWS = 10
+FULL_SIDE = 0.85
+"""Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
+
+FARTHEST = 30.0
+"""Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
+
+THUMB = (320, 240)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A cut object before it is judged: its asset, its track, and why it is not good enough, or ''."""
+
+    asset: Asset
+    track: str
+    flaw: str
+
+
+def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
+    """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first.
+
+    What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
+    """
+    if not isinstance(scene, Scene):
+        loaded = load(scene)
+        if not isinstance(loaded, Scene):
+            raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
+        scene = loaded
+    found = sorted(candidates(scene), key=lambda c: -len(c.asset.gaussians))
+    bank, ids = Databank(databank), []
+    for candidate in found:
+        if candidate.flaw:
+            print(f"left out {candidate.track} ({candidate.asset.label}): {candidate.flaw}", file=sys.stderr)
+        else:
+            ids.append(bank.add(candidate.asset, thumbnail(candidate.asset)))
+    if not ids:
+        raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")
+    return ids
+
+
+def candidates(scene: Scene) -> Iterator[Candidate]:
+    """Every mover and every parked vehicle of a scene as an asset in its own frame."""
+    share = {k: scene.meta[k] for k in ("licence", "attribution") if k in scene.meta}
+    share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
+    for actor in scene.actors:
+        cut = within_box(actor.asset.gaussians, actor.asset.size)
+        views, near = seen(scene, actor.trajectory, float(actor.asset.size[2]))
+        yield _judged(cut, actor.asset, share | {"track": actor.track, "views": views, "moved": True}, near)
+    for entry in scene.meta.get("parked", []):
+        world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
+        size = torch.tensor(entry["size"], dtype=torch.float64)
+        if size.max() <= 0:
+            continue
+        cut = within_box(moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size), size)
+        views, near = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), float(size[2]))
+        asset = Asset(cut, size, entry["label"], scene.model)
+        yield _judged(cut, asset, share | {"track": entry["track"], "views": views, "moved": False}, near)
+
+
+def seen(scene: Scene, box: Trajectory, height: float) -> tuple[int, float]:
+    """In how many frames of all cameras the middle of a box is in view within `FARTHEST`, and metres to the nearest camera then."""
+    middle = torch.tensor([0.0, 0.0, height / 2, 1.0], dtype=torch.float64)
+    count, nearest = 0, math.inf
+    for name, camera in scene.rig.items():
+        for t in scene.frame_times(name).tolist():
+            if not (box.covers(t) and scene.ego.covers(t)):
+                continue
+            x, y, z, _ = (inverse(scene.ego.at(t) @ camera.body_from_cam) @ box.at(t) @ middle).tolist()
+            if z < 0.5:
+                continue
+            u, v = camera.lens.fx * x / z + camera.lens.cx, camera.lens.fy * y / z + camera.lens.cy
+            if 0 <= u < camera.width and 0 <= v < camera.height:
+                nearest = min(nearest, math.hypot(x, y, z))
+                count += math.hypot(x, y, z) <= FARTHEST
+    return count, nearest
+
+
+def _judged(cut: Gaussians, asset: Asset, meta: dict, near: float) -> Candidate:
+    flaw = ""
+    if meta["views"] < FEWEST_VIEWS:
+        flaw = f"{meta['views']} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
+    elif len(cut) < FEWEST_SPLATS:
+        flaw = f"{len(cut)} splats, fewer than {FEWEST_SPLATS}"
+    elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
+        flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
+    whole, mirrored = (completed(cut) if not flaw else (cut, False))
+    meta = meta | {"mirrored": mirrored, "nearest_m": round(near, 2) if math.isfinite(near) else None}
+    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw)
+
+
+def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:
+    """Part of the box's side, length by height, that splats stand in or within a cell of; 0.95 for a whole car."""
+    length, _, height = size.tolist()
+    cell = max(height / 8, 0.1)
+    shape = math.ceil(length / cell), math.ceil(height / cell)
+    solid = gaussians.means[torch.sigmoid(gaussians.logit_opacities) > 0.3]
+    column = ((solid[:, 0] + length / 2) / cell).long().clamp(0, shape[0] - 1)
+    row = (solid[:, 2] / cell).long().clamp(0, shape[1] - 1)
+    grid = torch.zeros(1, 1, *shape)
+    grid[0, 0, column, row] = 1
+    return float(torch.nn.functional.max_pool2d(grid, 3, 1, 1).mean())
+
+
+def within_box(gaussians: Gaussians, size: torch.Tensor) -> Gaussians:
+    """The splats of a box frame that belong to the object: inside, above the floor, not faint, and no wider than a third of the box."""
+    half = size[:2].float() / 2 + 0.08
+    means = gaussians.means
+    keep = (means[:, :2].abs() <= half).all(1) & (means[:, 2] > FLOOR) & (means[:, 2] < float(size[2]) + 0.1)
+    keep &= torch.sigmoid(gaussians.logit_opacities) > FAINT
+    keep &= gaussians.log_scales.amax(1) < math.log(float(size.min()) / 3)
+    return gaussians.select(keep)
+
+
+def moved(gaussians: Gaussians, to_from_local: torch.Tensor, size: torch.Tensor) -> Gaussians:
+    """Splats near a box `[length, width, height]` at the origin of another frame, in that frame; harmonics turn along."""
+    rotation, shift = to_from_local[:3, :3], to_from_local[:3, 3]
+    means = gaussians.means.double() @ rotation.T + shift
+    near = means.norm(dim=1) < float(size.norm())
+    gaussians, means = gaussians.select(near), means[near]
+    quats = quat_from_matrix(rotation @ matrix_from_quat(gaussians.quats.double()))
+    return replace(gaussians, means=means.float(), quats=quats.float(), sh=turned(gaussians.sh, rotation))
+
+
+def turned(sh: torch.Tensor, transform: torch.Tensor) -> torch.Tensor:
+    """Harmonics `[N, K, 3]` of colours whose directions an orthogonal `[3, 3]` maps: rotations and mirrors alike.
+
+    Bands map to themselves, so K well-spread directions determine the matrix exactly.
+    """
+    count = sh.shape[1]
+    directions = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    matrix = torch.linalg.lstsq(basis(directions, count), basis(directions @ transform, count)).solution
+    return torch.einsum("kj,njc->nkc", matrix.to(sh), sh)
+
+
+def completed(gaussians: Gaussians) -> tuple[Gaussians, bool]:
+    """A vehicle seen from one side gets that half's mirror image for the other, and whether that was done.
+
+    Cameras pass a parked car on one side only; cars, trucks and people are near enough symmetric about their xz plane.
+    """
+    y = gaussians.means[:, 1]
+    weight = torch.sigmoid(gaussians.logit_opacities) * (2 * gaussians.log_scales.sum(1) / 3).exp()
+    left, right = float(weight[y > 0].sum()), float(weight[y < 0].sum())
+    if min(left, right) > 0.6 * max(left, right):
+        return gaussians, False
+    half = gaussians.select(y >= 0 if left > right else y <= 0)
+    mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    # of a mirrored rotation the axes x and z turn the other way round
+    other = replace(half, means=half.means * flip, quats=half.quats * torch.tensor([1.0, -1.0, 1.0, -1.0]), sh=turned(half.sh, mirror))
+    return Gaussians.cat([half, other]), True
+
+
+def thumbnail(asset: Asset) -> bytes:
+    """A PNG of the asset in three-quarter view from behind on its left, on neutral grey."""
+    from PIL import Image
+
+    length, width, height = asset.size.tolist()
+    centre = torch.tensor([0.0, 0.0, height / 2], dtype=torch.float64)
+    distance = 1.9 * math.hypot(length, width, height)
+    azimuth, elevation = math.radians(145), math.radians(18)
+    direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)
+    with torch.no_grad():
+        frame = rasterize(asset.gaussians, camera, ("rgb",), background=torch.tensor([0.72, 0.73, 0.75]), model=asset.model)
+    assert isinstance(frame, Frame) and frame.rgb is not None
+    pixels = np.round(frame.rgb.clamp(0, 1).numpy() * 255).astype(np.uint8)
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, "png")
+    return out.getvalue()
+
+
+def looking_at(target: torch.Tensor, eye: torch.Tensor, width: int, height: int) -> Camera:
+    """A camera at `eye` that looks at `target` with the world's z up in the picture."""
+    forward = (target - eye) / (target - eye).norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    right = right / right.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], 1)
+    pose[:3, 3] = eye
+    return Camera(Pinhole(1.75 * width, 1.75 * width, width / 2, height / 2), width, height, pose)

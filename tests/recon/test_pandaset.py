@@ -1,0 +1,151 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from made_drive import ABSENT, SCANNED_US
+
+from recon import open_log
+from recon.pandaset import label_slug
+from scenes.poses import inverse
+
+
+def test_the_made_drive_reads_as_it_was_written(drive, street):
+    log = open_log(drive)
+    assert list(log.cameras) == ["front_camera", "left_camera"]
+    assert [s.index for s in log.sweeps] == [i for i in range(8) if i != ABSENT]
+    for name, camera in log.cameras.items():
+        assert camera.times_us.tolist() == street.frame_times(name).tolist()
+        expected = torch.stack([street.camera(name, t).world_from_cam for t in camera.times_us.tolist()])
+        torch.testing.assert_close(camera.world_from_cam, expected, atol=1e-9, rtol=0)
+    assert log.meta["licence"] == "CC BY 4.0" and "Hesai" in log.meta["attribution"]
+
+
+def test_the_body_is_the_lidar_pose_turned_to_forward_left_up(drive, street):
+    log = open_log(drive)
+    for t in street.ego.times_us[:8].tolist():
+        torch.testing.assert_close(log.ego.at(t), street.ego.at(t), atol=1e-9, rtol=0)
+
+
+def test_the_body_covers_cameras_that_fire_before_its_first_stamp(drive):
+    log = open_log(drive)
+    assert log.ego.covers(int(log.cameras["front_camera"].times_us[0]) - 81_000)
+
+
+def test_the_rig_of_a_rigid_drive_reproduces_its_camera_poses(drive, street):
+    log = open_log(drive)
+    for name, camera in log.rig(96, 54).items():
+        torch.testing.assert_close(camera.body_from_cam, street.rig[name].body_from_cam, atol=1e-6, rtol=0)
+        assert log.offsets(name).std(0).max() < 1e-6
+
+
+def test_sibling_cuboids_become_one_track_with_its_heading(drive, street):
+    log = open_log(drive)
+    assert len(log.tracks) == 2
+    mover = next(t for t in log.tracks if t.moving)
+    assert mover.sources == ("mover-a", "mover-b") and mover.label == "car" and mover.name.startswith("veh_")
+    np.testing.assert_allclose(mover.size, street.actors[0].asset.size.numpy(), atol=1e-9)
+    for t, pose in zip(mover.times_us.tolist()[1:], mover.world_from_box[1:], strict=True):
+        torch.testing.assert_close(pose, street.actors[0].trajectory.at(t + SCANNED_US), atol=1e-6, rtol=0)
+
+
+def test_images_are_area_averaged_to_the_working_size(drive):
+    camera = open_log(drive).camera("front_camera")
+    full, half = camera.image(2), camera.image(2, 48, 27)
+    mean = full.reshape(27, 2, 48, 2, 3).astype(float).mean((1, 3))
+    assert np.abs(half - mean).max() <= 1
+
+
+def test_a_camera_that_does_not_exist_is_named_with_the_nearest(drive):
+    with pytest.raises(ValueError, match="Did you mean front_camera"):
+        open_log(drive).camera("frnt_camera")
+
+
+def test_a_missing_image_is_named(own_drive):
+    (own_drive / "camera/left_camera/05.jpg").unlink()
+    with pytest.raises(FileNotFoundError, match="left_camera/05.jpg is missing"):
+        open_log(own_drive)
+
+
+def test_an_image_that_does_not_decode_is_named(own_drive):
+    file = own_drive / "camera/front_camera/02.jpg"
+    file.write_bytes(file.read_bytes()[:400])
+    with pytest.raises(ValueError, match="front_camera/02.jpg does not decode"):
+        open_log(own_drive).camera("front_camera").image(2)
+
+
+@pytest.mark.parametrize("file", ["poses.json", "timestamps.json", "intrinsics.json"])
+def test_corrupt_and_missing_json_is_named(own_drive, file):
+    path = own_drive / "camera/front_camera" / file
+    path.write_text(path.read_text()[:-5])
+    with pytest.raises(ValueError, match=file):
+        open_log(own_drive)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=file):
+        open_log(own_drive)
+
+
+def test_json_of_another_shape_is_refused(own_drive):
+    path = own_drive / "camera/front_camera/poses.json"
+    path.write_text(json.dumps([{"position": {"x": 0}}] * 8))
+    with pytest.raises(ValueError, match="poses.json"):
+        open_log(own_drive)
+
+
+def test_times_that_do_not_rise_are_refused(own_drive):
+    path = own_drive / "lidar/timestamps.json"
+    times = json.loads(path.read_text())
+    path.write_text(json.dumps(times[:4] + times[3:7]))
+    with pytest.raises(ValueError, match="rise strictly at entry 4"):
+        open_log(own_drive)
+
+
+def test_a_sweep_without_its_columns_is_named_when_read(own_drive):
+    shutil.copy(own_drive / "annotations/cuboids/00.pkl.gz", own_drive / "lidar/00.pkl.gz")
+    log = open_log(own_drive)
+    with pytest.raises(ValueError, match="00.pkl.gz has no column 'x'"):
+        log.sweeps[0].read()
+
+
+def test_a_drive_without_boxes_or_gps_is_a_drive(own_drive):
+    shutil.rmtree(own_drive / "annotations")
+    shutil.rmtree(own_drive / "meta")
+    assert open_log(own_drive).tracks == ()
+
+
+def test_a_folder_that_is_no_drive_is_refused_with_the_drive_inside(own_drive, tmp_path):
+    with pytest.raises(ValueError, match=str(own_drive)):
+        open_log(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        open_log(tmp_path / "nowhere")
+
+
+def test_labels_become_slugs():
+    assert [label_slug(x) for x in ("Car", "Pickup Truck", "Medium-sized Truck", "Pedestrian with Object", "Rolling Containers", "")] == [
+        "car", "pickup", "truck", "pedestrian", "rolling-containers", "object",
+    ]  # fmt: skip
+
+
+def test_drive_002_has_what_its_page_says(pandaset):
+    log = open_log(pandaset)
+    assert len(log.cameras) == 5 and all(len(c) == 80 for c in log.cameras.values())
+    assert (log.cameras["front_camera"].width, log.cameras["left_camera"].width) == (1920, 960)
+    assert len(log.sweeps) == 76 and not {56, 57, 58, 71} & {s.index for s in log.sweeps}
+    moving = [t for t in log.tracks if t.moving]
+    assert 34 <= len(moving) <= 38 and sum(len(t.sources) for t in moving) == 67
+    travelled = (log.ego.world_from_body[-2, :3, 3] - log.ego.world_from_body[1, :3, 3]).norm()
+    assert 20 < float(travelled) < 22.5
+
+
+def test_the_lidar_of_drive_002_falls_into_the_moving_boxes(pandaset):
+    log = open_log(pandaset)
+    sweep = next(s for s in log.sweeps if s.index == 40)
+    points = sweep.read().xyz
+    counts = []
+    for track in log.tracks:
+        if track.moving and sweep.time_us in track.times_us:
+            pose = track.world_from_box[list(track.times_us).index(sweep.time_us)]
+            local = points @ inverse(pose).numpy()[:3, :3].T + inverse(pose).numpy()[:3, 3]
+            counts.append(((np.abs(local[:, :2]) < track.size[:2] / 2 + 0.1).all(1) & (local[:, 2] > 0) & (local[:, 2] < track.size[2])).sum())
+    assert max(counts) > 3000 and np.median(counts) >= 20
