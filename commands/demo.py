@@ -42,7 +42,7 @@ class Demo:
 
         start = time.monotonic()
         if not DATA.is_dir():
-            raise FileNotFoundError(f"the demo's drive is not at {DATA}: it comes with the source; clone the repository and run make demo there")
+            raise FileNotFoundError(f"the demo's drive is not at {DATA}: it comes with the source; clone that and run make demo there")
         self.output.mkdir(exist_ok=True)
         files = [fresh(self.output / name, self.overwrite) for name in ("out.mp4", "out.json", "contact.png")]
         demonstrate(DATA, self.output)

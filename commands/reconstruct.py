@@ -33,11 +33,17 @@ class Recon:
 
     def run(self) -> None:
         from recon import open_log, reconstruct
+        from scenes.usd_scene import is_scene
 
         fresh(self.output, self.overwrite)
+        if self.output.exists() and not is_scene(self.output):
+            raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
         log = open_log(self.data)
         try:
-            reconstruct(log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume)
+            reconstruct(
+                log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume,
+                overwrite=self.overwrite,
+            )  # fmt: skip
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
 

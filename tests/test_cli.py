@@ -171,6 +171,8 @@ DATA = [
     (["enhance", "clip.mp4", "-o", "x.mp4", "--weights", "gone.safetensors"], "gone.safetensors"),
     (["recon", "nowhere", "-o", "x"], "nowhere"),
     (["recon", "bank", "-o", "x"], "not a known layout"),
+    (["recon", "bank", "-o", "street"], "street exists; give -w"),
+    (["recon", "bank", "-o", "bank", "-w"], "bank is not a scene, so it is left alone"),
     (["info", "clip.mp4"], "clip.mp4 is not a kind of file that Sidestep knows"),
 ]
 
