@@ -18,8 +18,8 @@ CHUNKS = 8
 class TileLists:
     """What every tile composites, front to back. All int32.
 
-    starts `[tiles + 1]`, ids `[I]` (record of each entry; the first starts[-1] count), slot_of `[I]` (its gradient slot), first_slot `[N]` (where a record's
-    slots begin; they lie side by side, so that a record's gradient is one contiguous sum in fixed order).
+    starts `[tiles + 1]`, ids `[I]` (record of each entry; the first starts[-1] count), slot_of `[I]` (its gradient slot),
+    first_slot `[N]` (where a record's slots begin; they lie side by side, so that its gradient is one contiguous sum in fixed order).
     """
 
     starts: torch.Tensor
@@ -40,7 +40,9 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
     return pair[1, :n]
 
 
-def tile_lists(records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, counting: bool = True) -> TileLists:
+def tile_lists(
+    records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, counting: bool = True
+) -> TileLists:
     """Sort the visible records by depth once, then deal them to tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
     counts `[N]`: entries to set aside for each record; replaced by how many it has.

@@ -1,9 +1,9 @@
 """Front-to-back compositing on lane vectors, and its backward, for the CPU: a thread takes a band of tiles, a lane vector one row of one.
 
-Planes are `[rows, tiles_x]` lane vectors: plain row-major images whose width is padded to the tile. While a tile is worked on its
-rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row is another
-page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to front from a stored last entry per row: the
-front-to-back form (total minus prefix) cancels in float32.
+Planes are `[rows, tiles_x]` lane vectors: plain row-major images whose width is padded to the tile. While a tile is worked on,
+its rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row would
+be another page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to
+front from a stored last entry per row: the front-to-back form (total minus prefix) cancels in float32.
 """
 
 from functools import cache
@@ -99,7 +99,9 @@ def composite(depth: bool, instance: bool, squarings: int):
         out_z: wp.array2d[lanes], out_w: wp.array2d[lanes], out_instance: wp.array2d[lanes], last: wp.array2d[int],
         first: int,
     ):  # fmt: skip
-        """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart; state `[bands, 8, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight."""
+        """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
+        state `[bands, 8, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight.
+        """
         band = first + wp.tid()
         column = columns[0]
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):

@@ -97,7 +97,6 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
 @cache
 def composite_blocks_gradient(depth: bool, tile_size: int):
     """The backward kernel for tiles of `tile_size` pixels square; arguments as `composite_gradient`, per pixel instead of per row."""
-    block = tile_size * tile_size
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_backward(

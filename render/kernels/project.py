@@ -255,9 +255,19 @@ def project(
 
 
 @wp.func
-def add_cross_gradient(a: wp.vec2, b: wp.vec2, g: float):
-    """d loss / d a of cross2(a, b) with gradient g; d / d b is the same with a, b swapped and -g."""
+def cross_gradient(b: wp.vec2, g: float):
+    """g times d cross2(a, b) / d a; by b it is minus the same with a in place of b."""
     return wp.vec2(g * b[1], -g * b[0])
+
+
+@wp.func
+def quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
+    return xx * v[0] * v[0] + xy * v[0] * v[1] + yy * v[1] * v[1]
+
+
+@wp.func
+def gradient_of_quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
+    return wp.vec2(2.0 * xx * v[0] + xy * v[1], xy * v[0] + 2.0 * yy * v[1])
 
 
 @wp.func
@@ -324,7 +334,6 @@ def project_backward(
             r_splat = rotation(quats[i])
             scale = exp_scale(log_scales[i])
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            xx = f.xx + view.dilation
             yy = f.yy + view.dilation
             det = f.det0 + view.dilation * (f.xx + f.yy + view.dilation)
             o = sigmoid(logit_opacities[i])
@@ -355,9 +364,9 @@ def project_backward(
             um = cross2(f.u.e, f.mu)
             vm = cross2(f.v.e, f.mu)
             wm = cross2(f.w.e, f.mu)
-            g_wu = g_det0 * (f.v.w * uv * uv + f.w.w * uw * uw + um * um) + g_xx * f.u.e[0] * f.u.e[0] + g_yy * f.u.e[1] * f.u.e[1] + g_xy * f.u.e[0] * f.u.e[1]
-            g_wv = g_det0 * (f.u.w * uv * uv + f.w.w * vw * vw + vm * vm) + g_xx * f.v.e[0] * f.v.e[0] + g_yy * f.v.e[1] * f.v.e[1] + g_xy * f.v.e[0] * f.v.e[1]
-            g_ww = g_det0 * (f.u.w * uw * uw + f.v.w * vw * vw + wm * wm) + g_xx * f.w.e[0] * f.w.e[0] + g_yy * f.w.e[1] * f.w.e[1] + g_xy * f.w.e[0] * f.w.e[1]
+            g_wu = g_det0 * (f.v.w * uv * uv + f.w.w * uw * uw + um * um) + quadratic(g_xx, g_xy, g_yy, f.u.e)
+            g_wv = g_det0 * (f.u.w * uv * uv + f.w.w * vw * vw + vm * vm) + quadratic(g_xx, g_xy, g_yy, f.v.e)
+            g_ww = g_det0 * (f.u.w * uw * uw + f.v.w * vw * vw + wm * wm) + quadratic(g_xx, g_xy, g_yy, f.w.e)
             g_uv = 2.0 * g_det0 * f.u.w * f.v.w * uv
             g_uw = 2.0 * g_det0 * f.u.w * f.w.w * uw
             g_vw = 2.0 * g_det0 * f.v.w * f.w.w * vw
@@ -365,14 +374,14 @@ def project_backward(
             g_vm = 2.0 * g_det0 * f.v.w * vm
             g_wm = 2.0 * g_det0 * f.w.w * wm
             g_xy_px = wp.vec2(g[G_X], g[G_Y])
-            g_mu = g_xy_px + wp.vec2(2.0 * g_xx * f.mu[0] + g_xy * f.mu[1], 2.0 * g_yy * f.mu[1] + g_xy * f.mu[0])
-            g_mu += add_cross_gradient(f.mu, f.u.e, -g_um) + add_cross_gradient(f.mu, f.v.e, -g_vm) + add_cross_gradient(f.mu, f.w.e, -g_wm)
-            g_eu = f.u.w * wp.vec2(2.0 * g_xx * f.u.e[0] + g_xy * f.u.e[1], 2.0 * g_yy * f.u.e[1] + g_xy * f.u.e[0]) + f.u.b * g_mu
-            g_ev = f.v.w * wp.vec2(2.0 * g_xx * f.v.e[0] + g_xy * f.v.e[1], 2.0 * g_yy * f.v.e[1] + g_xy * f.v.e[0]) + f.v.b * g_mu
-            g_ew = f.w.w * wp.vec2(2.0 * g_xx * f.w.e[0] + g_xy * f.w.e[1], 2.0 * g_yy * f.w.e[1] + g_xy * f.w.e[0]) + f.w.b * g_mu
-            g_eu += add_cross_gradient(f.u.e, f.v.e, g_uv) + add_cross_gradient(f.u.e, f.w.e, g_uw) + add_cross_gradient(f.u.e, f.mu, g_um)
-            g_ev += add_cross_gradient(f.v.e, f.u.e, -g_uv) + add_cross_gradient(f.v.e, f.w.e, g_vw) + add_cross_gradient(f.v.e, f.mu, g_vm)
-            g_ew += add_cross_gradient(f.w.e, f.u.e, -g_uw) + add_cross_gradient(f.w.e, f.v.e, -g_vw) + add_cross_gradient(f.w.e, f.mu, g_wm)
+            g_mu = g_xy_px + gradient_of_quadratic(g_xx, g_xy, g_yy, f.mu)
+            g_mu -= cross_gradient(f.u.e, g_um) + cross_gradient(f.v.e, g_vm) + cross_gradient(f.w.e, g_wm)
+            g_eu = f.u.w * gradient_of_quadratic(g_xx, g_xy, g_yy, f.u.e) + f.u.b * g_mu
+            g_ev = f.v.w * gradient_of_quadratic(g_xx, g_xy, g_yy, f.v.e) + f.v.b * g_mu
+            g_ew = f.w.w * gradient_of_quadratic(g_xx, g_xy, g_yy, f.w.e) + f.w.b * g_mu
+            g_eu += cross_gradient(f.v.e, g_uv) + cross_gradient(f.w.e, g_uw) + cross_gradient(f.mu, g_um)
+            g_ev += cross_gradient(f.w.e, g_vw) - cross_gradient(f.u.e, g_uv) + cross_gradient(f.mu, g_vm)
+            g_ew += cross_gradient(f.mu, g_wm) - cross_gradient(f.u.e, g_uw) - cross_gradient(f.v.e, g_vw)
             a_u = axis_backward(f.u, g_eu, g_wu, wp.dot(g_mu, f.u.e), f.n, z, view)
             a_v = axis_backward(f.v, g_ev, g_wv, wp.dot(g_mu, f.v.e), f.n, z, view)
             a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), f.n, z, view)

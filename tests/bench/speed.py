@@ -56,19 +56,20 @@ def main() -> None:
     lanes = load_prototype()
     tiles = lanes.Tiles(args.splats, width, height)
     tiles.run(lanes.forward, 1)
-    tiles.set_grad(weights.numpy()[: tiles.ty * 16, : tiles.tx * 16] if height % 16 == 0 else torch.zeros(tiles.ty * 16, tiles.tx * 16, 3).numpy())
+    tiles.set_grad(torch.nn.functional.pad(weights, (0, 0, 0, tiles.tx * 16 - width, 0, tiles.ty * 16 - height)).numpy())
     kernels = {"plain": lanes.plain, "forward": lanes.forward, "backward": lanes.backward}
 
     # rounds alternate between the two, so that a change of the machine's speed meets both alike
     times: dict[str, list[float]] = {}
     for _ in range(3):
         for name, kernel in kernels.items():
-            times.setdefault(f"prototype {name}", []).append(timed(lambda k=kernel: tiles.run(k, threads), 1 if name == "plain" else args.repeat))
+            repeat = 1 if name == "plain" else args.repeat
+            times.setdefault(f"prototype {name}", []).append(timed(lambda k=kernel: tiles.run(k, threads), repeat))
         for name, work in ours.items():
             times.setdefault(name, []).append(timed(work, args.repeat))
     ms = {name: statistics.median(values) for name, values in times.items()}
     forward, both = ms["prototype forward"], ms["prototype forward"] + ms["prototype backward"]
-    print(f"{args.splats} splats, {width}x{height}, {threads} threads, median ms (prototype: {len(tiles.ids)} intersections, composite alone)")
+    print(f"{args.splats} splats, {width}x{height}, {threads} threads, median ms (the prototype composites only: {len(tiles.ids)} entries)")
     for name, value in ms.items():
         base = both if "backward" in name else forward
         print(f"  {name:30} {value:9.1f} ms   {value / base:5.2f}x the prototype's {'forward + backward' if base == both else 'forward'}")

@@ -1,5 +1,6 @@
 """The CUDA kernels: compiled for sm_90 without a GPU, run on the CPU with tiles of one pixel, and on a GPU where there is one."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from render.kernels.composite_cuda import composite_blocks, composite_blocks_gra
 from render.kernels.types import GRADIENTS, TILE
 from render.launch import run, run_blocks, view
 from render.order import tile_lists
-from scenes import Pinhole, Placed, SplatModel
+from scenes import Pinhole, SplatModel
 from scenes.poses import translation
 from tests.bench.presets import random_splats
 
@@ -80,7 +81,7 @@ def test_block_kernels_agree_with_lane_kernels():
     ids = order.repeat(pixels)
     first_slot = torch.zeros(len(records), dtype=torch.int32)
     first_slot[order.long()] = torch.arange(n, dtype=torch.int32) * pixels
-    slot_of = (torch.arange(n, dtype=torch.int32)[None] * pixels + torch.arange(pixels, dtype=torch.int32)[:, None]).reshape(-1).contiguous()
+    slot_of = (torch.arange(n)[None] * pixels + torch.arange(pixels)[:, None]).reshape(-1).to(torch.int32)
 
     planes = torch.empty(7, HEIGHT, WIDTH)
     last = torch.empty(HEIGHT, WIDTH, dtype=torch.int32)
@@ -135,7 +136,7 @@ def test_a_gpu_draws_what_the_cpu_draws():
     from tests.render.test_rasterize import CAMERA, two_instances
 
     def gradients(device):
-        placed = [Placed(p.gaussians.to(device).map(lambda t: t.requires_grad_()), p.world_from_local, instance=p.instance) for p in two_instances(1)]
+        placed = [replace(p, gaussians=p.gaussians.to(device).map(lambda t: t.requires_grad_())) for p in two_instances(1)]
         frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"))
         frame.rgb.square().sum().backward()
         return frame, [t.grad.cpu() for p in placed for t in p.gaussians.tensors().values()]

@@ -65,7 +65,8 @@ def test_forward_agrees_with_the_oracle(make, model):
 def assert_gradient(name: str, mine: torch.Tensor, reference: torch.Tensor) -> None:
     error = (mine.double() - reference).abs()
     allowed = 1e-3 * reference.abs() + 1e-6 * reference.abs().max()
-    assert (error <= allowed).all(), f"{name}: {int((error > allowed).sum())} of {error.numel()} off, worst {float((error / allowed).max()):.1f}x"
+    off = f"{name}: {int((error > allowed).sum())} of {error.numel()} off, worst {float((error / allowed).max()):.1f}x"
+    assert (error <= allowed).all(), off
 
 
 def gradients_of_both(placed: list[Placed], model: SplatModel):
@@ -82,7 +83,7 @@ def gradients_of_both(placed: list[Placed], model: SplatModel):
 
     loss(rgb, alpha, depth).backward()
     mine = [
-        replace(p, gaussians=p.gaussians.map(lambda t: t.clone().requires_grad_()), world_from_local=p.world_from_local.clone().requires_grad_())
+        Placed(p.gaussians.map(lambda t: t.clone().requires_grad_()), p.world_from_local.clone().requires_grad_(), instance=p.instance)
         for p in placed
     ]
     my_pose, my_lens = CAMERA.world_from_cam.clone().requires_grad_(), CAMERA.lens.params().requires_grad_()
@@ -125,7 +126,8 @@ def test_zero_splats_renders_background():
 
 
 def test_hidden_splats_do_not_perturb_render():
-    wall = Gaussians(torch.tensor([[0.0, 0, 3]] * 3), torch.tensor([[1.0, 0, 0, 0]] * 3), torch.tensor([[3.0, 3, -5]] * 3), torch.full((3,), 12.0), torch.ones(3, 1, 3))
+    means, quats, log_scales = ([0.0, 0, 3], [1.0, 0, 0, 0], [3.0, 3, -5])
+    wall = Gaussians(*(torch.tensor([v] * 3) for v in (means, quats, log_scales)), torch.full((3,), 12.0), torch.ones(3, 1, 3))
     behind = random_splats(50, 4)
     behind = replace(behind, means=behind.means + torch.tensor([0.0, 0, 30]))
     camera = replace(CAMERA, world_from_cam=torch.eye(4, dtype=torch.float64))
@@ -157,7 +159,8 @@ def test_splitting_into_instances_changes_nothing():
     g = random_splats(100, 8)
     pose = translation(0, 0, 6)
     whole = rasterize(Placed(g, pose), CAMERA, ("rgb", "alpha", "depth"))
-    parts = rasterize([Placed(g.select(torch.arange(0, 40)), pose), Placed(g.select(torch.arange(40, 100)), pose, instance=1)], CAMERA, ("rgb", "alpha", "depth"))
+    split = [Placed(g.select(torch.arange(0, 40)), pose), Placed(g.select(torch.arange(40, 100)), pose, instance=1)]
+    parts = rasterize(split, CAMERA, ("rgb", "alpha", "depth"))
     for name, picture in whole.outputs().items():
         assert torch.equal(picture, getattr(parts, name)), name
 
@@ -264,7 +267,7 @@ def test_depth_far_behind_faint_splats_is_still_divided_by_its_weight():
         (lambda: rasterize(random_splats(3, 0), CAMERA, ("flow_next",)), "flow_to"),
         (lambda: rasterize(random_splats(3, 0), replace(CAMERA, shutter="rows")), "rolling shutter"),
         (lambda: rasterize(random_splats(3, 0), CAMERA, model=SplatModel(response="ray")), "ray"),
-        (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=torch.full((4, 4), torch.nan, dtype=torch.float64))), "not finite"),
+        (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=CAMERA.world_from_cam * torch.nan)), "not finite"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(change, message):
