@@ -50,8 +50,8 @@ class FitConfig:
     """Of the order of views."""
 
 
-FADE = 12.0
-"""Logit that a splat loses over a fit in which it is always seen, unless the pictures hold it up: what nothing needs, goes."""
+FADE = 0.003
+"""Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
 
 RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "dc": 5e-3, "rest": 5e-4}
 """Adam's step a field; of means in parts of each splat's reach (0.1 pixel at a focal length of 1000)."""
@@ -211,7 +211,7 @@ class Fit:
         with torch.no_grad():
             # Adam's step has one length for all; a far splat must move further to move a pixel
             fields["means"].sub_(before).mul_(self.splats.reach[:, None]).add_(before)
-            fields["logits"].sub_(seen, alpha=FADE / self.config.steps)
+            fields["logits"].sub_(seen, alpha=FADE)
             adjusted(self.splats)
         if self.exposures.grad is not None:
             self.exposures.grad[0] = 0  # the first camera is the reference

@@ -127,13 +127,13 @@ def thin(cloud: Cloud, distance: np.ndarray, budget: int) -> tuple[Cloud, np.nda
     The side is k times the distance, at least 4 cm, in half octaves; k is found by bisection so that the budget is met.
     """
     low, high = 1e-4, 0.3
-    chosen, sides = np.arange(len(cloud.xyz)), np.full(len(cloud.xyz), 0.04)
-    if len(cloud.xyz) > budget:
+    chosen, sides = _voxels(cloud.xyz, distance, low)
+    if len(chosen) > budget:
         for _ in range(10):
             k = np.sqrt(low * high)
             chosen, sides = _voxels(cloud.xyz, distance, k)
             low, high = (k, high) if len(chosen) > budget else (low, k)
-    return cloud.select(chosen), sides[chosen] if len(sides) == len(cloud.xyz) else sides
+    return cloud.select(chosen), sides[chosen]
 
 
 def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +170,7 @@ def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndar
     sh[:, 0] = sh_from_rgb(torch.from_numpy(cloud.rgb).float())
     return Gaussians(
         torch.from_numpy(cloud.xyz).float(),
-        quat_from_matrix(torch.from_numpy(np.ascontiguousarray(rotation))).float(),
+        quat_from_matrix(torch.from_numpy(np.array(rotation))).float(),
         torch.from_numpy(np.log(scales)).float(),
         torch.full((n,), float(np.log(OPACITY / (1 - OPACITY)))),
         sh,

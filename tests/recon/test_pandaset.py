@@ -7,6 +7,7 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
+from recon.actors import inside
 from recon.pandaset import label_slug
 from scenes.poses import inverse
 
@@ -147,5 +148,5 @@ def test_the_lidar_of_drive_002_falls_into_the_moving_boxes(pandaset):
         if track.moving and sweep.time_us in track.times_us:
             pose = track.world_from_box[list(track.times_us).index(sweep.time_us)]
             local = points @ inverse(pose).numpy()[:3, :3].T + inverse(pose).numpy()[:3, 3]
-            counts.append(((np.abs(local[:, :2]) < track.size[:2] / 2 + 0.1).all(1) & (local[:, 2] > 0) & (local[:, 2] < track.size[2])).sum())
+            counts.append(inside(local, track.size, 0.1).sum())
     assert max(counts) > 3000 and np.median(counts) >= 20

@@ -39,7 +39,8 @@ def test_a_frame_in_the_old_block_layout_reads_too(tmp_path):
     import types
 
     module = types.ModuleType("pandas.made_up")
-    manager_state = ([names, np.arange(3)], [values], [names], {"0.14.1": {"axes": [names], "blocks": [{"values": values, "mgr_locs": slice(0, 2, 1)}]}})
+    block = {"values": values, "mgr_locs": slice(0, 2, 1)}
+    manager_state = ([names, np.arange(3)], [values], [names], {"0.14.1": {"axes": [names], "blocks": [block]}})
     module.BlockManager = state_of("BlockManager", manager_state)
     module.DataFrame = state_of("DataFrame", {"_data": module.BlockManager()})
     sys.modules["pandas.made_up"] = module

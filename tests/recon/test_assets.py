@@ -1,0 +1,118 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recon import extract_assets
+from recon.assets import completed, looking_at, moved, silhouette, thumbnail, turned, within_box
+from scenes import Asset, Databank, Gaussians, Placed
+from scenes.harmonics import evaluate
+from scenes.poses import inverse, translation, yaw
+
+SIZE = torch.tensor([4.2, 1.8, 1.5], dtype=torch.float64)
+
+
+def body(count=1500, seed=0) -> Gaussians:
+    """Splats on a box's skin, in its frame."""
+    g = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=g) - 0.5
+    points = points / (2 * points.abs().amax(1, keepdim=True)) * SIZE.float() + torch.tensor([0, 0, SIZE[2] / 2])
+    sh = torch.randn(count, 4, 3, generator=g) * 0.2
+    return Gaussians(points.float(), torch.randn(count, 4, generator=g), torch.full((count, 3), -2.5), torch.full((count,), 3.0), sh)
+
+
+def test_harmonics_turn_with_the_splats():
+    pose = yaw(0.7)[:3, :3]
+    sh = torch.randn(5, 16, 3)
+    direction = torch.nn.functional.normalize(torch.randn(5, 3), dim=1)
+    there = evaluate(turned(sh, pose), direction @ pose.T.float())
+    torch.testing.assert_close(there, evaluate(sh, direction), atol=1e-5, rtol=1e-4)
+
+
+def test_splats_go_into_a_box_frame_and_back():
+    pose = translation(30.0, -4.0, 0.5) @ yaw(2.1)
+    local = body()
+    world = moved(local, pose, torch.tensor([200.0, 200, 200]))
+    back = moved(world, inverse(pose), SIZE)
+    torch.testing.assert_close(back.means, local.means, atol=1e-4, rtol=0)
+    torch.testing.assert_close(back.sh, local.sh, atol=1e-4, rtol=0)
+
+
+def test_the_road_faint_and_wide_splats_stay_behind():
+    g = body()
+    g.means[0, 2], g.means[1, 0] = 0.0, 3.0
+    g.logit_opacities[2], g.log_scales[3] = -6, 1.0
+    kept = within_box(g, SIZE)
+    assert not {(0, 1, 2, 3)[i] for i in range(4) if (kept.means == g.means[i]).all(1).any()}
+
+
+def test_a_car_seen_from_one_side_is_completed_by_its_mirror_image():
+    half = body()
+    half = half.select(half.means[:, 1] > 0.1)
+    whole, mirrored = completed(half)
+    assert mirrored and len(whole) == 2 * len(half)
+    flip = torch.tensor([1.0, -1, 1])
+    there = evaluate(whole.sh[len(half) :], torch.nn.functional.normalize(torch.tensor([[1.0, -2, 0.5]]), dim=1).expand(len(half), 3))
+    here = evaluate(half.sh, torch.nn.functional.normalize(torch.tensor([[1.0, 2, 0.5]]), dim=1).expand(len(half), 3))
+    torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(whole.means[len(half) :], half.means * flip)
+    same, untouched = completed(body())
+    assert not untouched and len(same) == len(body())
+
+
+def test_a_mirrored_picture_is_the_picture_of_the_mirrored_car():
+    from render import rasterize
+
+    half = body()
+    half = half.select(half.means[:, 1] > 0.1)
+    mirror = completed(half)[0].select(torch.arange(len(half), 2 * len(half)))
+    centre = torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
+    views = [looking_at(centre, torch.tensor([-5.0, side, 2.0], dtype=torch.float64), 96, 72) for side in (4.0, -4.0)]
+    ours, theirs = rasterize(half, views[0]).rgb, rasterize(mirror, views[1]).rgb
+    torch.testing.assert_close(ours, theirs.flip(1), atol=2e-3, rtol=0)
+
+
+def test_a_tail_has_less_silhouette_than_a_car():
+    g = body()
+    assert silhouette(g, SIZE) > 0.95 > 0.5 > silhouette(g.select(g.means[:, 0] < -1.4), SIZE)
+
+
+def test_a_thumbnail_shows_the_asset_on_grey():
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    pixels = np.asarray(Image.open(io.BytesIO(thumbnail(Asset(body(), SIZE, "car")))))
+    assert pixels.shape == (240, 320, 3) and tuple(pixels[0, 0]) == (184, 186, 191) and pixels.std() > 5
+
+
+@pytest.fixture
+def parked_street(street):
+    """The street with a car standing in the background whose box the scene knows."""
+    pose = translation(9.0, 3.5, 0.0) @ yaw(math.pi)
+    car = moved(body(), pose, torch.tensor([200.0, 200, 200]))
+    meta = {**street.meta, "parked": [
+        {"track": "veh_7", "label": "car", "size": SIZE.tolist(), "world_from_box": pose.tolist()},
+        {"track": "veh_8", "label": "pickup", "size": SIZE.tolist(), "world_from_box": translation(9.0, -90.0, 0.0).tolist()},
+    ]}  # fmt: skip
+    background = Placed(Gaussians.cat([street.background.gaussians, car]), street.background.world_from_local)
+    return replace(street, background=background, meta=meta)
+
+
+def test_parked_cars_and_movers_become_assets_and_the_rest_is_said(parked_street, tmp_path, capsys):
+    ids = extract_assets(parked_street, tmp_path / "bank")
+    assert ids and all(i.startswith("car/") for i in ids)
+    bank = Databank(tmp_path / "bank")
+    tracks = {bank.load(e.id).meta["track"]: e for e in bank.entries()}
+    assert "veh_7" in tracks and tracks["veh_7"].views >= 10 and tracks["veh_7"].licence == "CC0-1.0" and tracks["veh_7"].thumb
+    asset = bank.load(tracks["veh_7"].id)
+    assert asset.gaussians.means[:, 2].min() > 0 and (asset.gaussians.means.abs() < torch.tensor([2.3, 1.1, 1.8])).all()
+    assert "left out veh_8 (pickup): 0 views" in capsys.readouterr().err
+
+
+def test_a_scene_without_objects_says_so(street, tmp_path):
+    with pytest.raises(ValueError, match="good enough"):
+        extract_assets(replace(street, actors=()), tmp_path / "bank")
+    assert not (tmp_path / "bank").exists()

@@ -1,0 +1,53 @@
+import numpy as np
+import torch
+
+from recon.fill import FAR, SkyPicture, sky_mask, unexplained
+from recon.frames import View
+from scenes.camera import Camera
+from scenes.lens import Pinhole
+
+
+def house_under_sky():
+    image = np.full((60, 80, 3), (140, 160, 200), np.uint8)
+    image[25:, 20:60] = (150, 120, 90)
+    image[40:] = (80, 80, 80)
+    return image
+
+
+def camera():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    return Camera(Pinhole(60.0, 60.0, 40.0, 30.0), 80, 60, pose)
+
+
+def test_sky_is_what_is_smooth_and_blue_down_from_the_top():
+    image = house_under_sky()
+    mask = sky_mask(image, np.zeros(image.shape[:2], bool))
+    assert mask[2:20].all() and not mask[28:, 22:58].any() and not mask[42:].any()
+    covered = np.zeros(image.shape[:2], bool)
+    covered[:, :30] = True
+    assert not sky_mask(image, covered)[:, :30].any()
+
+
+def test_the_sky_picture_shows_what_was_seen_and_spreads_it():
+    sky = SkyPicture(32)
+    image = house_under_sky()
+    sky.add(image, sky_mask(image, np.zeros(image.shape[:2], bool)), camera(), np.array([0.5, 1.0, 1.0]))
+    picture = sky.picture()
+    assert picture.shape == (32, 64, 3) and torch.isfinite(picture).all()
+    np.testing.assert_allclose(picture[0, 0], [140 / 255 / 0.5, 160 / 255, 200 / 255], atol=1e-3)
+    assert SkyPicture(8).picture().shape == (8, 16, 3)
+
+
+def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
+    image = torch.from_numpy(house_under_sky())
+    alpha = np.zeros((60, 80))
+    alpha[35:] = 1
+    depth = np.where(alpha > 0, 12.0, np.inf)
+    sky = np.zeros((60, 80), bool)
+    sky[:25] = True
+    cloud, width = unexplained(View(0, 0, 0, image, False), camera(), alpha, depth, sky, np.ones(3))
+    assert len(cloud.xyz) > 10 and np.abs(cloud.xyz[:, 0] - 12).max() < 1e-6 and (cloud.xyz[:, 2] > -2).all()
+    assert (width > 0).all()
+    nothing = unexplained(View(0, 0, 0, image, False), camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3))[0]
+    assert np.abs(nothing.xyz[:, 0] - FAR).max() < 1e-6

@@ -1,0 +1,141 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recon import open_log, reconstruct
+from recon.build import _span
+from recon.checkpoint import checkpoint_path
+from recon.fit import Fit, FitConfig
+from recon.model import Knots, small_poses
+from scenes import Scene, load
+from scenes.poses import inverse
+from scenes.trajectory import Trajectory
+
+CONFIG = FitConfig(steps=60, budget=3000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
+SIZE = (96, 54)
+
+
+@pytest.fixture(scope="module")
+def whole(drive, tmp_path_factory):
+    out = tmp_path_factory.mktemp("fit") / "scene"
+    return out, reconstruct(open_log(drive), out, size=SIZE, held_out=4, config=CONFIG)
+
+
+def test_a_drive_becomes_a_scene_on_disk(whole):
+    out, made = whole
+    scene = load(out)
+    assert isinstance(scene, Scene) and not checkpoint_path(out).exists()
+    assert list(scene.rig) == ["front_camera"] and scene.meta["licence"] == "CC BY 4.0"
+    assert len(scene.background.gaussians) > 300 and len(made.actors) == 1 and len(made.actors[0].asset.gaussians) > 50
+    assert [p["track"] for p in scene.meta["parked"]] == ["veh_1"] or [p["track"] for p in scene.meta["parked"]] == ["veh_2"]
+
+
+def test_held_out_frames_are_reported_with_the_mean_image(whole):
+    rows = whole[1].meta["held_out"]
+    row = next(r for r in rows if r["which"] == "all")
+    assert row["frames"] == [0, 4] and row["psnr"] > 22 and {"ssim", "mean_ssim"} <= row.keys()
+
+
+def test_the_reported_views_are_the_scenes_own(whole, street):
+    """The scene's camera at a recorded moment stands where the log's camera stood, within what the fit may correct."""
+    scene = whole[1]
+    for t in scene.frame_times("front_camera").tolist():
+        off = inverse(scene.camera("front_camera", t).world_from_cam) @ street.camera("front_camera", t).world_from_cam
+        assert off[:3, 3].norm() < 0.05
+
+
+def test_the_mover_is_an_actor_and_not_in_the_background(whole, street):
+    scene = whole[1]
+    actor, truth = scene.actors[0], street.actors[0]
+    for t in truth.trajectory.times_us[1:7].tolist():
+        assert (actor.trajectory.at(t)[:3, 3] - truth.trajectory.at(t)[:3, 3]).norm() < 0.25
+    pose = actor.trajectory.at(int(truth.trajectory.times_us[4]))
+    local = (scene.background.gaussians.means.double() - pose[:3, 3]) @ pose[:3, :3]
+    in_box = (local[:, :2].abs() < actor.asset.size[:2] / 2 - 0.2).all(1) & (local[:, 2] > 0.3) & (local[:, 2] < 1.3)
+    assert in_box.sum() < 0.02 * len(local)
+
+
+def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, whole, monkeypatch):
+    log, out = open_log(drive), tmp_path / "scene"
+    step = Fit.step
+
+    def interrupted(self):
+        if self.step_count == 35:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(Fit, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG)
+    assert checkpoint_path(out).is_file() and not out.exists()
+    monkeypatch.setattr(Fit, "step", step)
+    resumed = reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
+    for name, tensor in resumed.background.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
+    assert resumed.meta["held_out"] == whole[1].meta["held_out"] and out.is_dir()
+
+
+def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, monkeypatch):
+    log, out = open_log(drive), tmp_path / "scene"
+    with pytest.raises(FileNotFoundError, match="without --resume"):
+        reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
+
+    def stop(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Fit, "step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(log, out, size=SIZE, config=CONFIG)
+    with pytest.raises(ValueError, match="held_out 8, not 4"):
+        reconstruct(log, out, size=SIZE, config=CONFIG, held_out=4, resume=True)
+    checkpoint_path(out).write_bytes(checkpoint_path(out).read_bytes()[:2000])
+    with pytest.raises(ValueError, match="scene.fit"):
+        reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
+
+
+def test_an_existing_output_and_a_missing_folder_are_refused_before_any_work(drive, tmp_path):
+    log = open_log(drive)
+    with pytest.raises(FileExistsError):
+        reconstruct(log, tmp_path)
+    with pytest.raises(FileNotFoundError, match="create it first"):
+        reconstruct(log, tmp_path / "a" / "b")
+    with pytest.raises(ValueError, match="Did you mean front_camera"):
+        reconstruct(log, tmp_path / "s", cameras=["frnt_camera"])
+
+
+def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
+    log = open_log(drive)
+    names = list(log.cameras)
+    for start, duration, expected in ((0, None, 8), (0, 300_000, 3), (200_000, 300_000, 3), (500_000, None, 3)):
+        first, last = _span(log, names, start, duration)
+        for name in names:
+            assert sum(first <= t <= last for t in log.cameras[name].times_us.tolist()) == expected
+    with pytest.raises(ValueError, match="lasts 0.7s"):
+        _span(log, names, 5_000_000, None)
+    with pytest.raises(ValueError, match="must be positive"):
+        _span(log, names, 0, -1)
+
+
+def test_a_drive_without_lidar_in_view_is_refused(own_drive, tmp_path):
+    for file in (own_drive / "lidar").glob("*.pkl.gz"):
+        file.unlink()
+    with pytest.raises(ValueError, match="no lidar point"):
+        reconstruct(open_log(own_drive), tmp_path / "s", size=SIZE, config=replace(CONFIG, steps=1))
+
+
+def test_small_poses_are_the_exponential_map():
+    delta = torch.tensor([[0.0, 0.0, 0.3, 1.0, 2.0, 3.0], [0.0] * 6])
+    poses = small_poses(delta)
+    torch.testing.assert_close(poses[1], torch.eye(4, dtype=torch.float64))
+    assert float(torch.atan2(poses[0, 1, 0], poses[0, 0, 0])) == pytest.approx(0.3, abs=1e-6)
+    torch.testing.assert_close(small_poses(-delta[0]) @ poses[0], torch.eye(4, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def test_corrections_between_knots_are_between_theirs():
+    knots = Knots(Trajectory(torch.tensor([0, 100, 300]), torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)))
+    knots.deltas = torch.arange(3.0)[:, None].expand(3, 6).clone()
+    import numpy as np
+
+    _, knot, share = knots.base(np.array([0, 50, 200, 300]))
+    torch.testing.assert_close(knots.correction(knot, share)[:, 0], torch.tensor([0.0, 0.5, 1.5, 2.0]))

@@ -1,0 +1,77 @@
+import numpy as np
+import torch
+
+from recon import open_log
+from recon.frames import load_frames
+from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from scenes.poses import matrix_from_quat
+
+ALL = (0, 2**62)
+
+
+def test_points_take_the_colour_of_the_pixel_they_fall_on(drive):
+    log = open_log(drive)
+    frames = load_frames(log, ["front_camera"], ALL, (96, 54), 8)
+    view = frames.training()[0]
+    camera = log.camera("front_camera").camera(view.index)
+    ray = camera.lens.unproject(torch.tensor([40.5, 30.5], dtype=torch.float64)) * 7
+    point = (camera.world_from_cam[:3, :3] @ ray + camera.world_from_cam[:3, 3]).numpy()[None]
+    seen = colours(log, frames, np.concatenate([point, -100 * point]), np.full(2, view.index), [])
+    np.testing.assert_allclose(seen[0, 0], view.image[30, 40].numpy() / 255, atol=1e-6)
+    assert np.isnan(seen[0, 1]).all()
+
+
+def test_points_behind_a_mover_are_not_seen(drive):
+    log = open_log(drive)
+    frames = load_frames(log, ["front_camera"], ALL, (96, 54), 8)
+    mover = next(t for t in log.tracks if t.moving)
+    view = frames.training()[3]
+    pose = mover.trajectory().at(view.time_us)[:3, 3].numpy()
+    eye = log.camera("front_camera").world_from_cam[view.index, :3, 3].numpy()
+    middle = pose + [0, 0, 0.7]
+    behind, before = eye + 1.4 * (middle - eye), eye + 0.5 * (middle - eye)
+    seen = colours(log, frames, np.stack([behind, before]), np.full(2, view.index), [mover])
+    assert np.isnan(seen[0, 0]).all() and np.isfinite(seen[0, 1]).all()
+    box = nearest_box(log.camera("front_camera").camera(view.index), [mover])
+    assert np.isfinite(box).any() and not np.isfinite(box).all()
+
+
+def test_held_out_frames_are_every_eighth_and_lend_no_colour(drive):
+    log = open_log(drive)
+    frames = load_frames(log, ["front_camera", "left_camera"], ALL, (48, 27), 4)
+    assert [v.index for v in frames.of(0, held_out=True)] == [0, 4]
+    assert len(frames.training()) == 12 and frames.views[0].image.dtype == torch.uint8
+
+
+def test_gains_between_cameras_are_found_from_shared_points():
+    generator = np.random.default_rng(0)
+    truth = generator.uniform(0.1, 0.7, (5000, 3)).astype(np.float32)
+    seen = np.stack([truth, truth * [0.8, 0.9, 1.1], np.full_like(truth, np.nan)])
+    seen[0, :2000] = np.nan
+    gains = first_exposures(seen)
+    np.testing.assert_allclose(gains, [[1, 1, 1], [0.8, 0.9, 1.1], [1, 1, 1]], atol=1e-3)
+    np.testing.assert_allclose(merged_colours(seen, gains), truth, atol=1e-3)
+
+
+def test_thinning_meets_its_budget_and_keeps_more_near_the_path():
+    generator = np.random.default_rng(0)
+    xyz = generator.uniform([-60, -60, 0], [60, 60, 0.1], (40_000, 3))
+    distance = np.linalg.norm(xyz, axis=1)
+    chosen, sides = thin(Cloud(xyz, xyz), distance, 5000)
+    assert 3500 < len(chosen.xyz) <= 5500 and len(sides) == len(chosen.xyz)
+    near = np.linalg.norm(chosen.xyz, axis=1) < 10
+    assert near.mean() > 3 * (distance < 10).mean()
+
+
+def test_seeds_of_a_plane_lie_flat_in_it():
+    generator = np.random.default_rng(0)
+    xyz = np.concatenate([generator.uniform(-2, 2, (2000, 2)), np.zeros((2000, 1))], 1)
+    g = splats_from(Cloud(xyz, np.full((2000, 3), 0.5)), np.full(2000, 0.1), 4, 0.5)
+    thin_axis = g.log_scales.argmin(1)
+    normal = matrix_from_quat(g.quats).gather(2, thin_axis[:, None, None].expand(-1, 3, 1))[..., 0]
+    assert (normal[:, 2].abs() > 0.99).all()
+    g.validate()
+
+
+def test_views_are_spread_from_first_to_last():
+    assert spread(list(range(10)), 4) == [0, 3, 6, 9] and spread([1], 5) == [1]
