@@ -191,7 +191,7 @@ def thumbnail(asset: Asset) -> bytes:
 
     length, width, height = asset.size.tolist()
     centre = torch.tensor([0.0, 0.0, height / 2], dtype=torch.float64)
-    distance = 1.9 * math.hypot(length, width, height)
+    distance = 1.6 * math.hypot(length, width, height)
     azimuth, elevation = math.radians(145), math.radians(18)
     direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)

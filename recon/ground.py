@@ -10,7 +10,7 @@ from scenes.ground import Ground
 from scenes.trajectory import Trajectory
 
 CELL = 0.5
-REACH = 80.0
+REACH = 60.0
 """Metres around the path that the height field covers."""
 
 
