@@ -7,8 +7,9 @@ features of the input frame at every scale, and the output is
 
     output = input + gate * (colour + residual)
 
-where colour is a smooth field of quadratic tone curves and saturation, the residual is free, and the gate is exactly 0
-where the frame is to be left alone. Colour and residual are zero in an untrained network, which therefore changes nothing.
+where colour is a smooth field of quadratic tone curves and saturation (plus one such change for the gate's region as a whole,
+from comparing its palette with the rest), the residual is free, and the gate is exactly 0 where the
+frame is to be left alone. Colour and residual are zero in an untrained network, which therefore changes nothing.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
+from enhance.palette import LUMA, RegionColour
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
@@ -182,7 +184,7 @@ class FrameDecoder(nn.Module):
 def colour_change(rgb: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
     """What the colour field `[B, 12, h, w]` adds to `rgb` `[B, 3, H, W]`: per channel a + b x + c x^2 + d (luma - x)."""
     a, b, c, d = F.interpolate(coefficients, rgb.shape[-2:], mode="bilinear", align_corners=False).chunk(4, 1)
-    luma = 0.299 * rgb[:, :1] + 0.587 * rgb[:, 1:2] + 0.114 * rgb[:, 2:]
+    luma = LUMA[0] * rgb[:, :1] + LUMA[1] * rgb[:, 1:2] + LUMA[2] * rgb[:, 2:]
     return torch.addcmul(a, rgb, b + c * rgb) + d * (luma - rgb)
 
 
@@ -221,6 +223,7 @@ class Net(nn.Module):
         self.norm = nn.LayerNorm(config.width)
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
+        self.region_colour = RegionColour()
         zero(self.denoise)
 
     def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None, latents: torch.Tensor, valid: torch.Tensor) -> Enhanced:
@@ -246,7 +249,8 @@ class Net(nn.Module):
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
         coefficients, residual, logits = self.decoder(tokens, enhanced, half, quarter, eighth)
         logits = logits.float()
-        change = colour_change(rgb.float(), coefficients.float()) + residual.float()
+        whole = self.region_colour(rgb, torch.sigmoid(logits).detach())
+        change = colour_change(rgb.float(), coefficients.float() + whole[:, :, None, None]) + residual.float()
         return Enhanced(rgb + hard_gate(logits) * change, enhanced.float(), logits, rgb + change)
 
     def _history(self, latents: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -84,17 +84,18 @@ class Sampler:
         images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
         return torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images])
 
-    def batch(self, step: int, count: int, frames: int, size: int) -> Sample:
-        """`count` clips of `frames` frames."""
+    def batch(self, step: int, count: int, frames: int, size: int, kind: str | None = None) -> Sample:
+        """`count` clips of `frames` frames, of one kind of damage or of all."""
         rng = self.rng(step)
-        drawn = [self._sample(rng, frames, size) for _ in range(count)]
+        drawn = [self._sample(rng, frames, size, kind) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
-    def _sample(self, rng: np.random.Generator, frames: int, size: int) -> Sample:
-        kinds = [k for k in KIND_WEIGHTS if k != "underfit" or self.shards["underfit"]]
+    def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
+        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k != "underfit" or self.shards["underfit"]]
         weights = np.array([KIND_WEIGHTS[k] for k in kinds])
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
+        w = _regraded(rng, w)
         objects = (w.instance > 0).float()
         if kind == "isp":
             region = self._moving_mask(rng, w)
@@ -152,6 +153,17 @@ def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int) -> Win
         flow=F.pad(window.flow, pad, value=torch.nan),
         visible=F.pad(window.visible, pad),
     )
+
+
+def _regraded(rng: np.random.Generator, w: Window) -> Window:
+    """Now and then the whole picture in other colours, damage and target alike: the network must compare within a picture.
+
+    Without this it learns what the few training places look like, and does harm in any other light.
+    """
+    if rng.random() < 0.35:
+        return w
+    grade = random_isp(rng, 0.7)
+    return replace(w, target=grade(w.target), input=grade(w.input))
 
 
 def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:

@@ -1,4 +1,5 @@
-"""Training: first the autoencoder on single images, then, with its encoder frozen, the enhancer on pairs.
+"""Training: the autoencoder on single images, the region's colour change on palettes alone, then, with the encoder frozen, the
+enhancer on pairs.
 
 The enhancer's batches alternate: images without history, and clips that the network walks through with its own earlier
 outputs as history, of any length from 0 to K, so that it never sees a history better than the one it will make itself.
@@ -18,13 +19,15 @@ from torch.nn import functional as F
 
 from enhance.autoencoder import STRIDE, Autoencoder
 from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, temporal_loss
-from enhance.net import Net, NetConfig
+from enhance.net import Net, NetConfig, colour_change
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shards import PairSet
 from enhance.warp import carry
 from enhance.weights_file import save_net
 from scenes.atomic import atomic_file
+
+STAGES = ("autoencoder", "colour", "enhancer")
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,8 @@ class TrainConfig:
 
     autoencoder: float = 0.25
     """Share of the budget for the autoencoder."""
+    colour: float = 0.05
+    """Share of the budget for the region's colour change alone."""
     crop: int = 160
     """Side of training crops in pixels, a multiple of 16."""
     images: int = 8
@@ -68,10 +73,11 @@ class _Run:
         self.autoencoder = channels_last(Autoencoder())
         self.net = channels_last(Net(net))
         self.average = Net(net)
-        self.step = {"autoencoder": 0, "enhancer": 0}
-        self.seconds = {"autoencoder": 0.0, "enhancer": 0.0}
+        self.step = dict.fromkeys(STAGES, 0)
+        self.seconds = dict.fromkeys(STAGES, 0.0)
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
+            "colour": torch.optim.AdamW(self.net.region_colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "enhancer": torch.optim.AdamW(
                 [p for n, p in self.net.named_parameters() if not n.startswith("encoder.")], betas=(0.9, 0.98), weight_decay=1e-2
             ),
@@ -99,9 +105,14 @@ class _Run:
         if state["seed"] != self.seed:
             raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
 
+    def share(self, stage: str) -> float:
+        """A stage's share of the budget."""
+        c = self.config
+        return {"autoencoder": c.autoencoder, "colour": c.colour, "enhancer": 1 - c.autoencoder - c.colour}[stage]
+
     def done(self, stage: str) -> float:
         """How much of a stage's budget is spent, from 0 to 1."""
-        share = self.config.autoencoder if stage == "autoencoder" else 1 - self.config.autoencoder
+        share = self.share(stage)
         if self.steps is not None:
             return min(1.0, self.step[stage] / max(share * self.steps, 1))
         return min(1.0, self.seconds[stage] / 60 / max(share * (self.minutes or 0), 1e-9))
@@ -149,6 +160,7 @@ def train(
     report = _Reporter(run, progress)
     try:
         _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
+        _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
         if run.step["enhancer"] == 0:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
             run.average.load_state_dict(run.net.state_dict())
@@ -204,6 +216,13 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
     slopes = (d[..., 1:] - d[..., :-1]).abs().mean() + (d[..., 1:, :] - d[..., :-1, :]).abs().mean()
     spread = latent.mean((0, 2, 3)).square().mean() + (latent.var((0, 2, 3)) - 1).square().mean()
     return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
+
+
+def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
+    sample = sampler.batch(3 * step + 2, 2 * run.config.images, 1, run.config.crop, "isp")
+    rgb, target, region = sample.input[:, 0], sample.target[:, 0], sample.region[:, 0]
+    better = rgb + region * colour_change(rgb, run.net.region_colour(rgb, region)[:, :, None, None])
+    return _update(run, "colour", [pixel_loss(better, target, region)], run.net.region_colour.parameters())
 
 
 def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
@@ -275,6 +294,5 @@ class _Reporter:
         if self.progress is None or (time.monotonic() - self.told < 5 and self.run.done(stage) < 1):
             return
         self.told = time.monotonic()
-        share = self.run.config.autoencoder
-        done = share * self.run.done("autoencoder") + (1 - share) * (self.run.done("enhancer") if stage == "enhancer" else 0)
+        done = sum(self.run.share(name) * self.run.done(name) for name in STAGES)
         self.progress(done, f"{stage}: step {self.run.step[stage]}, loss {self.loss[stage]:.4f}")
