@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import UseAppendAction
 
@@ -101,6 +101,8 @@ class Render:
     """Size in pixels, as 640x360."""
     outputs: Outputs = ()
     """Frames to keep in the folder out/: any of rgb, alpha, depth, instance, flow_prev, flow_next."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to render and enhance."""
     databank: Path = Path("databank")
     """Folder of the databank."""
     drop_invalid: Flag = False
@@ -116,6 +118,7 @@ class Render:
         from scenes import Databank
         from scenes.insert import insert
 
+        check_device(self.device)
         scene, warnings = open_scene(self.scene, self.drop_invalid)
         times = clip_times(scene, self.camera, self.start, self.duration, self.fps)
         for placement in self.insert:
@@ -123,20 +126,28 @@ class Render:
             scene, warnings = result.scene, [*warnings, *result.warnings]
         warn(warnings)
         width, height = self.size or (None, None)
-        finish, needs = enhancement(self.weights) if self.enhance else (None, ())
+        finish, needs = enhancement(self.weights, self.device) if self.enhance else (None, ())
         facts = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
         record(
-            scene, self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
+            scene.to(self.device), self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
             not self.no_shadows, finish, needs, facts, warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")
 
 
-def enhancement(weights: str) -> tuple[Finish, tuple[str, ...]]:
+def check_device(device: str) -> None:
+    """ValueError where the machine has no such device."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
+
+
+def enhancement(weights: str, device: str = "cpu") -> tuple[Finish, tuple[str, ...]]:
     """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads."""
     from enhance import Enhancer
     from enhance.clip import READS, enhance_frames
 
-    enhancer = Enhancer.load(weights)
+    enhancer = Enhancer.load(weights, device)
     return lambda frames: enhance_frames(frames, enhancer), READS

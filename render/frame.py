@@ -72,7 +72,8 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Ca
     through = alpha.detach() < 1 - SKY_SHOWS
     if not through.any():
         return rgb
-    behind = sky.colour(world_directions(camera).to(alpha.device)[through]) * (1 - alpha[through])[..., None]
+    colour = sky.colour(world_directions(camera)[through.cpu()]).to(rgb)
+    behind = colour * (1 - alpha[through])[..., None]
     return rgb.index_put((through,), behind, accumulate=True)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -36,6 +36,12 @@ class Scene:
         tracks = [a.track for a in self.actors]
         if len(set(tracks)) != len(tracks):
             raise ValueError(f"actor tracks must differ, but {next(t for t in tracks if tracks.count(t) > 1)!r} stands twice")
+
+    def to(self, device) -> Scene:
+        """The same scene with its splats on a device; poses, lenses, sky and ground stay where they are."""
+        background = replace(self.background, gaussians=self.background.gaussians.to(device))
+        actors = tuple(replace(a, asset=replace(a.asset, gaussians=a.asset.gaussians.to(device))) for a in self.actors)
+        return replace(self, background=background, actors=actors)
 
     def rig_camera(self, name: str) -> RigCamera:
         """The rig's camera of that name; ValueError naming the nearest where there is none."""

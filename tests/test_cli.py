@@ -185,6 +185,11 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
     assert not list(desk.glob("x*")) and not list(desk.glob(".x*"))
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_device_that_is_not_there_is_refused(door):
+    assert "leave --device cuda out" in door([*SHOOT, "--device", "cuda"], 1)[1]
+
+
 def test_an_empty_scene_is_refused(door, tmp_path):
     scene = replace(made.street(), background=Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64)), actors=())
     save(scene, tmp_path / "empty")
