@@ -113,7 +113,7 @@ class Render:
     def run(self) -> None:
         for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
-        from render.clip import clip_times
+        from render.clip import clip_cameras, clip_times, in_view
         from render.record import record
         from scenes import Databank
         from scenes.insert import insert
@@ -121,9 +121,12 @@ class Render:
         check_device(self.device)
         scene, warnings = open_scene(self.scene, self.drop_invalid)
         times = clip_times(scene, self.camera, self.start, self.duration, self.fps)
+        cameras = clip_cameras(scene, self.camera, self.lateral_shift, times)
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
+            if not in_view(result.actor, cameras):
+                warnings.append(f"{placement.asset} is never in view of {self.camera}: X is metres forward, Y metres to the left")
         warn(warnings)
         width, height = self.size or (None, None)
         finish, needs = enhancement(self.weights, self.device) if self.enhance else (None, ())
