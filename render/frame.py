@@ -52,7 +52,6 @@ def render_frame(
         needed |= {"depth", "instance"}
     placed = scene.placed(camera.time_us)
     frame = rasterize(placed, camera, tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
-    assert isinstance(frame, Frame)
 
     rgb = frame.rgb if "rgb" in outputs else None
     if rgb is not None:

@@ -73,4 +73,5 @@ def view(tensor: torch.Tensor, dtype) -> object:
 
 def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int) -> None:
     """Stable radix sort of the first `count` int32 pairs in place; both tensors hold room for `2 * count`."""
-    wp.utils.radix_sort_pairs(wp.from_torch(keys, dtype=wp.int32), wp.from_torch(values, dtype=wp.int32), count)
+    first, second = (wp.from_torch(t, dtype=wp.int32) for t in (keys, values))
+    wp.utils.radix_sort_pairs(first, second, count)  # type: ignore[arg-type]  # without return_ctype these are arrays

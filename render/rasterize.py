@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
 
 import torch
 
@@ -16,6 +17,26 @@ from scenes.poses import inverse
 COMPUTED = ("rgb", "alpha", "depth", "instance", "flow_prev", "flow_next")
 
 
+@overload
+def rasterize(
+    splats: Gaussians | Placed | Sequence[Placed],
+    camera: Camera,
+    outputs: tuple[str, ...] = ...,
+    background: torch.Tensor | None = ...,
+    flow_to: dict[str, tuple[Sequence[Placed], Camera]] | None = ...,
+    model: SplatModel = ...,
+    config: RenderConfig = ...,
+) -> Frame: ...
+@overload
+def rasterize(
+    splats: Gaussians | Placed | Sequence[Placed],
+    camera: Sequence[Camera],
+    outputs: tuple[str, ...] = ...,
+    background: torch.Tensor | None = ...,
+    flow_to: dict[str, tuple[Sequence[Placed], Camera]] | None = ...,
+    model: SplatModel = ...,
+    config: RenderConfig = ...,
+) -> list[Frame]: ...
 def rasterize(
     splats: Gaussians | Placed | Sequence[Placed],
     camera: Camera | Sequence[Camera],
