@@ -50,7 +50,7 @@ class Train:
     """Folder that sidestep pairs made."""
     output: Output
     """Folder of the training: checkpoint.pt and, at the end, enhancer.safetensors."""
-    time: Annotated[int, written(units.duration_us, "TIME")] = 7_200_000_000
+    time: Annotated[int, written(units.duration_us, "TIME", "7200s")] = 7_200_000_000
     """How long to train, as 7200s."""
     seed: int = 0
     """Seed of the first weights and of every sample."""

@@ -14,14 +14,14 @@ from scenes import units
 from scenes.placement import Placement, parse_at, parse_placement
 
 
-def written(parse: Callable[[str], Any], metavar: str, default: str = "") -> Any:
-    """How tyro reads a value that is written with a unit or in a form of ours; `default` is what --help shows for None."""
+def written(parse: Callable[[str], Any], metavar: str, default: str) -> Any:
+    """How tyro reads a value that is written with a unit or in a form of ours; `default` is what --help shows for its default."""
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
         is_instance=lambda value: True,
-        str_from_instance=lambda value: [default if value in (None, ()) else f"{value:g}" if isinstance(value, float) else str(value)],
+        str_from_instance=lambda value: [default],
     )
 
 
@@ -50,9 +50,9 @@ def _outputs(text: str) -> tuple[str, ...]:
     return check_outputs(_names(text))
 
 
-Length = Annotated[float, written(units.length, "LENGTH")]
-Angle = Annotated[float, written(units.angle, "ANGLE")]
-Speed = Annotated[float, written(units.speed, "SPEED")]
+Length = Annotated[float, written(units.length, "LENGTH", "0m")]
+Angle = Annotated[float, written(units.angle, "ANGLE", "0deg")]
+Speed = Annotated[float, written(units.speed, "SPEED", "0m/s")]
 Time = Annotated[int, written(units.duration_us, "TIME", "0s")]
 TimeOrAll = Annotated[int | None, written(units.duration_us, "TIME", "the rest")]
 Size = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded")]
@@ -61,7 +61,7 @@ Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Outputs = Annotated[tuple[str, ...], written(_outputs, "NAME,NAME", "none")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
 Csv = Annotated[Path | None, written(Path, "FILE", "none")]
-Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V]")]
+Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V]", "none")]
 Output = Annotated[Path, arg(aliases=("-o",))]
 Overwrite = FlagCreatePairsOff[Annotated[bool, arg(aliases=("-w",))]]
 Flag = FlagCreatePairsOff[bool]
