@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit import POSE_UNITS, Fit, FitConfig, run, scaled
+from recon.fit import POSE_UNITS, Fit, FitConfig, run
 from recon.frames import Frames, load_frames
 from recon.log import Log, Track
-from recon.model import MODEL, Knots, small_poses
+from recon.model import MODEL, Knots, scaled, small_poses
 from recon.report import held_out_table, table_text
 from recon.start import Start, prepare
 from render.progress import Progress
@@ -23,7 +23,6 @@ from scenes.files import save
 from scenes.gaussians import Placed
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
-from scenes.trajectory import Trajectory
 
 DEFAULT_CAMERAS = ("front_camera", "front_left_camera", "front_right_camera")
 SIZE = (960, 540)
@@ -111,13 +110,14 @@ def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) ->
 def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
     actors = [Knots(t.trajectory()) for t in start.tracks]
     boxes = [t.size for t in start.tracks]
-    return Fit(frames, start.rig, start.splats, start.sky, start.exposures, Knots(start.ego), actors, boxes, config)
+    trained = torch.tensor([v.time_us for v in frames.of(0)])
+    return Fit(frames, start.rig, start.splats, start.sky, start.exposures, Knots(start.ego, trained), actors, boxes, config)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
     """The scene that a fit's present state stands for."""
     groups = [g.detach() for g in fit.splats.groups(fit.sh_count())]
-    ego = _baked(fit.ego, "ego")
+    ego = fit.ego.corrected(*POSE_UNITS["ego"])
     rig = {}
     for c, name in enumerate(fit.frames.names):
         r = start.rig[name]
@@ -128,7 +128,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
-        trajectory = _baked(fit.actors[i], "actor")
+        trajectory = fit.actors[i].corrected(*POSE_UNITS["actor"])
         meta = {**share, "track": track.name}
         actors.append(Actor(Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta), trajectory, track.name))
     parked = [
@@ -140,10 +140,6 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     background = Placed(groups[0], torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
     return Scene(background, tuple(actors), sky, ego, rig, MODEL, start.ground, meta)
-
-
-def _baked(knots: Knots, kind: str) -> Trajectory:
-    return Knots(knots.trajectory, scaled(knots.deltas.detach(), *POSE_UNITS[kind])).corrected()
 
 
 def middle_pose(track: Track) -> torch.Tensor:

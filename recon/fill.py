@@ -1,4 +1,4 @@
-"""What lidar does not reach: which pixels are sky and their first picture, and splats for the other unexplained pixels.
+"""What lidar does not reach: the first picture of the sky, and splats for the other unexplained pixels.
 
 Lidar sees about 15 degrees up and loses dark and shiny things. Buildings above it, wires, far blocks and windows get splats at
 the depth of what stands below them in the image, since facades and poles are upright.
@@ -19,28 +19,6 @@ FAR = 250.0
 
 STEP = 6
 """Pixels between filling splats."""
-
-
-def sky_mask(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Pixels `[H, W]` of the sky in a uint8 image: smooth, bright enough, bluish, and joined to the image's top row.
-
-    `covered` `[H, W]` marks pixels where splats stand already; they are not sky.
-    """
-    rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
-    grey = rgb.mean(-1)
-    edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
-    bluish = rgb[..., 2] > rgb[..., 0] + 2
-    smooth = (edge < 3.0) & ~covered & bluish & (grey > 90)
-    label, _ = ndimage.label(smooth)
-    large = np.bincount(label.ravel()) > 1e-3 * grey.size
-    top = np.array([k for k in np.unique(label[:3][smooth[:3]]) if large[k]], dtype=label.dtype)
-    sky = ndimage.binary_closing(np.isin(label, top), iterations=2) & ~covered
-    if not sky.any():
-        return sky
-    # what looks like the nearest sky is sky between leaves and wires: splats of its colour would float before the houses
-    away, nearest = ndimage.distance_transform_edt(~sky, return_indices=True)
-    alike = np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 28
-    return sky | (alike & (away < 40) & ~covered)
 
 
 class SkyPicture:

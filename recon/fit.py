@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from recon.densify import Growth, adjusted, grow
 from recon.frames import Frames, View
 from recon.losses import PictureLoss
-from recon.model import FIELDS, Knots, Splats, draw, placed_groups, small_poses
+from recon.model import FIELDS, Knots, Splats, draw, placed_groups, scaled, small_poses
 from scenes.camera import Camera, RigCamera
 from scenes.poses import inverse
 from scenes.sky import sample_equirect
@@ -28,17 +28,17 @@ POSE_UNITS = {"ego": (1e-3, 1e-2), "extrinsic": (1e-3, 1e-3), "actor": (1e-2, 5e
 class FitConfig:
     """How long and how finely to fit."""
 
-    steps: int = 4000
+    steps: int = 6000
     """Pictures rendered and compared."""
-    budget: int = 200_000
+    budget: int = 220_000
     """Splats at most, all groups together."""
     sh_degree: int = 1
     """Harmonics of the splats' colours; they rise from 0 a quarter of the way in."""
-    stages: tuple[tuple[float, int], ...] = ((0.0, 4), (0.2, 2), (0.5, 1))
+    stages: tuple[tuple[float, int], ...] = ((0.0, 4), (0.15, 2), (0.4, 1))
     """From which part of the fit on pictures are shrunk by which factor: coarse to fine."""
     grow_every: int = 100
     """Steps between densifications."""
-    grow_span: tuple[float, float] = (0.08, 0.7)
+    grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
@@ -49,6 +49,9 @@ class FitConfig:
     seed: int = 0
     """Of the order of views."""
 
+
+SKY_WEIGHT = 0.03
+"""Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
 
 FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
@@ -127,10 +130,11 @@ class Fit:
         view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
         camera = self.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
-        rgb, _ = self.render(view, camera)
+        rgb, alpha = self.render(view, camera)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
+        haze = SKY_WEIGHT * (F.interpolate(alpha[None, None], view.sky.shape)[0, 0] * view.sky).mean()
         regular = 1e-4 * self.ego.unrest() + sum(1e-4 * a.unrest() for a in self.actors)
-        (loss + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        (loss + haze + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self._follow()
         self.step_count += 1
         value = float(loss.detach())
@@ -203,7 +207,9 @@ class Fit:
         fields, decay = self.splats.fields, 0.01**self.progress
         assert fields["means"].grad is not None
         seen = self.growth.see(fields["means"].grad, self.splats.reach)
-        self.splat_adam.param_groups[0]["lr"] = RATES["means"] * decay
+        settle = 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
+        for group, name in zip(self.splat_adam.param_groups, FIELDS, strict=True):
+            group["lr"] = RATES[name] * (decay if name == "means" else settle)
         before = fields["means"].detach().clone()
         if fields["rest"].grad is None:
             fields["rest"].grad = torch.zeros_like(fields["rest"])
@@ -279,11 +285,6 @@ class Fit:
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:
     return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=eps, fused=True)
-
-
-def scaled(raw: torch.Tensor, radians: float, metres: float) -> torch.Tensor:
-    """A correction `[..., 6]` in its units as radians and metres."""
-    return raw * raw.new_tensor([radians] * 3 + [metres] * 3)
 
 
 def run(fit: Fit, save: Callable[[], None], report: Callable[[Fit], None], every_seconds: float = 45.0) -> None:

@@ -5,20 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy import ndimage
 
 from recon.log import Log
+from recon.skies import sky_mask
 
 
 @dataclass(frozen=True)
 class View:
-    """One frame: the camera's place in `Frames.names`, its index in the log, time, uint8 image `[H, W, 3]`; held out or not."""
+    """One frame: the camera's place in `Frames.names`, its index in the log, time, uint8 image `[H, W, 3]`; held out or not.
+
+    sky: bool `[h, w]`, a coarse mask of what is surely sky.
+    """
 
     camera: int
     index: int
     time_us: int
     image: torch.Tensor
     held_out: bool
+    sky: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -58,9 +65,16 @@ def load_frames(
         chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
         for i in chosen:
             image = torch.from_numpy(camera.image(i, *size).copy())
-            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == 0))
+            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == 0, _sky(image)))
             if report:
                 report("images", len(views) / (len(names) * max(len(chosen), 1)))
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
     return Frames(names, *size, views)
+
+
+def _sky(image: torch.Tensor) -> torch.Tensor:
+    """The sky of an image on a grid about 240 cells wide, without its rim."""
+    step = max(1, image.shape[1] // 240)
+    coarse = sky_mask(np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy()))
+    return torch.from_numpy(ndimage.binary_erosion(coarse, border_value=1))

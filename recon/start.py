@@ -10,12 +10,13 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.actors import split_points
-from recon.fill import SkyPicture, sky_mask, unexplained
+from recon.fill import SkyPicture, unexplained
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.skies import like_sky, sky_mask
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
@@ -91,21 +92,16 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
 def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:
     """The body at the first camera's moments, from its recorded poses, one step longer at either end.
 
-    Camera poses are recorded closer to the pictures than the lidar's are. Held-out moments are left out, but for the ends: the
-    corrections that the fit finds at training frames then carry the body smoothly through them.
+    Camera poses are recorded closer to the pictures than the lidar's are.
     """
     name = frames.names[0]
     camera, back = log.camera(name), inverse(rig[name].body_from_cam)
     views = [v for v in frames.views if v.camera == 0]
-    chosen = [v for i, v in enumerate(views) if not v.held_out or i in (0, len(views) - 1)]
-    times = [v.time_us for v in chosen]
-    poses = [camera.world_from_cam[v.index] @ back for v in chosen]
+    times = [v.time_us for v in views]
+    poses = [camera.world_from_cam[v.index] @ back for v in views]
     if len(times) > 1:
-        step = (times[-1] - times[0]) / (len(views) - 1)
-        share = step / (times[1] - times[0])
-        times, poses = [round(times[0] - step), *times], [interpolate(poses[0], poses[1], -share), *poses]
-        share = step / (times[-1] - times[-2])
-        times, poses = [*times, round(times[-1] + step)], [*poses, interpolate(poses[-2], poses[-1], 1 + share)]
+        times = [2 * times[0] - times[1], *times, 2 * times[-1] - times[-2]]
+        poses = [interpolate(poses[0], poses[1], -1.0), *poses, interpolate(poses[-2], poses[-1], 2.0)]
     return Trajectory(torch.tensor(times), torch.stack(poses))
 
 
@@ -159,8 +155,10 @@ def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussian
                 if trajectory.covers(view.time_us):
                     placed.append(Placed(splats, trajectory.at(view.time_us)))
             alpha, depth = (t.numpy() for t in draw(placed, camera, "alpha", "depth"))
-            sky = sky_mask(view.image.numpy(), (alpha > 0.3) | hidden)
+            covered = (alpha > 0.3) | hidden
+            sky = sky_mask(view.image.numpy()) & ~covered
             picture.add(view.image.numpy(), sky, camera, gains[c])
+            sky = like_sky(view.image.numpy(), sky) & ~covered
             depth = np.where(hidden & (alpha < 0.5), np.inf, depth)
             cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c])
             if len(cloud.xyz):

@@ -1,8 +1,9 @@
 import numpy as np
 import torch
 
-from recon.fill import FAR, SkyPicture, sky_mask, unexplained
+from recon.fill import FAR, SkyPicture, unexplained
 from recon.frames import View
+from recon.skies import like_sky, sky_mask
 from scenes.camera import Camera
 from scenes.lens import Pinhole
 
@@ -22,17 +23,24 @@ def camera():
 
 def test_sky_is_what_is_smooth_and_blue_down_from_the_top():
     image = house_under_sky()
-    mask = sky_mask(image, np.zeros(image.shape[:2], bool))
+    mask = sky_mask(image)
     assert mask[2:20].all() and not mask[28:, 22:58].any() and not mask[42:].any()
-    covered = np.zeros(image.shape[:2], bool)
-    covered[:, :30] = True
-    assert not sky_mask(image, covered)[:, :30].any()
+
+
+def test_gaps_that_look_like_the_sky_beside_them_are_sky():
+    image = house_under_sky()
+    image[10:20, 30:34] = (40, 60, 30)
+    image[14:16, 31:33] = (138, 160, 205)
+    sky = sky_mask(image)
+    sky[8:22, 28:36] = False
+    assert like_sky(image, sky)[5:8].all() and not like_sky(image, sky)[11:13, 31:33].any()
+    assert not like_sky(image, np.zeros(image.shape[:2], bool)).any()
 
 
 def test_the_sky_picture_shows_what_was_seen_and_spreads_it():
     sky = SkyPicture(32)
     image = house_under_sky()
-    sky.add(image, sky_mask(image, np.zeros(image.shape[:2], bool)), camera(), np.array([0.5, 1.0, 1.0]))
+    sky.add(image, sky_mask(image), camera(), np.array([0.5, 1.0, 1.0]))
     picture = sky.picture()
     assert picture.shape == (32, 64, 3) and torch.isfinite(picture).all()
     np.testing.assert_allclose(picture[0, 0], [140 / 255 / 0.5, 160 / 255, 200 / 255], atol=1e-3)
@@ -46,8 +54,9 @@ def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
     depth = np.where(alpha > 0, 12.0, np.inf)
     sky = np.zeros((60, 80), bool)
     sky[:25] = True
-    cloud, width = unexplained(View(0, 0, 0, image, False), camera(), alpha, depth, sky, np.ones(3))
+    view = View(0, 0, 0, image, False, torch.zeros(60, 80, dtype=torch.bool))
+    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3))
     assert len(cloud.xyz) > 10 and np.abs(cloud.xyz[:, 0] - 12).max() < 1e-6 and (cloud.xyz[:, 2] > -2).all()
     assert (width > 0).all()
-    nothing = unexplained(View(0, 0, 0, image, False), camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3))[0]
+    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3))[0]
     assert np.abs(nothing.xyz[:, 0] - FAR).max() < 1e-6

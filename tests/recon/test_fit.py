@@ -139,3 +139,7 @@ def test_corrections_between_knots_are_between_theirs():
 
     _, knot, share = knots.base(np.array([0, 50, 200, 300]))
     torch.testing.assert_close(knots.correction(knot, share)[:, 0], torch.tensor([0.0, 0.5, 1.5, 2.0]))
+    held_out = Knots(knots.trajectory, torch.tensor([0, 300]))
+    held_out.deltas = torch.tensor([[0.0], [3.0]]).expand(2, 6).clone()
+    shift = held_out.corrected(0.0, 0.1).world_from_body[:, 0, 3]
+    torch.testing.assert_close(shift, torch.tensor([0.0, 0.1, 0.3], dtype=torch.float64))
