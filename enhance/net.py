@@ -209,7 +209,8 @@ class Enhanced:
 
 
 class Net(nn.Module):
-    """The whole network. `encoder` is the autoencoder's, frozen; everything else is trained on pairs."""
+    """The whole network. `encoder` is the autoencoder's and `region_colour` is trained on palettes, both before and then frozen;
+    everything else is trained on pairs."""
 
     def __init__(self, config: NetConfig | None = None):
         super().__init__()
@@ -249,7 +250,9 @@ class Net(nn.Module):
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
         coefficients, residual, logits = self.decoder(tokens, enhanced, half, quarter, eighth)
         logits = logits.float()
-        whole = self.region_colour(rgb, torch.sigmoid(logits).detach())
+        thin = (..., slice(None, None, 4), slice(None, None, 4))
+        with torch.no_grad():
+            whole = self.region_colour(rgb[thin], torch.sigmoid(logits[thin]))
         change = colour_change(rgb.float(), coefficients.float() + whole[:, :, None, None]) + residual.float()
         return Enhanced(rgb + hard_gate(logits) * change, enhanced.float(), logits, rgb + change)
 

@@ -28,6 +28,7 @@ from enhance.weights_file import save_net
 from scenes.atomic import atomic_file
 
 STAGES = ("autoencoder", "colour", "enhancer")
+FROZEN = ("encoder.", "region_colour.")  # parts of the network that the last stage leaves as they are
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class _Run:
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
             "colour": torch.optim.AdamW(self.net.region_colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "enhancer": torch.optim.AdamW(
-                [p for n, p in self.net.named_parameters() if not n.startswith("encoder.")], betas=(0.9, 0.98), weight_decay=1e-2
+                [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
             ),
         }
 
@@ -164,7 +165,8 @@ def train(
         if run.step["enhancer"] == 0:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
             run.average.load_state_dict(run.net.state_dict())
-        run.net.encoder.requires_grad_(False)
+        for name, parameter in run.net.named_parameters():
+            parameter.requires_grad_(not name.startswith(FROZEN))
         perceptual = PatchPerceptual(run.net.encoder)
         _stage(run, "enhancer", lambda step: _enhancer_step(run, sampler, perceptual, step), checkpoint, save_every, report)
     except KeyboardInterrupt:
@@ -206,7 +208,7 @@ def _autoencoder_step(run: _Run, sampler: Sampler, step: int) -> float:
     with autocast(x.device):
         y, latent = run.autoencoder(x, noise=0.05)
     loss = autoencoder_loss(y.float(), x, latent.float())
-    _update(run, "autoencoder", [loss], run.autoencoder.parameters())
+    _update(run, "autoencoder", [loss])
     return float(loss.detach())
 
 
@@ -219,10 +221,9 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
 
 
 def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
-    sample = sampler.batch(3 * step + 2, 2 * run.config.images, 1, run.config.crop, "isp")
-    rgb, target, region = sample.input[:, 0], sample.target[:, 0], sample.region[:, 0]
-    better = rgb + region * colour_change(rgb, run.net.region_colour(rgb, region)[:, :, None, None])
-    return _update(run, "colour", [pixel_loss(better, target, region)], run.net.region_colour.parameters())
+    rgb, target, region, guess = sampler.palettes(3 * step + 2, 4 * run.config.images)
+    better = rgb + region * colour_change(rgb, run.net.region_colour(rgb, guess)[:, :, None, None])
+    return _update(run, "colour", [pixel_loss(better, target, region)])
 
 
 def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
@@ -231,7 +232,7 @@ def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, ste
     rng = np.random.default_rng([run.seed, 7, step])
     sample = sampler.batch(2 * step + 1, c.clips if temporal else c.images, c.frames if temporal else 1, c.crop)
     losses = rollout_losses(run.net, sample, perceptual, c, rng)
-    total = _update(run, "enhancer", losses, run.net.parameters())
+    total = _update(run, "enhancer", losses)
     decay = min(0.998, (1 + run.step["enhancer"]) / (10 + run.step["enhancer"]))
     with torch.no_grad():
         for mean, now in zip(run.average.parameters(), run.net.parameters(), strict=True):
@@ -259,7 +260,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
                 wanted = net.encoder(sample.target[:, t].contiguous(memory_format=torch.channels_last))
             seen = perceptual(out.rgb, sample.target[:, t], rng) if c.perceptual else 0.0
         loss = pixel_loss(out.rgb, sample.target[:, t], sample.region[:, t]) + c.perceptual * seen
-        loss = loss + gate_loss(out.logits, out.ungated, sample.target[:, t], sample.region[:, t])
+        loss = loss + gate_loss(out.logits, out.ungated, sample.input[:, t], sample.target[:, t], sample.region[:, t])
         loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
         if previous is not None:
             loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])
@@ -269,7 +270,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
         yield loss / frames
 
 
-def _update(run: _Run, stage: str, losses, parameters) -> float:
+def _update(run: _Run, stage: str, losses) -> float:
     optimiser, total = run.optimiser[stage], 0.0
     optimiser.zero_grad()
     for loss in losses:
@@ -277,7 +278,7 @@ def _update(run: _Run, stage: str, losses, parameters) -> float:
         total += float(loss.detach())
     if not np.isfinite(total):
         raise ValueError(f"the {stage}'s loss is {total} at step {run.step[stage]}; check the pairs for damaged files, or lower the rate")
-    torch.nn.utils.clip_grad_norm_([p for p in parameters if p.grad is not None], 1.0)
+    torch.nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], 1.0)
     optimiser.step()
     return total
 

@@ -26,10 +26,11 @@ def test_pixel_loss_has_a_gradient_without_region():
 def test_gate_loss_opens_the_gate_in_the_region_and_closes_it_elsewhere():
     target, region = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
     region[:, :, :16] = 1
+    given = target + 0.2 * region
     right, wrong = (2 * region - 1) * 8, (1 - 2 * region) * 8
-    assert gate_loss(right, target, target, region) < 0.001 < 0.1 < gate_loss(wrong, target, target, region)
-    assert gate_loss(right, target + 0.1 * region, target, region) > 0.09
-    assert gate_loss(right, target + 0.1 * (1 - region), target, region) < 0.001
+    assert gate_loss(right, target, given, target, region) < 0.05 < 0.1 < gate_loss(wrong, target, given, target, region)
+    assert gate_loss(right, target + 0.1 * region, given, target, region) > 0.1
+    assert gate_loss(right, target + 0.1 * (1 - region), given, target, region) < 0.05
 
 
 def test_temporal_loss_is_zero_for_a_picture_that_moves_with_its_flow():
