@@ -30,12 +30,12 @@ FLOOR = 0.06
 FAINT = 0.05
 """Opacity under which a splat is left behind."""
 
-FEWEST_SPLATS = 400
+FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10
 FULL_SIDE = 0.85
 """Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
 
-FARTHEST = 30.0
+FARTHEST = 20.0
 """Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
 
 THUMB = (320, 240)
@@ -113,11 +113,11 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, near: float) -> Candidate:
     flaw = ""
     if meta["views"] < FEWEST_VIEWS:
         flaw = f"{meta['views']} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
-    elif len(cut) < FEWEST_SPLATS:
-        flaw = f"{len(cut)} splats, fewer than {FEWEST_SPLATS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
     whole, mirrored = (completed(cut) if not flaw else (cut, False))
+    if not flaw and len(whole) < FEWEST_SPLATS:
+        flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
     meta = meta | {"mirrored": mirrored, "nearest_m": round(near, 2) if math.isfinite(near) else None}
     return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw)
 
@@ -136,10 +136,14 @@ def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:
 
 
 def within_box(gaussians: Gaussians, size: torch.Tensor) -> Gaussians:
-    """The splats of a box frame that belong to the object: inside, above the floor, not faint, and no wider than a third of the box."""
+    """The splats of a box frame that belong to the object: inside, above the floor, not faint, and not sticking out of the box."""
     half = size[:2].float() / 2 + 0.08
-    means = gaussians.means
+    means, axes = gaussians.means, matrix_from_quat(gaussians.quats)
+    # from the sides it was not seen from, a splat that the pictures drew out along their rays is a spike
+    spread = 1.5 * (axes.square() * gaussians.log_scales.exp().square()[:, None]).sum(2).sqrt()
     keep = (means[:, :2].abs() <= half).all(1) & (means[:, 2] > FLOOR) & (means[:, 2] < float(size[2]) + 0.1)
+    keep &= (means[:, :2].abs() + spread[:, :2] < half + 0.12).all(1)
+    keep &= (means[:, 2] + spread[:, 2] < float(size[2]) + 0.15) & (means[:, 2] - spread[:, 2] > FLOOR - 0.15)
     keep &= torch.sigmoid(gaussians.logit_opacities) > FAINT
     keep &= gaussians.log_scales.amax(1) < math.log(float(size.min()) / 3)
     return gaussians.select(keep)
@@ -191,7 +195,7 @@ def thumbnail(asset: Asset) -> bytes:
 
     length, width, height = asset.size.tolist()
     centre = torch.tensor([0.0, 0.0, height / 2], dtype=torch.float64)
-    distance = 1.6 * math.hypot(length, width, height)
+    distance = 1.7 * math.hypot(length, width, height)
     azimuth, elevation = math.radians(145), math.radians(18)
     direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)
