@@ -1,9 +1,13 @@
 """How it looks: the Warp rasterizer, frames, clips, image and video files. Rooms are loaded when first used."""
 
 import importlib
+import os
 import sys
 import types
 from typing import TYPE_CHECKING
+
+# OpenMP's idle workers would spin on the cores that Warp's threads need; it reads this once, when torch is loaded
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _HOME = {
     "rasterize": "rasterize",

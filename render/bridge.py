@@ -13,7 +13,7 @@ from render.kernels.composite import composite, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.project import project, project_backward
 from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, lanes
-from render.launch import BANDS, run, run_blocks, stream, view
+from render.launch import BANDS, run, run_blocks, stage, view
 from render.order import TileLists, tile_lists
 from scenes.gaussians import SplatModel
 
@@ -103,7 +103,7 @@ def _arrays(fields) -> list:
 
 
 class Rasterize(torch.autograd.Function):
-    """(settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z,
+    """Inside a `stage`: (settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z,
     sum of w, instance.
 
     The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
@@ -120,14 +120,13 @@ class Rasterize(torch.autograd.Function):
         keys, counts = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
         poses = cam_from_local.detach().cpu()
         eyes = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
-        with stream(device):
-            uniforms = []
-            for p, group in enumerate(groups):
-                uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
-                uniforms.append(uniform)
-                run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
-            lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y, counting=device.type == "cpu")
-            planes, last = _composite(settings, lists, records)
+        uniforms = []
+        for p, group in enumerate(groups):
+            uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
+            uniforms.append(uniform)
+            run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
+        lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y, counting=device.type == "cpu")
+        planes, last = _composite(settings, lists, records)
         ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
         ctx.records, ctx.counts, ctx.last, ctx.final_t = records, counts, last, planes[0]
         ctx.like_pose, ctx.like_lens = cam_from_local.new_empty(0), lens.new_empty(0)
@@ -144,16 +143,16 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, _g_instance):
         settings, lists, device = ctx.settings, ctx.lists, ctx.records.device
         total = lists.ids.shape[0]
-        grads = settings.planes(6 if settings.depth else 4, device).zero_()
-        settings.crop(grads[:3]).copy_(g_rgb)
-        settings.crop(grads[3]).copy_(g_alpha).neg_().mul_(settings.crop(ctx.final_t))  # alpha = 1 - T
-        if settings.depth:
-            settings.crop(grads[4]).copy_(g_z)
-            settings.crop(grads[5]).copy_(g_weights)
         slots = torch.empty(total, GRADIENTS, device=device)
         outputs: list = []
         g_uniform = []
-        with stream(device):
+        with stage(device):
+            grads = settings.planes(6 if settings.depth else 4, device).zero_()
+            settings.crop(grads[:3]).copy_(g_rgb)
+            settings.crop(grads[3]).copy_(g_alpha).neg_().mul_(settings.crop(ctx.final_t))  # alpha = 1 - T
+            if settings.depth:
+                settings.crop(grads[4]).copy_(g_z)
+                settings.crop(grads[5]).copy_(g_weights)
             _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t, slots)
             base = 0
             for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):

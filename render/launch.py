@@ -4,8 +4,9 @@ Warp runs a CPU launch as one serial loop and releases the GIL, so bands on a th
 makes the result the same bits on any number of threads.
 """
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager
 from functools import cache
 
 import torch
@@ -23,13 +24,13 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None:
-    """Launch `kernel` over `count` work items; its last parameter, `first`, is the index of a band's first item."""
+    """Launch `kernel` over `count` work items, inside a `stage`; its last parameter, `first`, is the index of a band's first item."""
     if count == 0:
         return
     if device.type == "cuda":
         wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
         return
-    threads = torch.get_num_threads()
+    threads = _cores.threads
     bands = 1 if threads == 1 else min(BANDS, count)
     edges = [count * b // bands for b in range(bands + 1)]
 
@@ -56,11 +57,32 @@ def run_blocks(kernel: wp.Kernel, blocks: int, block_dim: int, args: list, devic
         wp.launch_tiled(kernel, dim=[blocks], inputs=args, block_dim=block_dim, device=wp.device_from_torch(device))
 
 
-def stream(device: torch.device):
-    """Run what is launched inside on torch's current CUDA stream, so that both see each other's results in order."""
-    if device.type != "cuda":
-        return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+@contextmanager
+def stage(device: torch.device):
+    """What is launched inside runs in order with torch: on its current CUDA stream, or on the CPU with the cores left to Warp.
+
+    After every parallel operation torch's OpenMP workers spin for milliseconds on the cores that our bands need, which makes frames
+    several times slower. So torch's own small operations between launches stay on this thread. (OMP_WAIT_POLICY=passive, set before
+    torch is loaded, as the front door does, ends the spinning after the caller's operations too.)
+    """
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+            yield
+        return
+    threads = torch.get_num_threads()
+    _cores.threads = threads
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Cores(threading.local):
+    threads = 1
+
+
+_cores = _Cores()
 
 
 _WARP_TYPES = {float: wp.float32, int: wp.int32}

@@ -9,7 +9,9 @@ import torch
 
 from render.bridge import Rasterize, Settings
 from render.flow import image_flow
-from render.frame_types import Frame, RenderConfig, check_outputs
+from render.frame_types import Frame, RenderConfig
+from render.launch import stage
+from render.outputs import check_outputs
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import inverse
@@ -62,16 +64,21 @@ def rasterize(
     placed = _as_placed(splats)
     _check(placed, camera, outputs, flow_to, model)
 
-    flows = [o for o in outputs if o.startswith("flow_")]
+    flows = any(o.startswith("flow_") for o in outputs)
     settings = Settings(
         width=camera.width,
         height=camera.height,
         model=model,
         config=config,
-        depth="depth" in outputs or bool(flows),
-        instance="instance" in outputs or bool(flows),
+        depth="depth" in outputs or flows,
+        instance="instance" in outputs or flows,
         instances=tuple(p.instance for p in placed),
     )
+    with stage(placed[0].gaussians.device):
+        return _draw(settings, placed, camera, outputs, background, flow_to)
+
+
+def _draw(settings: Settings, placed: list[Placed], camera: Camera, outputs, background, flow_to) -> Frame:
     cam_from_world = inverse(camera.world_from_cam)
     cam_from_local = torch.stack([cam_from_world @ p.world_from_local for p in placed])
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
@@ -92,7 +99,7 @@ def rasterize(
             frame["depth"] = depth
     if "instance" in outputs:
         frame["instance"] = instance
-    for name in flows:
+    for name in (o for o in outputs if o.startswith("flow_")):
         assert flow_to is not None
         there, other = flow_to[name.removeprefix("flow_")]
         frame[name] = image_flow(placed, camera, depth.detach(), instance, there, other)
