@@ -103,8 +103,10 @@ def _arrays(fields) -> list:
 
 
 class Rasterize(torch.autograd.Function):
-    """Inside a `stage`: (settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z,
-    sum of w, instance.
+    """The kernels behind `rasterize`, which calls this inside a `stage`.
+
+    (settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w,
+    instance.
 
     The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
     """
