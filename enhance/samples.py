@@ -90,7 +90,7 @@ class Sampler:
         drawn = [self._sample(rng, frames, size, kind) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
-    def palettes(self, step: int, count: int, height: int = 90, width: int = 160) -> tuple[torch.Tensor, ...]:
+    def palettes(self, step: int, count: int, height: int = 54, width: int = 96) -> tuple[torch.Tensor, ...]:
         """Whole pictures, thinned to `height` x `width` pixels, with a region in other colours.
 
         Given, target `[count, 3, height, width]`, region `[count, 1, height, width]`, and a vague region as the gate's might be.
@@ -100,7 +100,7 @@ class Sampler:
         for _ in range(count):
             rgb, instance = self._whole(rng, height, width)
             target = random_isp(rng, 0.7)(rgb) if rng.random() < 0.7 else rgb
-            ids = [i for i in instance.unique().tolist() if i > 0 and rng.random() < 0.5]
+            ids = [i for i in instance.unique().tolist() if 0 < i < 255 and rng.random() < 0.5]
             inside = torch.isin(instance, torch.tensor(ids, dtype=instance.dtype)).float()
             if inside.sum() < 50 or rng.random() < 0.3:
                 inside = (torch.from_numpy(random_mask(rng, height, width)) > 0.5).float()
@@ -113,14 +113,13 @@ class Sampler:
         """Evenly spaced pixels `[3, height, width]` of one whole picture, and their instances `[height, width]`."""
         stored = [s for of in self.shards.values() for s in of]
         if self.photos is not None and (not stored or rng.random() < 0.4):
-            rgb = torch.from_numpy(self.photos.frames[rng.integers(len(self.photos.frames))]).permute(2, 0, 1).float() / 255
-            instance = torch.zeros(rgb.shape[1:], dtype=torch.int16)
+            rgb = torch.from_numpy(self.photos.frames[rng.integers(len(self.photos.frames))])
+            instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
         else:
             shard = stored[rng.integers(len(stored))]
-            window = shard.window(int(rng.integers(shard.frames)), 1)
-            rgb, instance = window.target[0], window.instance[0, 0]
-        y, x = (torch.linspace(0, side - 1, n).round().long() for side, n in zip(rgb.shape[1:], (height, width), strict=True))
-        return rgb[:, y[:, None], x], instance[y[:, None], x]
+            rgb, instance = shard.target(int(rng.integers(shard.frames)))
+        y, x = (torch.linspace(0, side - 1, n).round().long() for side, n in zip(instance.shape, (height, width), strict=True))
+        return rgb[y[:, None], x].permute(2, 0, 1).float() / 255, instance[y[:, None], x]
 
     def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
         kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k != "underfit" or self.shards["underfit"]]

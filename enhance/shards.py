@@ -88,6 +88,13 @@ class Shard:
             visible=visible,
         )
 
+    def target(self, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """One target as stored, uint8 `[H, W, 3]`, and its instances `[H, W]`."""
+        from safetensors import safe_open
+
+        with safe_open(self.path, "pt") as file:
+            return file.get_slice("target")[frame], file.get_slice("instance")[frame]
+
 
 def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:
     """Store one clip; the json file is written last, so a shard without one is unfinished and is made again."""
