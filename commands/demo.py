@@ -22,8 +22,8 @@ DATA = Path(__file__).resolve().parents[1] / "examples" / "data"
 CAMERA = "front_camera"
 SHIFT = 2.0
 WIDTH, HEIGHT = 640, 360
-PARKED = "car/0001@30m,5.9m"
-MOVING = "car/0002@9m,3.6m,speed=5.5m/s"
+PARKED = "car/0001@32m,6.1m"
+MOVING = "car/0003@8.5m,0m,speed=3.5m/s"
 # the recording itself is not ours to bundle: the first column is the reconstruction seen from the recorded path
 COLUMNS = ("recorded view, reconstructed", "shifted 2 m to the left", "with a parked and a moving asset", "enhanced")
 

@@ -70,9 +70,27 @@ def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monk
 
     monkeypatch.setattr(demo, "WIDTH", 64)
     monkeypatch.setattr(demo, "HEIGHT", 48)
+    monkeypatch.setattr(demo, "MOVING", "car/0002@8m,0m,speed=4m/s")
     demo.demonstrate(data, tmp_path, str(data / "weights.safetensors"))
     assert len(list(read_video(tmp_path / "out.mp4"))) == 8
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["lateral_shift_m"] == 2 and len(told["inserted"]) == 2
     assert {"render", "enhance", "write"} <= set(told["ms_per_frame"])
     assert read_image(tmp_path / "contact.png").shape[1] > 4 * 64
+
+
+def test_the_bundled_street_has_what_the_demo_needs():
+    from commands.demo import CAMERA, MOVING, PARKED
+    from scenes import load
+    from scenes.placement import parse_placement
+    from scenes.report import validate
+
+    data = EXAMPLES / "data"
+    scene = load(data / "drive002")
+    assert len(scene.frame_times(CAMERA)) >= 60
+    ids = {e.id for e in Databank(data / "databank").entries()}
+    assert len(ids) >= 3
+    assert {parse_placement(text).asset for text in (PARKED, MOVING)} <= ids
+    assert "CC BY 4.0" in scene.meta["licence"]
+    assert validate(data / "databank") == []
+    assert sum(p.stat().st_size for p in data.rglob("*") if p.is_file()) <= 10_000_000
