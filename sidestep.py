@@ -44,8 +44,6 @@ def parse(words: list[str]) -> Any:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit."""
     command = parse(list(sys.argv[1:] if arguments is None else arguments))
-    # OpenMP's idle workers would spin after every torch operation, on the cores that Warp's threads need: 4 times slower frames
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that half-written files are removed on the way out
     try:
         command.run()

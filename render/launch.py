@@ -4,6 +4,8 @@ Warp runs a CPU launch as one serial loop and releases the GIL, so bands on a th
 makes the result the same bits on any number of threads.
 """
 
+import os
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,6 +15,25 @@ import torch
 import warp as wp
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+
+
+def _start() -> None:
+    """Start Warp. Where there is no CUDA driver its native code says so on stderr, past every log level; that is no news here."""
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+_start()
 
 BANDS = 16
 """Bands of tiles a launch is cut into: enough to even out a busy part of the image, few enough to cost nothing."""
