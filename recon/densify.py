@@ -13,10 +13,10 @@ FAINT = 0.02
 """Opacity under which a splat is dropped."""
 
 LARGEST = 0.03
-"""Of a splat's reach: its standard deviation at most; 30 pixels at a focal length of 1000."""
+"""Of a splat's reach: its standard deviation at most, 30 pixels."""
 
 THINNEST = 1e-4
-"""Of a splat's reach: its standard deviation at least."""
+"""Of a splat's reach: its standard deviation at least, a tenth of a pixel."""
 
 LONGEST = 12.0
 """Times a splat's middle axis that its longest may be: needles look right along one ray only."""

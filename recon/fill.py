@@ -55,11 +55,12 @@ class SkyPicture:
 
 
 def unexplained(
-    view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray
+    view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray, floor: float
 ) -> tuple[Cloud, np.ndarray]:
     """World points with colours for pixels that neither splats (`alpha` `[H, W]`) nor sky explain, and their widths in metres.
 
-    One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`.
+    One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`;
+    never under the ground at height `floor`.
     """
     half = STEP // 2
     rows, columns = np.mgrid[half : camera.height : STEP, half : camera.width : STEP]
@@ -69,10 +70,12 @@ def unexplained(
     want = ~solid & ~blocked
     pixels = torch.from_numpy(np.stack([columns[want], rows[want]], 1) + 0.5)
     rays = camera.lens.unproject(pixels).numpy()
-    local = rays * z[want][:, None]
     pose = camera.world_from_cam.numpy()
+    down = np.minimum(rays @ pose[2, :3], -1e-3)
+    z = np.minimum(z[want], np.maximum(0.5, (floor - pose[2, 3]) / down))
+    local = rays * z[:, None]
     colour = ndimage.uniform_filter(view.image.numpy().astype(np.float32) / 255, (STEP, STEP, 1))[rows[want], columns[want]] / gain
-    return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z[want] * STEP / float(camera.lens.fx)
+    return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / float(camera.lens.fx)
 
 
 def _from_below(depth: np.ndarray) -> np.ndarray:

@@ -57,7 +57,7 @@ FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
 
 RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "dc": 5e-3, "rest": 5e-4}
-"""Adam's step a field; of means in parts of each splat's reach (0.1 pixel at a focal length of 1000)."""
+"""Adam's step a field; of means in parts of each splat's reach: 0.1 pixel."""
 
 
 class Fit:

@@ -21,7 +21,7 @@ class Splats:
     """Splats of all groups (background first, then the actors) in one set of tensors, so that one optimiser step moves all.
 
     means `[N, 3]`, quats `[N, 4]`, log_scales `[N, 3]`, logits `[N]`, dc `[N, 1, 3]`, rest `[N, K - 1, 3]`; sizes: splats a group;
-    reach `[N]`: metres to the nearest camera position, by which steps and limits of a splat scale.
+    reach `[N]`: metres that 1000 pixels of the sharpest camera span where it comes nearest, by which steps and limits of a splat scale.
     """
 
     fields: dict[str, torch.Tensor]

@@ -31,7 +31,7 @@ FILL_VIEWS = 6
 """Views a camera that are searched for what lidar does not explain."""
 
 WIDEST_SEED = 0.012
-"""Of its reach: a seed's width at most."""
+"""Of its reach: a seed's width at most, 12 pixels."""
 
 
 @dataclass
@@ -67,7 +67,8 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     cloud = Cloud(split.static[known], rgb[known])
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
-    reach = np.maximum(path.query(cloud.xyz)[0], 1.0)
+    sharpest = 1000 / max(float(r.lens.fx) for r in rig.values())
+    reach = sharpest * np.maximum(path.query(cloud.xyz)[0], 1.0)
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
 
     groups, reaches, tracks = [], [], []
@@ -79,11 +80,11 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
             tracks.append(track)
             middle = track.world_from_box[:, :3, 3].numpy()
             near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)
-            reaches.append(torch.full((len(made),), near))
+            reaches.append(torch.full((len(made),), sharpest * near))
 
     report("filling what lidar missed")
-    filled, sky = _fill(log, frames, rig, background, groups, tracks, gains, sh_count)
-    reach = torch.from_numpy(np.maximum(path.query(filled.means.numpy())[0], 1.0)).float()
+    filled, sky = _fill(log, frames, background, groups, tracks, gains, sh_count, ground)
+    reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], 1.0)).float()
     exposures = torch.zeros(len(frames.names), 3, 4)
     exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
     return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig)
@@ -141,7 +142,7 @@ def box_skin(size: np.ndarray, step: float) -> np.ndarray:
     return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
 
 
-def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussians], tracks: list[Track], gains, sh_count):
+def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussians], tracks: list[Track], gains, sh_count, ground: Ground):
     """Background with splats added where views show neither splats nor sky, and the sky `[H, 2H, 3]`."""
     picture = SkyPicture(SKY_HEIGHT)
     world = torch.eye(4, dtype=torch.float64)
@@ -159,9 +160,10 @@ def _fill(log, frames: Frames, rig, background: Gaussians, actors: list[Gaussian
             sky = sky_mask(view.image.numpy()) & ~covered
             picture.add(view.image.numpy(), sky, camera, gains[c])
             sky = like_sky(view.image.numpy(), sky) & ~covered
+            floor = float(ground.height(camera.world_from_cam[:2, 3]))
             depth = np.where(hidden & (alpha < 0.5), np.inf, depth)
-            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c])
+            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c], floor)
             if len(cloud.xyz):
-                more = splats_from(cloud, width, sh_count, width)
+                more = splats_from(cloud, 3 * width, sh_count, width)  # as wide as their blocks, to close the holes
                 background = Gaussians.cat([background, more])
     return background, picture.picture()

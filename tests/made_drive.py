@@ -85,6 +85,7 @@ def _sweep(path: Path, street, mover, pose, stamp: int, scanned: int, generator)
     own = mover.asset.gaussians.means.double().numpy() @ pose[:3, :3].numpy().T + pose[:3, 3].numpy()
     xyz = np.concatenate([static, own])
     xyz = xyz + generator.normal(0, 0.01, xyz.shape)
+    xyz[: len(static), :2] += generator.uniform(-0.25, 0.25, (len(static), 2))  # a lidar does not hit the same spot again
     times = np.concatenate([np.full(len(static), stamp - 20_000), np.full(len(own), scanned)]) / 1e6
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "i": np.zeros(len(xyz)), "t": times, "d": np.zeros(len(xyz), np.int64)}
     pd.DataFrame(columns).to_pickle(path)

@@ -55,8 +55,9 @@ def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
     sky = np.zeros((60, 80), bool)
     sky[:25] = True
     view = View(0, 0, 0, image, False, torch.zeros(60, 80, dtype=torch.bool))
-    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3))
+    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3), -40.0)
     assert len(cloud.xyz) > 10 and np.abs(cloud.xyz[:, 0] - 12).max() < 1e-6 and (cloud.xyz[:, 2] > -2).all()
     assert (width > 0).all()
-    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3))[0]
-    assert np.abs(nothing.xyz[:, 0] - FAR).max() < 1e-6
+    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), -40.0)[0]
+    up = nothing.xyz[:, 2] > 0
+    assert np.abs(nothing.xyz[up, 0] - FAR).max() < 1e-6 and np.abs(nothing.xyz[:, 2].min() + 40) < 1e-6

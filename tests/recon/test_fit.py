@@ -12,7 +12,7 @@ from scenes import Scene, load
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
-CONFIG = FitConfig(steps=160, budget=3000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
+CONFIG = FitConfig(steps=160, budget=8000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
 SIZE = (96, 54)
 
 
@@ -34,7 +34,7 @@ def test_a_drive_becomes_a_scene_on_disk(whole):
 def test_held_out_frames_are_reported_with_the_mean_image(whole):
     rows = whole[1].meta["held_out"]
     row = next(r for r in rows if r["which"] == "all")
-    assert row["frames"] == [0, 4] and row["psnr"] > 24 and {"ssim", "mean_ssim"} <= row.keys()
+    assert row["frames"] == [0, 4] and row["psnr"] > 27 and {"ssim", "mean_ssim"} <= row.keys()
 
 
 def test_the_reported_views_are_the_scenes_own(whole, street):

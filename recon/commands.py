@@ -1,0 +1,118 @@
+"""`sidestep recon` and `sidestep assets`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from scenes.opening import fresh
+from scenes.options import Flag, Names, Output, Overwrite, ScenePath, Time, TimeOrAll
+
+
+@dataclass
+class Recon:
+    """Reconstruct a recorded drive as a scene: background, movers, sky, exposure; reports its quality on held-out frames."""
+
+    data: Positional[Annotated[Path, arg(metavar="DATA")]]
+    """Folder of one drive, as pandaset/002."""
+    output: Output
+    """Folder of the new scene."""
+    cameras: Names = None
+    """Cameras to use."""
+    start: Time = 0
+    """Where in the drive to begin."""
+    duration: TimeOrAll = None
+    """How much of the drive to use."""
+    resume: Flag = False
+    """Go on from where an interrupted run of the same command stopped."""
+    overwrite: Overwrite = False
+    """Replace an existing scene."""
+
+    def run(self) -> None:
+        from recon import open_log, reconstruct
+        from scenes.usd_scene import is_scene
+
+        fresh(self.output, self.overwrite)
+        if self.output.exists() and not is_scene(self.output):
+            raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
+        log = open_log(self.data)
+        try:
+            reconstruct(
+                log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume,
+                overwrite=self.overwrite,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
+
+
+@dataclass
+class Extract:
+    """Cut the moving and parked vehicles of a scene into the databank."""
+
+    scene: ScenePath
+    """Scene folder."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        from recon import extract_assets
+
+        ids = extract_assets(self.scene, self.databank)
+        print(f"{len(ids)} assets added to {self.databank}: {', '.join(ids)}")
+
+
+@dataclass
+class List:
+    """List the assets of the databank."""
+
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        from scenes import Databank
+
+        entries = Databank(self.databank).entries()
+        for e in entries:
+            size = " x ".join(f"{v:.2f}" for v in e.size)
+            print(f"{e.id:<20} {size:>18} m  {e.splats:>7} splats  {'?' if e.views is None else e.views:>4} views  {e.licence}")
+        print(f"{len(entries)} assets in {self.databank}")
+
+
+@dataclass
+class Show:
+    """Show one asset: size, class, splats, views, licence, thumbnail."""
+
+    id: Positional[Annotated[str, arg(metavar="ID")]]
+    """The asset, as car/0003."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        from scenes import Databank
+
+        e = Databank(self.databank).entry(self.id)
+        thumb = self.databank / e.thumb if e.thumb else "none"
+        told = {
+            "asset": e.id, "class": e.label, "size": "{:.2f} m long, {:.2f} m wide, {:.2f} m high".format(*e.size), "splats": e.splats,
+            "views": "unknown" if e.views is None else e.views, "licence": e.licence, "attribution": e.attribution, "source": e.source,
+            "file": self.databank / e.asset, "thumbnail": thumb,
+        }  # fmt: skip
+        for key, value in told.items():
+            print(f"{key:<12} {value}")
+
+
+@dataclass
+class Assets:
+    """Assets of the databank: extract them from a scene, list them, show one."""
+
+    action: OmitArgPrefixes[
+        OmitSubcommandPrefixes[
+            Annotated[Extract, subcommand("extract")] | Annotated[List, subcommand("list")] | Annotated[Show, subcommand("show")]
+        ]
+    ]
+
+    def run(self) -> None:
+        self.action.run()
