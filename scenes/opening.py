@@ -1,0 +1,58 @@
+"""What several sub-commands do: refuse what stands, open a scene, warn."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scenes import Asset, Gaussians, Scene
+
+
+class UsageError(Exception):
+    """The command line asks for something that makes no sense; exit 2."""
+
+
+def fresh(path: Path, overwrite: bool) -> Path:
+    """A path that may be written; FileExistsError where something stands there and -w was not given."""
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists; give -w to replace it, or another name with -o")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
+    return path
+
+
+def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
+    """The scene of a folder, and what was dropped from it. ValueError where it is something else, empty, or not finite."""
+    from scenes import Scene
+    from scenes.files import Dropping, read
+
+    dropping = Dropping()
+    thing = read(path, dropping if drop_invalid else _refuse)
+    if not isinstance(thing, Scene):
+        raise ValueError(f"{path} holds {_kind(thing)}, not a scene; give a folder that sidestep recon wrote")
+    if not len(thing.background.gaussians) and not thing.actors:
+        raise ValueError(f"{path} is empty: it has no splats and no actors; reconstruct it again with sidestep recon")
+    return thing, [dropped(dropping.count)] if dropping.count else []
+
+
+def dropped(count: int) -> str:
+    return f"dropped {count} splat{'s' * (count != 1)} with values that are not finite"
+
+
+def _refuse(gaussians: Gaussians, where: str) -> Gaussians:
+    try:
+        return gaussians.checked(where)
+    except ValueError as error:
+        raise ValueError(f"{error}; give --drop-invalid to leave them out") from error
+
+
+def _kind(thing: Asset | Gaussians | Scene) -> str:
+    return {"Asset": "an asset", "Gaussians": "splats"}[type(thing).__name__]
+
+
+def warn(lines: Sequence[str]) -> None:
+    for line in lines:
+        print(f"sidestep: warning: {line}", file=sys.stderr)

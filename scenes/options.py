@@ -1,0 +1,63 @@
+"""How values are written on the command line: with units, as lists, as places. Loads nothing heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from scenes import units
+from scenes.placement import Placement, parse_at, parse_placement
+
+
+def written(parse: Callable[[str], Any], metavar: str, default: str) -> Any:
+    """How tyro reads a value that is written with a unit or in a form of ours; `default` is what --help shows for its default."""
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: parse(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: [default],
+    )
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ValueError(f'"{text}" is not a size; write width and height in pixels, as 640x360')
+    return int(width), int(height)
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < 1000:
+        raise ValueError(f'"{text}" is not a frame rate; write frames a second, as 10')
+    return rate
+
+
+def names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+Length = Annotated[float, written(units.length, "LENGTH", "0m")]
+Angle = Annotated[float, written(units.angle, "ANGLE", "0deg")]
+Speed = Annotated[float, written(units.speed, "SPEED", "0m/s")]
+Time = Annotated[int, written(units.duration_us, "TIME", "0s")]
+TimeOrAll = Annotated[int | None, written(units.duration_us, "TIME", "the rest")]
+Size = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded")]
+Names = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "all")]
+Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
+Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
+Csv = Annotated[Path | None, written(Path, "FILE", "none")]
+Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V]", "none")]
+Output = Annotated[Path, arg(aliases=("-o",))]
+Overwrite = FlagCreatePairsOff[Annotated[bool, arg(aliases=("-w",))]]
+Flag = FlagCreatePairsOff[bool]
+ScenePath = Positional[Annotated[Path, arg(metavar="SCENE")]]
+AnyPath = Positional[Annotated[Path, arg(metavar="PATH")]]
