@@ -1,4 +1,4 @@
-"""The front door: `sidestep COMMAND`. The sub-commands stand in commands/, one dataclass each.
+"""The front door: `sidestep COMMAND`, one dataclass each. The main job stands here; commands about one package in its commands.py.
 
 Exit codes: 0 done, 1 bad data (one line says what, where and the fix; SIDESTEP_TRACEBACK=1 shows where it came from), 2 usage,
 130 interrupted.
@@ -10,18 +10,165 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, NoReturn, Union
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union
 
 import tyro
-from tyro.conf import subcommand
+from tyro.conf import UseAppendAction, subcommand
 
-from commands.common import UsageError
-from commands.demo import Demo
-from commands.files import Info, Validate
-from commands.reconstruct import Assets, Recon
-from commands.repair import Enhance, Pairs, Train
-from commands.shoot import Insert, Render
+from enhance.commands import Enhance, Pairs, Train
+from enhance.demo import Demo
+from recon.commands import Assets, Recon
+from render.outputs import check_outputs
+from scenes.commands import Info, Validate
 from scenes.names import unknown
+from scenes.opening import UsageError, fresh, open_scene, warn
+from scenes.options import (
+    Angle,
+    Csv,
+    Flag,
+    Insertion,
+    Length,
+    Output,
+    Overwrite,
+    Place,
+    Rate,
+    ScenePath,
+    Size,
+    Speed,
+    Time,
+    TimeOrAll,
+    names,
+    written,
+)
+from scenes.placement import Placement
+
+if TYPE_CHECKING:
+    from render.record import Finish
+
+Outputs = Annotated[tuple[str, ...], written(lambda text: check_outputs(names(text)), "NAME,NAME", "none")]
+
+
+@dataclass
+class Insert:
+    """Insert an asset into a scene, as a layer that leaves the rest of the scene untouched."""
+
+    scene: ScenePath
+    """Scene folder."""
+    asset: str
+    """The asset, as car/0003."""
+    at: Place = None
+    """Metres forward and left of the unshifted body at --start, as 20m,-3.5m."""
+    yaw: Angle = 0.0
+    """Heading, to the left of the body's, as 5deg."""
+    speed: Speed = 0.0
+    """Speed along its heading, as 8m/s."""
+    trajectory: Csv = None
+    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw and --speed: seconds after --start, metres forward and left."""
+    start: Time = 0
+    """When the place holds, after the drive's first moment."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        if (self.at is None) == (self.trajectory is None):
+            raise UsageError("say where the asset goes with --at X,Y, as --at 20m,-3.5m, or with --trajectory t.csv; one of the two")
+        from scenes import Databank
+        from scenes.insert import insert
+        from scenes.usd_edit import add_edit
+
+        scene, _ = open_scene(self.scene)
+        placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.trajectory)
+        result = insert(scene, Databank(self.databank).load(self.asset), placement, int(scene.ego.times_us[0]) + self.start)
+        about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed}
+        add_edit(self.scene, result.actor.track, [result.actor], about)
+        warn(result.warnings)
+        layer = self.scene / "edits" / f"{result.actor.track}.usda"
+        print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit, and deleting it undoes it")
+
+
+@dataclass
+class Render:
+    """Render a clip of a scene from a shifted path, with inserted assets, enhanced: an H.264 video and a JSON report."""
+
+    scene: ScenePath
+    """Scene folder."""
+    camera: str
+    """Camera of the rig, as front_camera."""
+    output: Output
+    """Video to write, as out.mp4; the report goes to out.json."""
+    lateral_shift: Length = 0.0
+    """Metres to the left of the recorded path, as 2m; -2m is to the right."""
+    insert: UseAppendAction[tuple[Insertion, ...]] = ()
+    """An asset to insert for this clip, as car/0003@12m,3.5m,yaw=5deg,speed=8m/s or car/0003@trajectory=t.csv; metres are forward and left
+    of the unshifted body at the clip's first frame."""
+    enhance: Flag = False
+    """Repair and harmonize the frames."""
+    weights: str = "builtin"
+    """The enhancer's weights: builtin, or a file that sidestep train wrote."""
+    no_shadows: Flag = False
+    """Leave out the contact shadows of inserted assets."""
+    start: Time = 0
+    """Where to begin, after the camera's first frame."""
+    duration: TimeOrAll = None
+    """How long a clip."""
+    fps: Rate = None
+    """Frames a second, evenly spaced in place of the recorded times."""
+    size: Size = None
+    """Size in pixels, as 640x360."""
+    outputs: Outputs = ()
+    """Frames to keep in the folder out/: any of rgb, alpha, depth, instance, flow_prev, flow_next."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to render and enhance."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+    drop_invalid: Flag = False
+    """Leave out splats with values that are not finite, and count them, instead of refusing the scene."""
+    overwrite: Overwrite = False
+    """Replace existing files."""
+
+    def run(self) -> None:
+        for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
+            fresh(path, self.overwrite)
+        from render.clip import clip_cameras, clip_times, in_view
+        from render.record import record
+        from scenes import Databank
+        from scenes.insert import insert
+
+        check_device(self.device)
+        scene, warnings = open_scene(self.scene, self.drop_invalid)
+        times = clip_times(scene, self.camera, self.start, self.duration, self.fps)
+        cameras = clip_cameras(scene, self.camera, self.lateral_shift, times)
+        for placement in self.insert:
+            result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
+            scene, warnings = result.scene, [*warnings, *result.warnings]
+            if not in_view(result.actor, cameras):
+                warnings.append(f"{placement.asset} is never in view of {self.camera}: X is metres forward, Y metres to the left")
+        warn(warnings)
+        width, height = self.size or (None, None)
+        finish: Finish | None = None
+        needs: tuple[str, ...] = ()
+        if self.enhance:
+            from enhance.clip import enhancement
+
+            finish, needs = enhancement(self.weights, self.device)
+        facts = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
+        record(
+            scene.to(self.device), self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
+            not self.no_shadows, finish, needs, facts, warnings,
+        )  # fmt: skip
+        written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
+        print(f"wrote {', '.join(map(str, written))}")
+
+
+def check_device(device: str) -> None:
+    """ValueError where the machine has no such device."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
+
 
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
 COMMANDS = {

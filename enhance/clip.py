@@ -20,6 +20,12 @@ def enhance_frames(frames: Iterable[Frame], enhancer: Enhancer) -> Iterator[Fram
         yield replace(frame, rgb=better)
 
 
+def enhancement(weights: str, device: str = "cpu") -> tuple[Callable[[Iterable[Frame]], Iterator[Frame]], tuple[str, ...]]:
+    """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads."""
+    enhancer = Enhancer.load(weights, device)
+    return lambda frames: enhance_frames(frames, enhancer), READS
+
+
 def enhance_video(
     source: str | Path,
     out: str | Path,

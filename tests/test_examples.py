@@ -66,7 +66,7 @@ def test_a_clip_is_enhanced(data, tmp_path):
 
 
 def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monkeypatch):
-    from commands import demo
+    from enhance import demo
 
     monkeypatch.setattr(demo, "WIDTH", 64)
     monkeypatch.setattr(demo, "HEIGHT", 48)
@@ -80,7 +80,7 @@ def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monk
 
 
 def test_the_bundled_street_has_what_the_demo_needs():
-    from commands.demo import CAMERA, MOVING, PARKED
+    from enhance.demo import CAMERA, MOVING, PARKED
     from scenes import load
     from scenes.placement import parse_placement
     from scenes.report import validate

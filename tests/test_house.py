@@ -9,7 +9,7 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[1]
 COMMANDS = ["recon", "assets", "insert", "render", "pairs", "train", "enhance", "info", "validate", "demo"]
-ORDER = ["scenes", "render", "recon", "enhance", "commands"]
+ORDER = ["scenes", "render", "recon", "enhance"]
 
 
 def imported_packages(path: Path) -> set[str]:
