@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +37,7 @@ def inside(local: np.ndarray, size: np.ndarray, margin: float, below: float = 0.
     return (np.abs(local[:, :2]) <= half).all(1) & (local[:, 2] >= -below) & (local[:, 2] <= size[2] + margin)
 
 
-def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track], report: Callable[[str, float], None] | None = None) -> Split:
+def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track]) -> Split:
     """Sort the points of `sweeps` into static ones and those of the moving `tracks`.
 
     A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the
@@ -49,7 +48,7 @@ def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track], report: Cal
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
-    for count, sweep in enumerate(sweeps):
+    for sweep in sweeps:
         points = sweep.read()
         keep = np.ones(len(points.xyz), dtype=bool)
         for track in tracks:
@@ -75,8 +74,6 @@ def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track], report: Cal
         keep &= _beside_body(log, sweep, points.xyz)
         static.append(points.xyz[keep])
         static_sweep.append(np.full(keep.sum(), sweep.index))
-        if report:
-            report("points", (count + 1) / len(sweeps))
     usual = float(np.median(offsets)) if offsets else 0.0
     corrected = tuple(_retimed(t, scanned[t.name], usual) for t in tracks)
     return Split(

@@ -64,7 +64,7 @@ def reconstruct(
     saved = load_checkpoint(checkpoint, options) if resume else None
 
     with Progress("images") as steps:
-        frames = load_frames(log, names, span, size, held_out, lambda _what, _part: steps.step())
+        frames = load_frames(log, names, span, size, held_out, steps.step)
     with Progress("prepare") as steps:
         coefficients = (config.sh_degree + 1) ** 2
         start = saved[0] if saved else prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))

@@ -53,11 +53,11 @@ def load_frames(
     span_us: tuple[int, int],
     size: tuple[int, int],
     held_out: int,
-    report: Callable[[str, float], None] | None = None,
+    report: Callable[[], None] = lambda: None,
 ) -> Frames:
     """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
 
-    Raises ValueError where a camera has no frame left to train on, or a file does not decode.
+    `report` is called after each. Raises ValueError where a camera has no frame left to train on, or a file does not decode.
     """
     views = []
     for c, name in enumerate(names):
@@ -66,8 +66,7 @@ def load_frames(
         for i in chosen:
             image = torch.from_numpy(camera.image(i, *size).copy())
             views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == 0, _sky(image)))
-            if report:
-                report("images", len(views) / (len(names) * max(len(chosen), 1)))
+            report()
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
     return Frames(names, *size, views)

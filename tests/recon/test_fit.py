@@ -1,3 +1,5 @@
+import os
+import signal
 from dataclasses import replace
 
 import pytest
@@ -62,7 +64,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
 
     def interrupted(self):
         if self.step_count == 95:
-            raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.SIGINT)
         return step(self)
 
     monkeypatch.setattr(Fit, "step", interrupted)
@@ -81,8 +83,11 @@ def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, m
     with pytest.raises(FileNotFoundError, match="without --resume"):
         reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
 
+    step = Fit.step
+
     def stop(self):
-        raise KeyboardInterrupt
+        os.kill(os.getpid(), signal.SIGINT)
+        return step(self)
 
     monkeypatch.setattr(Fit, "step", stop)
     with pytest.raises(KeyboardInterrupt):
