@@ -38,9 +38,9 @@ def gate_loss(logits: torch.Tensor, ungated: torch.Tensor, given: torch.Tensor, 
     wrong = F.avg_pool2d((given - target).abs().mean(1, keepdim=True), 9, 1, 4, count_include_pad=False) / 0.04
     wrong = wrong.clamp(0, 1) * region
     total = logits.new_zeros(())
-    for part, sign in ((wrong, -1.0), (1 - wrong, 1.0)):
-        each, some = _part_mean(F.softplus(sign * logits), part)
-        total = total + 0.05 * (each * some).sum() / some.sum().clamp_min(1)
+    for part in (region, 1 - region):
+        each, some = _part_mean(F.binary_cross_entropy_with_logits(logits, wrong, reduction="none"), part)
+        total = total + 0.1 * (each * some).sum() / some.sum().clamp_min(1)
     absolute, some = _part_mean((ungated - target).abs(), region)
     return total + (absolute * some).sum() / some.sum().clamp_min(1)
 

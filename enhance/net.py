@@ -161,6 +161,7 @@ class FrameDecoder(nn.Module):
         super().__init__()
         self.up_eighth = nn.Conv2d(c.width, 4 * c.eighth, 1)
         self.latent = nn.Conv2d(LATENT, c.eighth, 3, padding=1)
+        self.norm = nn.GroupNorm(1, c.eighth)
         self.eighth = Residual(c.eighth)
         self.colour = nn.Conv2d(c.eighth, 12, 3, padding=1)
         self.up_quarter = nn.Conv2d(c.eighth, 4 * c.quarter, 1)
@@ -173,7 +174,8 @@ class FrameDecoder(nn.Module):
 
     def forward(self, tokens, latent, half, quarter, eighth) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Colour coefficients `[B, 12, H/8, W/8]`, residual `[B, 3, H, W]`, gate logits `[B, 1, H, W]`."""
-        x = self.eighth(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + eighth)
+        # Normalised, because a channel that drifts far below zero here is dead for good behind the next activation.
+        x = self.eighth(self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + eighth))
         coefficients = self.colour(F.silu(x))
         x = self.quarter(F.pixel_shuffle(self.up_quarter(F.silu(x)), 2) + quarter)
         x = self.fine(F.pixel_shuffle(self.up_half(F.silu(x)), 2) + half)
@@ -252,7 +254,9 @@ class Net(nn.Module):
         logits = logits.float()
         thin = (..., slice(None, None, 4), slice(None, None, 4))
         with torch.no_grad():
-            whole = self.region_colour(rgb[thin], torch.sigmoid(logits[thin]))
+            # Only where the gate is more open than shut: a small region's palette must not drown in a large surrounding's doubts.
+            region = (2 * torch.sigmoid(logits[thin]) - 1).clamp_min(0)
+            whole = self.region_colour(rgb[thin], region) * (region.sum((2, 3)) / 20).clamp_max(1)
         change = colour_change(rgb.float(), coefficients.float() + whole[:, :, None, None]) + residual.float()
         return Enhanced(rgb + hard_gate(logits) * change, enhanced.float(), logits, rgb + change)
 
