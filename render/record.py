@@ -14,6 +14,7 @@ import torch
 
 from render.clip import clip_cameras, frame_rate, render_clip
 from render.frame_types import Frame
+from render.outputs import OUTPUTS
 from render.progress import Progress, Stopwatch
 from render.video import VideoWriter, write_image
 from scenes.atomic import atomic_file, atomic_folder
@@ -45,8 +46,11 @@ def record(
     keep: outputs that also go, frame by frame, into a folder of the same name: rgb as PNG, all others as .npy.
     finish: what happens to the stream of frames before it is written, such as enhancement; finish_needs: outputs it reads.
     facts: what else the report should say. Frames are streamed, and all files appear together at the end or not at all.
-    Existing files are replaced; whether they may be is the caller's question.
+    Existing files are replaced; whether they may be is the caller's question. A folder that is not one of kept frames is never
+    replaced: FileExistsError.
     """
+    if keep:
+        _check_replaceable(path.with_suffix(""))
     torch.manual_seed(SEED)
     cameras = clip_cameras(scene, camera, shift, times_us, width, height)
     times = torch.tensor([c.time_us for c in cameras])
@@ -109,6 +113,12 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:  # run from a source tree that was never installed
             found[package] = "unknown"
     return found
+
+
+def _check_replaceable(folder: Path) -> None:
+    """FileExistsError where `folder` holds anything but kept frames: scenes/s1 stands where the frames of scenes/s1.mp4 would go."""
+    if folder.exists() and not (folder.is_dir() and all(entry.name in OUTPUTS for entry in folder.iterdir())):
+        raise FileExistsError(f"{folder} holds something else than kept frames, so it is left alone; give another name with -o")
 
 
 def _keep(folder: Path, index: int, frame: Frame, keep: Sequence[str]) -> None:

@@ -39,6 +39,19 @@ def test_kept_outputs_come_as_files(street, tmp_path):
     assert os.listdir(tmp_path / "out/flow_prev") == ["000001.npy"]
 
 
+def test_kept_outputs_replace_kept_outputs_and_nothing_else(street, tmp_path):
+    times = street.frame_times("front_camera")[:1]
+    record(street, "front_camera", tmp_path / "out.mp4", times_us=times, keep=("rgb", "depth"))
+    record(street, "front_camera", tmp_path / "out.mp4", times_us=times, keep=("depth",))
+    assert os.listdir(tmp_path / "out") == ["depth"]
+    (tmp_path / "s1").mkdir()
+    (tmp_path / "s1/scene.usda").touch()
+    with pytest.raises(FileExistsError, match="s1 holds something else than kept frames"):
+        record(street, "front_camera", tmp_path / "s1.mp4", times_us=times, keep=("depth",))
+    assert os.listdir(tmp_path / "s1") == ["scene.usda"]
+    assert not (tmp_path / "s1.mp4").exists()
+
+
 def test_frames_are_finished_on_their_way(street, tmp_path):
     def invert(frames):
         for frame in frames:
