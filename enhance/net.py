@@ -25,6 +25,7 @@ from enhance.palette import LUMA, RegionColour
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
+SHUT_TRAINING, SHUT_TOLD, SHUT_ALONE = 0.1, 0.5, 1.0  # see hard_gate; the latter two chosen on training clips, for clean frames' sake
 MASK_CHANNELS = 2  # the mask, and whether there is one
 
 
@@ -190,12 +191,12 @@ def colour_change(rgb: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor
     return torch.addcmul(a, rgb, b + c * rgb) + d * (luma - rgb)
 
 
-def hard_gate(logits: torch.Tensor) -> torch.Tensor:
-    """A gate in 0..1 that reaches both ends exactly: a stretched sigmoid, clamped.
+def hard_gate(logits: torch.Tensor, shut: float | torch.Tensor = SHUT_TRAINING) -> torch.Tensor:
+    """A gate in 0..1 that closes exactly: the sigmoid stretched so that it is 0 up to shut / (1 + shut).
 
     Its gradient ignores the clamp, or a closed gate would never open again.
     """
-    soft = torch.sigmoid(logits) * 1.2 - 0.1
+    soft = torch.sigmoid(logits) * (1 + shut) - shut
     return soft + (soft.clamp(0, 1) - soft).detach() if torch.is_grad_enabled() else soft.clamp(0, 1)
 
 
@@ -258,7 +259,8 @@ class Net(nn.Module):
             region = (2 * torch.sigmoid(logits[thin]) - 1).clamp_min(0)
             whole = self.region_colour(rgb[thin], region) * (region.sum((2, 3)) / 20).clamp_max(1)
         change = colour_change(rgb.float(), coefficients.float() + whole[:, :, None, None]) + residual.float()
-        return Enhanced(rgb + hard_gate(logits) * change, enhanced.float(), logits, rgb + change)
+        shut = SHUT_TRAINING if torch.is_grad_enabled() else SHUT_ALONE + (SHUT_TOLD - SHUT_ALONE) * known
+        return Enhanced(rgb + hard_gate(logits, shut) * change, enhanced.float(), logits, rgb + change)
 
     def _history(self, latents: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Tokens of the history `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""
