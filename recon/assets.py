@@ -78,47 +78,64 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
     for actor in scene.actors:
         cut = within_box(actor.asset.gaussians, actor.asset.size)
-        views, near = seen(scene, actor.trajectory, float(actor.asset.size[2]))
-        yield _judged(cut, actor.asset, share | {"track": actor.track, "views": views, "moved": True}, near)
+        sight = seen(scene, actor.trajectory, actor.asset.size)
+        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True}, sight)
     for entry in scene.meta.get("parked", []):
         world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
         size = torch.tensor(entry["size"], dtype=torch.float64)
         if size.max() <= 0:
             continue
         cut = within_box(moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size), size)
-        views, near = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), float(size[2]))
+        sight = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), size)
         asset = Asset(cut, size, entry["label"], scene.model)
-        yield _judged(cut, asset, share | {"track": entry["track"], "views": views, "moved": False}, near)
+        yield _judged(cut, asset, share | {"track": entry["track"], "moved": False}, sight)
 
 
-def seen(scene: Scene, box: Trajectory, height: float) -> tuple[int, float]:
-    """In how many frames of all cameras the middle of a box is in view within `FARTHEST`, and metres to the nearest camera then."""
-    middle = torch.tensor([0.0, 0.0, height / 2, 1.0], dtype=torch.float64)
-    count, nearest = 0, math.inf
+@dataclass(frozen=True)
+class Sight:
+    """How an object was seen: frames of all cameras with its middle in view within `FARTHEST`, metres to the nearest camera then,
+    and how large its left and right sides appeared, summed over those frames (solid angle in parts of the side's area)."""
+
+    views: int
+    nearest: float
+    left: float
+    right: float
+
+
+def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
+    """How the cameras of a scene saw a box `[length, width, height]`."""
+    middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
+    views, nearest, sides = 0, math.inf, [0.0, 0.0]
     for name, camera in scene.rig.items():
         for t in scene.frame_times(name).tolist():
             if not (box.covers(t) and scene.ego.covers(t)):
                 continue
-            x, y, z, _ = (inverse(scene.ego.at(t) @ camera.body_from_cam) @ box.at(t) @ middle).tolist()
+            cam_from_box = inverse(scene.ego.at(t) @ camera.body_from_cam) @ box.at(t)
+            x, y, z, _ = (cam_from_box @ middle).tolist()
             if z < 0.5:
                 continue
             u, v = camera.lens.fx * x / z + camera.lens.cx, camera.lens.fy * y / z + camera.lens.cy
             if 0 <= u < camera.width and 0 <= v < camera.height:
-                nearest = min(nearest, math.hypot(x, y, z))
-                count += math.hypot(x, y, z) <= FARTHEST
-    return count, nearest
+                away = math.hypot(x, y, z)
+                nearest = min(nearest, away)
+                if away <= FARTHEST:
+                    views += 1
+                    beside = float(inverse(cam_from_box)[1, 3])
+                    sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / away**3
+    return Sight(views, nearest, *sides)
 
 
-def _judged(cut: Gaussians, asset: Asset, meta: dict, near: float) -> Candidate:
+def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate:
     flaw = ""
-    if meta["views"] < FEWEST_VIEWS:
-        flaw = f"{meta['views']} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
+    if sight.views < FEWEST_VIEWS:
+        flaw = f"{sight.views} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
-    whole, mirrored = (completed(cut) if not flaw else (cut, False))
+    whole, mirrored = (completed(cut, sight.left, sight.right) if not flaw else (cut, False))
     if not flaw and len(whole) < FEWEST_SPLATS:
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
-    meta = meta | {"mirrored": mirrored, "nearest_m": round(near, 2) if math.isfinite(near) else None}
+    near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
+    meta = meta | {"views": sight.views, "mirrored": mirrored, "nearest_m": near}
     return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw)
 
 
@@ -171,15 +188,15 @@ def turned(sh: torch.Tensor, transform: torch.Tensor) -> torch.Tensor:
     return torch.einsum("kj,njc->nkc", matrix.to(sh), sh)
 
 
-def completed(gaussians: Gaussians) -> tuple[Gaussians, bool]:
-    """A vehicle seen from one side gets that half's mirror image for the other, and whether that was done.
+def completed(gaussians: Gaussians, left: float, right: float) -> tuple[Gaussians, bool]:
+    """An object whose sides were seen as unlike as `left` and `right` gets the better half's mirror image for the other half.
+
+    Returns whether that was done, too: where one side was seen less than a third as well as the other.
 
     Cameras pass a parked car on one side only; cars, trucks and people are near enough symmetric about their xz plane.
     """
     y = gaussians.means[:, 1]
-    weight = torch.sigmoid(gaussians.logit_opacities) * (2 * gaussians.log_scales.sum(1) / 3).exp()
-    left, right = float(weight[y > 0].sum()), float(weight[y < 0].sum())
-    if min(left, right) > 0.6 * max(left, right):
+    if min(left, right) >= max(left, right) / 3:
         return gaussians, False
     half = gaussians.select(y >= 0 if left > right else y <= 0)
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))

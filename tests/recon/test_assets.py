@@ -50,14 +50,14 @@ def test_the_road_faint_and_wide_splats_stay_behind():
 def test_a_car_seen_from_one_side_is_completed_by_its_mirror_image():
     half = body()
     half = half.select(half.means[:, 1] > 0.1)
-    whole, mirrored = completed(half)
+    whole, mirrored = completed(half, 1.0, 0.1)
     assert mirrored and len(whole) == 2 * len(half)
     flip = torch.tensor([1.0, -1, 1])
     there = evaluate(whole.sh[len(half) :], torch.nn.functional.normalize(torch.tensor([[1.0, -2, 0.5]]), dim=1).expand(len(half), 3))
     here = evaluate(half.sh, torch.nn.functional.normalize(torch.tensor([[1.0, 2, 0.5]]), dim=1).expand(len(half), 3))
     torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(whole.means[len(half) :], half.means * flip)
-    same, untouched = completed(body())
+    same, untouched = completed(body(), 1.0, 0.5)
     assert not untouched and len(same) == len(body())
 
 
@@ -66,7 +66,7 @@ def test_a_mirrored_picture_is_the_picture_of_the_mirrored_car():
 
     half = body()
     half = half.select(half.means[:, 1] > 0.1)
-    mirror = completed(half)[0].select(torch.arange(len(half), 2 * len(half)))
+    mirror = completed(half, 1.0, 0.1)[0].select(torch.arange(len(half), 2 * len(half)))
     centre = torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
     views = [looking_at(centre, torch.tensor([-5.0, side, 2.0], dtype=torch.float64), 96, 72) for side in (4.0, -4.0)]
     ours, theirs = rasterize(half, views[0]).rgb, rasterize(mirror, views[1]).rgb
