@@ -147,11 +147,17 @@ def _lines(key: str, value) -> Iterator[str]:
         for i, row in enumerate(value):
             yield (label if i == 0 else " " * len(label)) + "  ".join(_cell(k, v) for k, v in row.items() if _cell(k, v))
     elif isinstance(value, dict):
-        yield label + "  ".join(f"{k} {v}" for k, v in value.items())
+        yield label + "  ".join(f"{k} {_brief(v)}" for k, v in value.items())
     elif isinstance(value, list):
         yield label + ", ".join(str(v) for v in value)
     else:
         yield label + str(value)
+
+
+def _brief(value) -> str:
+    """A value of a dict on one line with others: of a list of records only how many; --json has them all."""
+    records = isinstance(value, list) and any(isinstance(v, dict) for v in value)
+    return f"({len(value)} entries, see --json)" if records else str(value)
 
 
 def _cell(key: str, value) -> str:

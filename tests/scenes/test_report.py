@@ -53,6 +53,11 @@ def test_a_databank_an_asset_and_splats_are_described(bank, tmp_path):
     assert told["bounds"] == [gaussians(7).means.amin(0).tolist(), gaussians(7).means.amax(0).tolist()]
 
 
+def test_records_in_the_metadata_are_counted_not_spelt_out():
+    meta = {"parked": [{"track": "veh_1", "size": [5.2, 2.0, 1.9]}] * 60, "world_origin": [0.0, 0.0]}
+    assert summary({"meta": meta}) == ["meta           parked (60 entries, see --json)  world_origin [0.0, 0.0]"]
+
+
 def test_an_empty_splat_file_is_described(tmp_path):
     save(Gaussians.empty(), tmp_path / "a.ply")
     assert describe(tmp_path / "a.ply")["bounds"] is None and text(tmp_path / "a.ply")
