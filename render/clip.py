@@ -67,13 +67,15 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
     """
     have = scene.frame_times(camera)
     first, last = int(have[0]), int(have[-1])
+    has = f"{camera} has {len(have)} frames over {(last - first) / 1e6:.3g}s"
+    if start_us < 0:
+        raise ValueError(f"--start {start_us / 1e6:g}s lies before the first frame: {has}; begin at 0s or later")
     begin = first + start_us
     end = last if duration_us is None else min(begin + duration_us - 1, last)
     times = have[(have >= begin) & (have <= end)] if fps is None else _evenly(begin, end, fps)
     if len(times) == 0:
-        span = f"{(last - first) / 1e6:.3g}s"
         asked = f"--start {start_us / 1e6:g}s" + ("" if duration_us is None else f" --duration {duration_us / 1e6:g}s")
-        raise ValueError(f"{asked} leaves no frame: {camera} has {len(have)} frames over {span}; start before that and last at least 100ms")
+        raise ValueError(f"{asked} leaves no frame: {has}; start before that and last at least 100ms")
     return times
 
 

@@ -34,6 +34,9 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     trajectory file is bad.
     """
     start_us = int(scene.ego.times_us[0]) if start_us is None else start_us
+    if not scene.ego.covers(start_us):
+        after, lasts = ((t - int(scene.ego.times_us[0])) / 1e6 for t in (start_us, int(scene.ego.times_us[-1])))
+        raise ValueError(f"{placement.asset} cannot be placed {after:g}s after the drive's first moment; the drive lasts {lasts:.3g}s")
     body = scene.ego.at(start_us)
     if placement.trajectory is not None:
         times, xy, headings = _along(read_waypoints(placement.trajectory), body, start_us)

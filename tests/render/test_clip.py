@@ -100,3 +100,8 @@ def test_a_clip_can_run_at_another_rate(street):
 def test_a_clip_without_frames_is_refused(street, start, duration):
     with pytest.raises(ValueError, match="8 frames over 0.7s"):
         clip_times(street, "front_camera", start, duration)
+
+
+def test_a_clip_cannot_begin_before_the_first_frame_at_any_rate(street):
+    with pytest.raises(ValueError, match="--start -1s lies before the first frame"):
+        clip_times(street, "front_camera", -1_000_000, 5_000_000, fps=20)

@@ -100,5 +100,5 @@ def test_yaw_goes_the_shorter_way_round(street, tmp_path):
 
 
 def test_a_start_off_the_drive_is_refused(street):
-    with pytest.raises(ValueError, match="outside the trajectory"):
+    with pytest.raises(ValueError, match="car cannot be placed 10s after the drive's first moment; the drive lasts 0.8s"):
         insert(street, car(), Placement("car", 10, 0), start_us=START_US + 10_000_000)
