@@ -13,6 +13,7 @@ from render.frame_types import Frame, RenderConfig
 from render.launch import stage
 from render.outputs import check_outputs
 from scenes.camera import Camera
+from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import inverse
 
@@ -63,6 +64,8 @@ def rasterize(
     outputs = check_outputs(outputs)
     placed = _as_placed(splats)
     _check(placed, camera, outputs, flow_to, model)
+    if background is not None:
+        check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
 
     flows = any(o.startswith("flow_") for o in outputs)
     settings = Settings(
