@@ -24,6 +24,10 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
         yield partial
         partial.chmod(0o666 & ~_umask())  # mkstemp's 0600 would outlive the rename
         os.replace(partial, path)
+    except OSError as error:
+        if error.filename == str(partial):
+            error.filename = str(path)  # a full disk is told with the name that the user knows
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

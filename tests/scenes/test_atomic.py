@@ -32,6 +32,12 @@ def test_a_broken_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
     assert target.read_text() == "old" and listing(tmp_path) == ["a.json"]
 
 
+def test_a_write_that_fails_names_the_target(tmp_path):
+    with pytest.raises(OSError) as caught, atomic_file(tmp_path / "a.mp4") as partial:
+        raise OSError(errno.ENOSPC, "No space left on device", str(partial))
+    assert caught.value.filename == str(tmp_path / "a.mp4")
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
 def test_a_broken_folder_leaves_the_old_one_and_nothing_else(tmp_path, error):
     target = tmp_path / "s1"
