@@ -117,12 +117,13 @@ class PairSet:
         self.shards: list[Shard] = []
         for folder in map(Path, folders):
             if not folder.is_dir():
-                raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE -o {folder}")
+                raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
             for file in sorted(folder.glob("*/*.json")):
                 self.shards.append(_read_meta(file))
         if not self.shards:
             raise ValueError(
-                f"no pairs in {', '.join(map(str, folders))}; make some with: sidestep pairs SCENE -o {folders[0] if folders else 'pairs'}"
+                f"no pairs in {', '.join(map(str, folders))}; "
+                f"make some with: sidestep pairs SCENE --data DRIVE -o {folders[0] if folders else 'pairs'}"
             )
 
     def of(self, kind: str | None = None, split: str | None = None) -> list[Shard]:
