@@ -36,20 +36,17 @@ class Frame:
     """The view of one camera. What was not asked for is None and was not computed.
 
     rgb `[H, W, 3]` display-referred, premultiplied over black where no background was given, not clamped above 1;
-    alpha `[H, W]`; depth `[H, W]` z in metres, inf where alpha is 0; normal `[H, W, 3]`;
-    flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame; instance `[H, W]` int32;
-    need `[H, W]` how much a pixel asks for repair, 0 to 1.
+    alpha `[H, W]`; depth `[H, W]` z in metres, inf where alpha is 0;
+    flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame; instance `[H, W]` int32.
     """
 
     camera: Camera
     rgb: torch.Tensor | None = None
     alpha: torch.Tensor | None = None
     depth: torch.Tensor | None = None
-    normal: torch.Tensor | None = None
     flow_prev: torch.Tensor | None = None
     flow_next: torch.Tensor | None = None
     instance: torch.Tensor | None = None
-    need: torch.Tensor | None = None
 
     def outputs(self) -> dict[str, torch.Tensor]:
         """The outputs that were computed, by name."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from scenes.names import nearest
 
-OUTPUTS = ("rgb", "alpha", "depth", "normal", "flow_prev", "flow_next", "instance", "need")
+OUTPUTS = ("rgb", "alpha", "depth", "flow_prev", "flow_next", "instance")
 
 
 def check_outputs(outputs: Iterable[str]) -> tuple[str, ...]:

@@ -17,8 +17,6 @@ from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import inverse
 
-COMPUTED = ("rgb", "alpha", "depth", "instance", "flow_prev", "flow_next")
-
 
 @overload
 def rasterize(
@@ -118,8 +116,6 @@ def _as_placed(splats) -> list[Placed]:
 
 def _check(placed, camera, outputs, flow_to, model) -> None:
     for name in outputs:
-        if name not in COMPUTED:
-            raise ValueError(f'output "{name}" is not computed yet; there are {", ".join(COMPUTED)}')
         if name.startswith("flow_") and name.removeprefix("flow_") not in (flow_to or {}):
             raise ValueError(f'output "{name}" needs flow_to={{"{name.removeprefix("flow_")}": (placed, camera)}}')
     if model.response != "conic":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,7 @@ def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]
         raise ValueError(f"{path} holds {_kind(thing)}, not a scene; give a folder that sidestep recon wrote")
     if not len(thing.background.gaussians) and not thing.actors:
         raise ValueError(f"{path} is empty: it has no splats and no actors; reconstruct it again with sidestep recon")
+    thing = replace(thing, meta={**thing.meta, "path": str(path)})  # errors name the folder that the user named
     return thing, [dropped(dropping.count)] if dropping.count else []
 
 

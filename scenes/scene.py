@@ -46,7 +46,7 @@ class Scene:
     def rig_camera(self, name: str) -> RigCamera:
         """The rig's camera of that name; ValueError naming the nearest where there is none."""
         if name not in self.rig:
-            raise ValueError(unknown("camera", name, str(self.meta.get("name", "the scene")), self.rig))
+            raise ValueError(unknown("camera", name, str(self.meta.get("path", self.meta.get("name", "the scene"))), self.rig))
         return self.rig[name]
 
     def camera(self, name: str, time_us: int, ego: Trajectory | None = None) -> Camera:

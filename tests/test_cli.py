@@ -170,7 +170,7 @@ DATA = [
     ([*SHOOT, "--insert", "van/2@5m,0m", "--databank", "bank"], "it has car/0001, van/0001. Did you mean van/0001?"),
     ([*SHOOT, "--insert", "car/0001@5m,0m"], "databank is not a databank"),
     ([*SHOOT, "--insert", "car/0001@trajectory=t.csv", "--databank", "bank"], "t.csv"),
-    ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "outside the trajectory"),
+    ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
     (["assets", "show", "cra/0001", "--databank", "bank"], "Did you mean car/0001?"),
     (["enhance", "street/metadata.json", "-o", "x.mp4"], "street/metadata.json cannot be decoded as video"),
     (["enhance", "gone.mp4", "-o", "x.mp4"], "gone.mp4"),
