@@ -156,7 +156,6 @@ class Rasterize(torch.autograd.Function):
                 settings.crop(grads[4]).copy_(g_z)
                 settings.crop(grads[5]).copy_(g_weights)
             _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t, slots)
-            base = 0
             for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
                 out = [torch.empty_like(f) for f in group]
                 chunk = POSE_CHUNK if device.type == "cpu" else 1
@@ -166,7 +165,6 @@ class Rasterize(torch.autograd.Function):
                 run(project_backward, parts, [*args, *_arrays(out), view(shared, float)], device)
                 outputs += out
                 g_uniform.append(shared)
-                base += size
         if not any(ctx.needs_input_grad[1:3]):
             return None, None, None, *outputs
         sums = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
