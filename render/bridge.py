@@ -81,7 +81,7 @@ def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
     margin = 4 * math.sqrt(settings.model.dilation) + 1
     v.left, v.right = -(v.cx + margin) / v.fx, (settings.width - v.cx + margin) / v.fx
     v.top, v.bottom = -(v.cy + margin) / v.fy, (settings.height - v.cy + margin) / v.fy
-    v.width, v.height, v.tiles_x, v.tiles_y = settings.width, settings.height, settings.tiles_x, settings.tiles_y
+    v.tiles_x, v.tiles_y = settings.tiles_x, settings.tiles_y
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
     v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
     return v

@@ -44,8 +44,6 @@ class View:
     clamp_right: float
     clamp_top: float
     clamp_bottom: float
-    width: int
-    height: int
     tiles_x: int
     tiles_y: int
     dilation: float
