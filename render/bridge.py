@@ -64,6 +64,16 @@ class Settings:
     def alpha_max(self) -> float:
         return min(self.config.alpha_max, 1 - 1e-6)
 
+    @property
+    def termination(self) -> float:
+        """Transmittance below which a pixel is done. Not 0: backward divides by what is left, so nothing may underflow."""
+        return max(self.config.termination, 1e-10)
+
+    @property
+    def early(self) -> int:
+        """Entries between two looks for pixels that are done: (1 - alpha_max)^early may be 1e-24 at least."""
+        return 8 if self.alpha_max <= 0.999 else 4
+
     def planes(self, count: int, device) -> torch.Tensor:
         """Row-major planes `[count, rows, pitch * 16]`, not initialised: the kernels write every pixel of every tile."""
         return torch.empty(count, self.tiles_y * TILE, self.pitch * TILE, device=device)
@@ -128,9 +138,9 @@ class Rasterize(torch.autograd.Function):
             uniforms.append(uniform)
             run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
         lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y, counting=device.type == "cpu")
-        planes, last = _composite(settings, lists, records)
+        planes, ends = _composite(settings, lists, records)
         ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
-        ctx.records, ctx.counts, ctx.last, ctx.final_t = records, counts, last, planes[0]
+        ctx.records, ctx.counts, ctx.ends, ctx.final_t = records, counts, ends, planes[0]
         ctx.like_pose, ctx.like_lens = cam_from_local.new_empty(0), lens.new_empty(0)
         rgb = settings.crop(planes[1:4])
         alpha = 1 - settings.crop(planes[0])
@@ -155,7 +165,7 @@ class Rasterize(torch.autograd.Function):
             if settings.depth:
                 settings.crop(grads[4]).copy_(g_z)
                 settings.crop(grads[5]).copy_(g_weights)
-            _composite_backward(settings, lists, ctx.records, grads, ctx.last, ctx.final_t, slots)
+            _composite_backward(settings, lists, ctx.records, grads, ctx.ends, ctx.final_t, slots)
             for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
                 out = [torch.empty_like(f) for f in group]
                 chunk = POSE_CHUNK if device.type == "cpu" else 1
@@ -179,27 +189,29 @@ def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
 
 
 def _composite(settings: Settings, lists: TileLists, records: torch.Tensor):
-    """Planes (T, r, g, b[, w z, w][, instance]) and one past the last composited entry of each row (CPU) or pixel (CUDA)."""
+    """Planes (T, r, g, b[, w z, w][, instance]) and where compositing ended: one past the last entry of each row, and where in the
+    tile's list each pixel went dark (CPU); one past the last entry of each pixel (CUDA)."""
     device, tiles = records.device, settings.tiles_x * settings.tiles_y
     planes = settings.planes(7 if settings.instance else 6 if settings.depth else 4, device)
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(records, float)]
-    limits = [settings.alpha_max, settings.config.termination]
+    limits = [settings.alpha_max, settings.termination]
     if device.type == "cuda":
         last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
         out = [view(planes[min(i, len(planes) - 1)], float) for i in range(7)]
         kernel = composite_blocks(settings.depth, settings.instance, TILE)
         run_blocks(kernel, tiles, TILE * TILE, [*lists_of, settings.tiles_x, *limits, *out, view(last, int)], device)
-        return planes, last
+        return planes, (last,)
     last = torch.empty(planes.shape[1], settings.pitch, dtype=torch.int32)
+    dark_at = settings.planes(1, device)[0]
     rows = _lane_planes(settings, planes)
     out = [rows[min(i, len(rows) - 1)] for i in range(7)]
     grid = [settings.tiles_x, tiles, BANDS]
-    kernel = composite(settings.depth, settings.instance, settings.squarings)
-    run(kernel, BANDS, [*lists_of, *grid, *limits, *_working(), *out, view(last, int)], device)
-    return planes, last
+    kernel = composite(settings.depth, settings.instance, settings.squarings, settings.early)
+    run(kernel, BANDS, [*lists_of, *grid, *limits, *_working(), *out, view(last, int), *_lane_planes(settings, dark_at[None])], device)
+    return planes, (last, dark_at)
 
 
-def _composite_backward(settings: Settings, lists: TileLists, records, grads, last, final_t, slots) -> None:
+def _composite_backward(settings: Settings, lists: TileLists, records, grads, ends, final_t, slots) -> None:
     """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, w z, w])."""
     device, tiles = records.device, settings.tiles_x * settings.tiles_y
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float)]
@@ -208,14 +220,15 @@ def _composite_backward(settings: Settings, lists: TileLists, records, grads, la
     z, w = extra or (r, r)
     if on_cuda:
         kernel = composite_blocks_gradient(settings.depth, TILE)
-        args = [*lists_of, settings.tiles_x, settings.alpha_max, r, g, b, z, w, view(last, int), view(final_t, float), t_gradient]
+        args = [*lists_of, settings.tiles_x, settings.alpha_max, r, g, b, z, w, view(ends[0], int), view(final_t, float), t_gradient]
         run_blocks(kernel, tiles, TILE * TILE, [*args, view(slots, float)], device)
         return
-    args = [*lists_of, settings.tiles_x, tiles, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(last, int)]
-    kernel = composite_gradient(settings.depth, settings.squarings)
-    run(kernel, BANDS, [*args, _lane_planes(settings, final_t[None])[0], t_gradient, view(slots, float)], device)
+    args = [*lists_of, settings.tiles_x, tiles, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(ends[0], int)]
+    kernel = composite_gradient(settings.depth, settings.squarings, settings.early)
+    lanes_of_pixels = [*_lane_planes(settings, ends[1][None]), *_lane_planes(settings, final_t[None])]
+    run(kernel, BANDS, [*args, *lanes_of_pixels, t_gradient, view(slots, float)], device)
 
 
 def _working() -> list:
     """The column ramp, and working rows of the tile at hand for each band."""
-    return [view(torch.arange(TILE, dtype=torch.float32)[None], lanes), view(torch.empty(BANDS, 8, TILE, TILE), lanes)]
+    return [view(torch.arange(TILE, dtype=torch.float32)[None], lanes), view(torch.empty(BANDS, 10, TILE, TILE), lanes)]

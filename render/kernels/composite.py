@@ -4,6 +4,10 @@ Planes are `[rows, tiles_x]` lane vectors: plain row-major images whose width is
 its rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row would
 be another page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to
 front from a stored last entry per row: the front-to-back form (total minus prefix) cancels in float32.
+
+Backward finds each transmittance by dividing the final one, so none may underflow. A lane whose neighbours see far may meet any
+number of splats after it is dark. So every `early` entries dark lanes are taken out: their transmittance is kept aside with the
+place in the list, and goes on as 0, which costs nothing an entry; backward brings it back at that place.
 """
 
 from functools import cache
@@ -45,7 +49,7 @@ from render.kernels.types import (
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
 ROLLED = OPTIONS | {"max_unroll": 8}  # loops over a tile's 16 rows stay loops: unrolled they compile ten times as long and run no faster
-EARLY = wp.constant(16)  # entries between two looks at whether the whole tile has terminated
+NEVER = wp.constant(16777216.0)  # the place in a tile's list of a lane that never went dark; floats count exactly up to it
 
 
 @wp.func
@@ -85,8 +89,11 @@ def row_range(records: wp.array2d[float], i: int, x0: float, y0: float):
 
 
 @cache
-def composite(depth: bool, instance: bool, squarings: int):
-    """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10."""
+def composite(depth: bool, instance: bool, squarings: int, early: int):
+    """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10.
+
+    early: entries between two looks for lanes that went dark, few enough that alpha_max cannot take one from there to underflow.
+    """
     scale = 0.5**squarings
     root = scale**0.5
 
@@ -97,10 +104,12 @@ def composite(depth: bool, instance: bool, squarings: int):
         columns: wp.array[lanes], state: wp.array3d[lanes],
         out_t: wp.array2d[lanes], out_r: wp.array2d[lanes], out_g: wp.array2d[lanes], out_b: wp.array2d[lanes],
         out_z: wp.array2d[lanes], out_w: wp.array2d[lanes], out_instance: wp.array2d[lanes], last: wp.array2d[int],
+        dark_at: wp.array2d[lanes],
         first: int,
     ):  # fmt: skip
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
-        state `[bands, 8, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight.
+        state `[bands, 10, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight, where in the tile's list
+        the lane went dark, its transmittance then.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -116,6 +125,8 @@ def composite(depth: bool, instance: bool, squarings: int):
                     state[band, p, r] = lanes(0.0)
                 if wp.static(instance):
                     state[band, 6, r] = lanes(-1.0)
+                state[band, 8, r] = lanes(NEVER)
+                state[band, 9, r] = lanes(0.0)
                 last[row0 + r, tx] = start
             row_max = lanes(1.0)
             stop = tile_starts[tile + 1]
@@ -123,10 +134,16 @@ def composite(depth: bool, instance: bool, squarings: int):
             if stop > start:
                 next_rows = row_range(records, ids[start], x0, y0)
             for n in range(start, stop):
-                if (n - start) % EARLY == EARLY - 1:
+                if (n - start) % wp.static(early) == wp.static(early - 1):
                     for r in range(TILE):
-                        row_max[r] = wp.max(state[band, 0, r])
-                    if wp.max(row_max) < termination:
+                        seen = state[band, 0, r]
+                        dark = below(termination, seen)
+                        kept = wp.cw_mul(dark, seen)
+                        state[band, 8, r] = wp.min(state[band, 8, r], lanes(NEVER) + dark * (float(n - start) - NEVER))
+                        state[band, 9, r] = state[band, 9, r] + kept
+                        state[band, 0, r] = seen - kept
+                        row_max[r] = wp.max(seen - kept)
+                    if wp.max(row_max) <= 0.0:
                         break
                 i = ids[n]
                 px = records[i, X] - x0
@@ -144,7 +161,7 @@ def composite(depth: bool, instance: bool, squarings: int):
                 # length is mispredicted, and then only what came before it is already done
                 next_rows = row_range(records, ids[wp.min(n + 1, stop - 1)], x0, y0)
                 for r in range(rows[0], rows[1] + 1):
-                    if row_max[r] >= termination:
+                    if row_max[r] > 0.0:
                         dy = float(r) - py
                         u = column * k - lanes(k * (px + m * dy))
                         z = wp.cw_mul(u, u) + lanes(h * dy * dy)
@@ -167,7 +184,8 @@ def composite(depth: bool, instance: bool, squarings: int):
                         state[band, 0, r] = t - w
                         last[row0 + r, tx] = n + 1
             for r in range(TILE):
-                out_t[row0 + r, tx] = state[band, 0, r]
+                out_t[row0 + r, tx] = state[band, 0, r] + state[band, 9, r]
+                dark_at[row0 + r, tx] = state[band, 8, r]
                 out_r[row0 + r, tx] = state[band, 1, r]
                 out_g[row0 + r, tx] = state[band, 2, r]
                 out_b[row0 + r, tx] = state[band, 3, r]
@@ -181,7 +199,7 @@ def composite(depth: bool, instance: bool, squarings: int):
 
 
 @cache
-def composite_gradient(depth: bool, squarings: int):
+def composite_gradient(depth: bool, squarings: int, early: int):
     """The backward kernel: writes one gradient slot for every entry of every tile, on every path."""
     scale = 0.5**squarings
     root = scale**0.5
@@ -192,13 +210,14 @@ def composite_gradient(depth: bool, squarings: int):
         tiles_x: int, tiles: int, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
         g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes], g_w: wp.array2d[lanes],
-        last: wp.array2d[int], final_t: wp.array2d[lanes], t_gradient: wp.array2d[lanes], slots: wp.array2d[float],
+        last: wp.array2d[int], dark_at: wp.array2d[lanes], final_t: wp.array2d[lanes], t_gradient: wp.array2d[lanes],
+        slots: wp.array2d[float],
         first: int,
     ):  # fmt: skip
         """With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j: dL/da_i = T_i d_i - rest_i / (1 - a_i).
 
         state `[bands, 8, 16]`: transmittance so far, rest (both start from the end: final transmittance, and that times its own
-        gradient), then the gradients of red, green, blue, sum of w z, sum of w.
+        gradient; both 0 where the lane was dark), then the gradients of red, green, blue, sum of w z, sum of w, where it went dark.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -212,14 +231,18 @@ def composite_gradient(depth: bool, squarings: int):
             stop = start
             for r in range(TILE):
                 stop = wp.max(stop, last[row0 + r, tx])
-                state[band, 0, r] = final_t[row0 + r, tx]
-                state[band, 1, r] = t_gradient[row0 + r, tx]
+            for r in range(TILE):
+                since = dark_at[row0 + r, tx]
+                lit = wp.min(wp.max(since - lanes(float(stop - start - 1)), lanes(0.0)), one)
+                state[band, 0, r] = wp.cw_mul(lit, final_t[row0 + r, tx])
+                state[band, 1, r] = wp.cw_mul(lit, t_gradient[row0 + r, tx])
                 state[band, 2, r] = g_r[row0 + r, tx]
                 state[band, 3, r] = g_g[row0 + r, tx]
                 state[band, 4, r] = g_b[row0 + r, tx]
                 if wp.static(depth):
                     state[band, 5, r] = g_z[row0 + r, tx]
                     state[band, 6, r] = g_w[row0 + r, tx]
+                state[band, 7, r] = since
             for n in range(stop, tile_starts[tile + 1]):
                 slot = slot_of[n]
                 for c in range(GRADIENTS):
@@ -229,6 +252,12 @@ def composite_gradient(depth: bool, squarings: int):
                 next_rows = row_range(records, ids[stop - 1], x0, y0)
             for back in range(stop - start):
                 n = stop - 1 - back
+                if (n + 1 - start) % wp.static(early) == wp.static(early - 1) and back > 0:
+                    for r in range(TILE):
+                        off = state[band, 7, r] - lanes(float(n + 1 - start))
+                        here = one - wp.min(wp.max(off, lanes(0.0) - off), one)
+                        state[band, 0, r] = state[band, 0, r] + wp.cw_mul(here, final_t[row0 + r, tx])
+                        state[band, 1, r] = state[band, 1, r] + wp.cw_mul(here, t_gradient[row0 + r, tx])
                 i = ids[n]
                 px = records[i, X] - x0
                 py = records[i, Y] - y0

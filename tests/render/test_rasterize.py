@@ -314,3 +314,34 @@ def test_a_tile_lists_a_splat_exactly_when_one_of_its_pixels_shows_it(seed):
         reached += int((by_tile < s_max[i]).sum())
         assert (listed[i] | (by_tile >= s_max[i])).all(), f"splat {int(i)} is missing from a tile that it reaches"
     assert total <= 1.1 * reached + 20, "tiles are listed that the splats do not reach"
+
+
+@pytest.mark.parametrize("alpha_max", [0.999, 0.9999])
+def test_pixels_behind_any_number_of_opaque_splats_keep_their_gradients(alpha_max):
+    """Left, eighty opaque walls one behind the other: transmittance goes far below the smallest float. Right, the same rows see far."""
+    walls = random_splats(80, 20)
+    depth = torch.linspace(-1, 1, 80)[:, None]
+    means = torch.cat([torch.tensor([[-1.2, 0.0]]).expand(80, 2) + 0.1 * walls.means[:, :2], depth], 1)
+    walls = replace(walls, means=means, log_scales=torch.full((80, 3), -0.4), logit_opacities=torch.linspace(2.5, 9.0, 80))
+    far = random_splats(40, 21)
+    placed = [Placed(walls, translation(0, 0, 4)), Placed(far, translation(0.8, 0, 8), instance=1)]
+    camera = Camera(Pinhole(30.0, 30.0, 16.0, 8.0), 32, 16, torch.eye(4, dtype=torch.float64))
+    g = torch.randn(16, 32, 3, generator=torch.Generator().manual_seed(3))
+    config = replace(EXACT, alpha_max=alpha_max)
+
+    def leaves(p):
+        return replace(p, gaussians=p.gaussians.map(lambda t: t.clone().requires_grad_()))
+
+    ours = [leaves(p) for p in placed]
+    frame = rasterize(ours, camera, config=config)
+    left, right = (1 - frame.alpha.detach())[8, [2, 30]].tolist()
+    assert left < 1e-9 and right > 1e-3
+    ((frame.rgb * g).sum() + frame.alpha.square().sum()).backward()
+    truth = oracle.as_oracle(placed)
+    rgb, alpha, *_ = oracle.render(truth, camera, SplatModel(), alpha_max=alpha_max)
+    ((rgb * g).sum() + alpha.square().sum()).backward()
+    for p, (fields, _, _) in zip(ours, truth, strict=True):
+        for name, tensor in p.gaussians.tensors().items():
+            ref = fields[name].grad
+            off = (tensor.grad.double() - ref).abs()
+            assert (off <= 2e-3 * ref.abs() + 1e-5 * ref.abs().max()).all(), (name, float(off.max()), float(ref.abs().max()))
