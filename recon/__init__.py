@@ -2,7 +2,7 @@
 
 import importlib
 
-_HOME = {"Log": "log", "open_log": "readers", "reconstruct": "build", "extract_assets": "assets"}
+_HOME = {"Log": "log", "open_log": "readers", "reconstruct": "build", "stopped_early": "early", "extract_assets": "assets"}
 
 __all__ = sorted(_HOME)
 

@@ -26,6 +26,7 @@ from scenes.sky import Sky, linear_from_srgb
 
 DEFAULT_CAMERAS = ("front_camera", "front_left_camera", "front_right_camera")
 SIZE = (960, 540)
+HELD_OUT = 8
 
 
 def reconstruct(
@@ -35,7 +36,7 @@ def reconstruct(
     start_us: int = 0,
     duration_us: int | None = None,
     size: tuple[int, int] = SIZE,
-    held_out: int = 8,
+    held_out: int = HELD_OUT,
     resume: bool = False,
     config: FitConfig = FitConfig(),  # noqa: B008 - frozen
     half: bool = False,
@@ -56,19 +57,13 @@ def reconstruct(
     if not output.parent.is_dir():
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     began = time.monotonic()
-    names = list(cameras or [n for n in DEFAULT_CAMERAS if n in log.cameras] or list(log.cameras)[:1])
-    span = _span(log, names, start_us, duration_us)
+    names, span = choose(log, cameras, start_us, duration_us)
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)
     saved = load_checkpoint(checkpoint, options) if resume else None
 
-    with Progress("images") as steps:
-        frames = load_frames(log, names, span, size, held_out, steps.step)
-    with Progress("prepare") as steps:
-        coefficients = (config.sh_degree + 1) ** 2
-        start = saved[0] if saved else prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))
-    fit = _fit(frames, start, config)
+    start, fit = begin(log, names, span, size, config, held_out, saved[0] if saved else None)
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
@@ -81,13 +76,40 @@ def reconstruct(
         run(fit, keep, lambda f: steps.step(note=f"loss {f.recent_loss:.4f}  {len(f.splats)} splats"))
     keep()  # the report and the writing below may be interrupted too
     scene = assemble(fit, start, log, {"options": options})
-    rows = held_out_table(scene, frames)
+    rows = held_out_table(scene, fit.frames)
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
     print(table_text(rows), file=sys.stderr)
     save(scene, output, overwrite, half)
     checkpoint.unlink(missing_ok=True)
     return scene
+
+
+def choose(
+    log: Log, cameras: Sequence[str] | None = None, start_us: int = 0, duration_us: int | None = None
+) -> tuple[list[str], tuple[int, int]]:
+    """The cameras to fit, the front ones where None, and the span of time in microseconds. ValueError for what the log has not."""
+    names = list(cameras or [n for n in DEFAULT_CAMERAS if n in log.cameras] or list(log.cameras)[:1])
+    return names, _span(log, names, start_us, duration_us)
+
+
+def begin(
+    log: Log,
+    names: list[str],
+    span: tuple[int, int],
+    size: tuple[int, int],
+    config: FitConfig,
+    held_out: int = HELD_OUT,
+    start: Start | None = None,
+) -> tuple[Start, Fit]:
+    """What a fit starts from, prepared unless it is given, and the fit before its first step."""
+    with Progress("images") as steps:
+        frames = load_frames(log, names, span, size, held_out, steps.step)
+    if start is None:
+        with Progress("prepare") as steps:
+            coefficients = (config.sh_degree + 1) ** 2
+            start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))
+    return start, _fit(frames, start, config)
 
 
 def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import fresh
-from scenes.options import Flag, Names, Output, Overwrite, ScenePath, Time, TimeOrAll
+from scenes.options import FitSize, Flag, Names, Output, Overwrite, ScenePath, Time, TimeOrAll
 
 
 @dataclass
@@ -26,6 +26,8 @@ class Recon:
     """Where in the drive to begin."""
     duration: TimeOrAll = None
     """How much of the drive to use."""
+    size: FitSize = None
+    """Size of the pictures that are fitted."""
     resume: Flag = False
     """Go on from where an interrupted run of the same command stopped."""
     overwrite: Overwrite = False
@@ -33,6 +35,7 @@ class Recon:
 
     def run(self) -> None:
         from recon import open_log, reconstruct
+        from recon.build import SIZE
         from scenes.usd_scene import is_scene
 
         fresh(self.output, self.overwrite)
@@ -41,8 +44,8 @@ class Recon:
         log = open_log(self.data)
         try:
             reconstruct(
-                log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration, resume=self.resume,
-                overwrite=self.overwrite,
+                log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
+                size=self.size or SIZE, resume=self.resume, overwrite=self.overwrite,
             )  # fmt: skip
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
