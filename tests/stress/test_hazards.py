@@ -32,7 +32,12 @@ NASTY = st.one_of(
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(NASTY, min_size=60, max_size=60), st.sampled_from(["ewa", "ut"]), st.booleans(), st.sampled_from([(1, 1), (17, 5), (40, 30)]))
+@given(
+    st.lists(NASTY, min_size=60, max_size=60),
+    st.sampled_from(["ewa", "ut"]),
+    st.booleans(),
+    st.sampled_from([(1, 1), (17, 5), (40, 30)]),
+)
 def test_any_numbers_at_all_leave_picture_and_gradients_finite(values, projection, antialias, size):
     n = 60 // 14
     v = torch.tensor(values[: 14 * n], dtype=torch.float32).reshape(n, 14)
