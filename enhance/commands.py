@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from scenes import units
-from scenes.opening import fresh
+from scenes.opening import UsageError, fresh
 from scenes.options import Flag, Names, Output, Overwrite, ScenePath, written
 
 
@@ -30,15 +30,19 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.pairs import make_pairs
+        from recon import open_log, stopped_early
         from render.progress import Progress
+        from scenes import load
 
+        log, scene = open_log(self.data), load(self.scene)
+        early = stopped_early(log, self.output / "early", [name for name in log.cameras if name in scene.rig])
         with Progress("pairs") as steps:
 
             def say(done: int, total: int, name: str) -> None:
                 steps.total = total
                 steps.step(done - steps.done, name)
 
-            make_pairs(self.scene, self.data, self.output, cameras=self.cameras, seed=self.seed, progress=say)
+            make_pairs(scene, log, self.output, cameras=self.cameras, seed=self.seed, progress=say, unfinished=early)
         print(f"wrote {self.output}")
 
 
@@ -46,10 +50,12 @@ class Pairs:
 class Train:
     """Train the enhancer on pairs; Ctrl-C, then --resume, goes on where it stopped."""
 
-    pairs: Positional[Annotated[Path, arg(metavar="PAIRS")]]
-    """Folder that sidestep pairs made."""
+    pairs: Positional[Annotated[tuple[Path, ...], arg(metavar="PAIRS")]]
+    """Folders that sidestep pairs made."""
     output: Output
     """Folder of the training: checkpoint.pt and, at the end, enhancer.safetensors."""
+    photos: tuple[Path, ...] = ()
+    """Folders of images, and videos: further clean pictures."""
     time: Annotated[int, written(units.duration_us, "TIME", "7200s")] = 7_200_000_000
     """How long to train, as 7200s."""
     seed: int = 0
@@ -58,13 +64,19 @@ class Train:
     """Go on from the folder's checkpoint."""
 
     def run(self) -> None:
+        from enhance.shards import PairSet
         from enhance.train import train
         from render.progress import Progress
 
+        if not self.pairs:
+            raise UsageError("give at least one folder of pairs; sidestep pairs makes them")
+        pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:
             say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
             try:
-                weights = train(self.pairs, self.output, minutes=self.time / 60e6, seed=self.seed, resume=self.resume, progress=say)
+                weights = train(
+                    pairs, self.output, minutes=self.time / 60e6, seed=self.seed, resume=self.resume, progress=say, photos=self.photos
+                )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
         print(f"wrote {weights}; use it with --weights {weights}")

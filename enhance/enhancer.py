@@ -8,10 +8,9 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from enhance.autoencoder import STRIDE
 from enhance.net import MULTIPLE, Net
+from enhance.past import Past
 from enhance.precision import autocast, channels_last
-from enhance.warp import carry
 from enhance.weights_file import BUILTIN, load_net
 from render.frame_types import Frame
 from scenes.checks import check_tensor
@@ -19,22 +18,11 @@ from scenes.checks import check_tensor
 
 @dataclass(frozen=True)
 class Memory:
-    """What is remembered between the frames of a clip.
+    """What is remembered between the frames of a clip: their past, the frames' height and width in pixels, and whether they had flow."""
 
-    latents  `[K, 16, h, w]`: the last enhanced latents, newest first, K at most the network's history; where the last frame had them
-    valid    `[K, 1, h, w]`: 1 where those were inside the image
-    size     height and width of the frames in pixels
-    flow     whether the frames came with flow
-    """
-
-    latents: torch.Tensor
-    valid: torch.Tensor
+    past: Past
     size: tuple[int, int]
     flow: bool
-
-    def __post_init__(self):
-        check_tensor("latents", self.latents, ("K", "C", "h", "w"))
-        check_tensor("valid", self.valid, (len(self.latents), 1, *self.latents.shape[-2:]))
 
 
 class Enhancer:
@@ -69,22 +57,13 @@ class Enhancer:
         rgb = rgb.to(self.device, torch.float32).clamp(0, 1)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if mask is None else _pad(mask.to(self.device, torch.float32)[None, None], value=0)
-        latents, valid = self._history(memory, flow, padded.shape[-2:])
+        past = None if memory is None else memory.past
+        if past is not None and flow is not None:
+            past = past.moved(_pad(flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan))
         with autocast(self.device):
-            out = self.net(padded, mask, latents, valid)
-        newest = torch.cat([out.latent, latents[0]])[: self.net.config.history]
-        seen = torch.cat([torch.ones_like(out.latent[:, :1]), valid[0]])[: self.net.config.history]
+            out = self.net(padded, mask, past)
         better = out.rgb[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
-        return better, Memory(newest, seen, (height, width), flow is not None)
-
-    def _history(self, memory: Memory | None, flow: torch.Tensor | None, size: torch.Size) -> tuple[torch.Tensor, torch.Tensor]:
-        if memory is None:
-            h, w = size[0] // STRIDE, size[1] // STRIDE
-            empty = torch.zeros(1, 0, self.net.embed.in_channels, h, w, device=self.device)
-            return empty, empty[:, :, :1]
-        if flow is not None:
-            flow = _pad(flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan)
-        return carry(memory.latents[None], memory.valid[None], flow, STRIDE)
+        return better, Memory(out.past, (height, width), flow is not None)
 
 
 def _inputs(frame: Frame | torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:

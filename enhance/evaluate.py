@@ -21,11 +21,15 @@ from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lens import Pinhole
 
+HIGHEST = 60.0
+"""PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""
+
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one kind of damage, means over frames: PSNR in dB inside the damaged region and over the frame, warp error in
-    8-bit levels (mean absolute difference to the previous frame moved along exact flow, on visible pixels), milliseconds a frame."""
+    """One method on one kind of damage, means over frames: PSNR in dB inside the damaged region and over the frame (at most 60, which
+    is half an 8-bit level, unless all frames are equal), warp error in 8-bit levels (mean absolute difference to the previous frame
+    moved along exact flow, on visible pixels), milliseconds a frame."""
 
     kind: str
     method: str
@@ -82,6 +86,9 @@ def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Enhancer) ->
                 found["warp_error"] += _warp_error(better, previous, window, t)
             previous = better
     means = {k: float(np.mean(found[k])) if found[k] else float("nan") for k in ("region", "frame", "warp_error")}
+    for name in ("region", "frame"):
+        if np.isinf(means[name]) and not np.isinf(found[name]).all():
+            means[name] = float(np.minimum(found[name], HIGHEST).mean())
     return Row(kind, method, **means, milliseconds=float(np.median(found["milliseconds"])), frames=len(found["frame"]))
 
 

@@ -13,36 +13,47 @@ from enhance.autoencoder import Encoder
 from enhance.warp import warp
 
 
-def pixel_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """Distance of `out` to `target` `[B, 3, H, W]`: mean absolute error, counted apart inside and outside `region` `[B, 1, H, W]`.
+def pixel_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, logarithm: float = 0.01) -> torch.Tensor:
+    """Distance of `out` to `target` `[B, 3, H, W]`: `region_loss` inside `region` `[B, 1, H, W]`, mean absolute error outside."""
+    return region_loss(out, target, region, logarithm) + region_loss(out, target, 1 - region, 0.0)
 
-    Inside, a little of the logarithm of the squared error (PSNR) keeps strong damage from outweighing the slight. It is floored at
-    30 dB: with a lower floor the gradient of what is nearly right drowns all others, and the network learns to do nothing.
+
+def region_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, logarithm: float = 0.01) -> torch.Tensor:
+    """Mean absolute error of `out` to `target` `[B, 3, H, W]` within `region` `[B, 1, H, W]`, over the pictures that have any of it.
+
+    A little of the `logarithm` of the squared error (PSNR) keeps strong damage from outweighing the slight. It is floored at 30 dB:
+    with a lower floor the gradient of what is nearly right drowns all others, and the network learns to do nothing.
     """
     error = out - target
-    total = error.new_zeros(())
-    for part in (region, 1 - region):
-        absolute, some = _part_mean(error.abs(), part)
-        total = total + (absolute * some).sum() / some.sum().clamp_min(1)
-    squared, some = _part_mean(error.square(), region)
-    return total + 0.01 * (torch.log(squared + 1e-3) * some).sum() / some.sum().clamp_min(1)
+    absolute, some = _part_mean(error.abs(), region)
+    squared, _ = _part_mean(error.square(), region)
+    each = absolute + logarithm * torch.log(squared + 1e-3) if logarithm else absolute
+    return (each * some).sum() / some.sum().clamp_min(1)
 
 
-def gate_loss(logits: torch.Tensor, ungated: torch.Tensor, given: torch.Tensor, target: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """Teaches the gate what is wrong and the change what is right, apart from each other.
+def gate_loss(logits: torch.Tensor, given: torch.Tensor, target: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """Cross entropy of the gate's `logits` `[B, 1, H, W]` with where the `given` frame is wrong: by 4 percent or more, fully.
 
-    Only their product reaches the picture: a closed gate hides the change's error and a useless change closes the gate, and
-    training would end there. Cross entropy of the gate's `logits` `[B, 1, H, W]` with where the `given` frame is wrong (by 4 percent
-    or more: fully), and the error of the `ungated` frame in the region.
+    Only the product of gate and change reaches the picture: a closed gate hides the change's error and a useless change closes the
+    gate, and training would end there. So this teaches the gate, and `region_loss` of the ungated frame the change, apart.
     """
     wrong = F.avg_pool2d((given - target).abs().mean(1, keepdim=True), 9, 1, 4, count_include_pad=False) / 0.04
     wrong = wrong.clamp(0, 1) * region
     total = logits.new_zeros(())
     for part in (region, 1 - region):
         each, some = _part_mean(F.binary_cross_entropy_with_logits(logits, wrong, reduction="none"), part)
-        total = total + 0.1 * (each * some).sum() / some.sum().clamp_min(1)
-    absolute, some = _part_mean((ungated - target).abs(), region)
-    return total + (absolute * some).sum() / some.sum().clamp_min(1)
+        total = total + (each * some).sum() / some.sum().clamp_min(1)
+    return total
+
+
+def altered_loss(logits: torch.Tensor, altered: torch.Tensor) -> torch.Tensor:
+    """Cross entropy of `logits` `[B, 1, H, W]` with where colours are `altered`, 0..1, counted apart where they are and are not."""
+    each = F.binary_cross_entropy_with_logits(logits, altered, reduction="none")
+    total = logits.new_zeros(())
+    for part in (altered, 1 - altered):
+        mean, some = _part_mean(each, part)
+        total = total + (mean * some).sum() / some.sum().clamp_min(1)
+    return total
 
 
 def _part_mean(value: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

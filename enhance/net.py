@@ -3,13 +3,13 @@
 After DiffusionHarmonizer, small. The clean latent goes through the transformer once, at a fixed timestep and without text;
 because both never change, what their embeddings would add to every layer is stored as constants (`Modulation`). Spatial
 attention alternates with temporal attention over the latents of up to `history` frames enhanced before. The decoder gets
-features of the input frame at every scale, and the output is
+features of the input frame, and of the last enhanced one moved to it, at every scale, and the output is
 
-    output = input + gate * (colour + residual)
+    output = base + gate * (residual + blend * (last - base)),   base = input + altered * colour
 
-where colour is a smooth field of quadratic tone curves and saturation (plus one such change for the gate's region as a whole,
-from comparing its palette with the rest), the residual is free, and the gate is exactly 0 where the
-frame is to be left alone. Colour and residual are zero in an untrained network, which therefore changes nothing.
+where colour undoes altered colours (`ColourNet`), averaged over the last frames and kept to the mask where one is told; the residual
+is free; blending with the last picture keeps a clip calm; altered and gate are exactly 0 where the frame is to be left alone. Colour,
+residual and blend are zero in an untrained network, which therefore changes nothing.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
-from enhance.palette import LUMA, RegionColour
+from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, thin
+from enhance.past import Past
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
-SHUT_TRAINING, SHUT_TOLD, SHUT_ALONE = 0.1, 0.5, 1.0  # see hard_gate; the latter two keep clean frames above 42 dB
-MASK_CHANNELS = 2  # the mask, and whether there is one
+SHUT_TRAINING = 0.1  # see hard_gate
+FRAME_CHANNELS = 3 + 2 + 4  # colours; the mask, and whether there is one; the last picture, and where it is seen
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class NetConfig:
     width: int = 192
     """Channels of a token."""
     blocks: int = 4
-    """Transformer blocks: spatial attention, temporal attention, perceptron."""
+    """Transformer blocks: temporal attention, spatial attention, perceptron."""
     heads: int = 3
     """Attention heads."""
     history: int = 4
@@ -49,99 +51,12 @@ class NetConfig:
     """Channels at an eighth."""
 
 
-class Modulation(nn.Module):
-    """Normalise, scale and shift tokens `[..., C]`, and gate a branch: adaptive layer norm at one fixed condition.
-
-    With the timestep fixed (a clean latent) and the text empty, the conditioning network's outputs are constants, so the
-    constants are the parameters.
-    """
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.norm = nn.LayerNorm(width)
-        self.gate = nn.Parameter(torch.full((width,), 0.2))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.norm(x)
-
-
-class SpatialAttention(nn.Module):
-    """Every token of a frame attends to every other: tokens `[B, h, w, C]`."""
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.heads = heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        b, h, w, c = x.shape
-        q, k, v = self.qkv(x).reshape(b, h * w, 3, self.heads, c // self.heads).permute(2, 0, 3, 1, 4)
-        return self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(b, h, w, c))
-
-
-class TemporalAttention(nn.Module):
-    """Every token attends to itself and to the history at its own place: tokens `[B, h, w, C]`, history `[B, K, h, w, C]`.
-
-    `valid` bool `[B, K, h, w]` says where the history was inside the image. Without history a token sees itself alone, so
-    the layer works for any length from 0.
-    """
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.heads = heads
-        self.query = nn.Linear(width, width)
-        self.key_value = nn.Linear(width, 2 * width)
-        self.out = nn.Linear(width, width)
-
-    def forward(self, x: torch.Tensor, history: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        b, h, w, c = x.shape
-        seen = torch.cat([x[:, None], history], 1)
-        m, d = seen.shape[1], c // self.heads
-        k, v = self.key_value(seen).reshape(b, m, h, w, 2, self.heads, d).unbind(4)
-        q = self.query(x).reshape(b, 1, h, w, self.heads, d)
-        score = (q * k).sum(-1) * d**-0.5
-        allowed = torch.cat([torch.ones_like(valid[:, :1]) if valid.shape[1] else valid.new_ones(b, 1, h, w), valid], 1)
-        weight = score.float().masked_fill(~allowed[..., None], -torch.inf).softmax(1).to(v.dtype)
-        return self.out((weight[..., None] * v).sum(1).reshape(b, h, w, c))
-
-
-class Perceptron(nn.Module):
-    """Widen, mix each token with its 8 neighbours (which also tells position), narrow: tokens `[B, h, w, C]`."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.widen = nn.Linear(width, 2 * width)
-        self.mix = nn.Conv2d(2 * width, 2 * width, 3, padding=1, groups=2 * width)
-        self.narrow = nn.Linear(2 * width, width)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        wide = self.widen(x)
-        mixed = self.mix(wide.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-        return self.narrow(F.silu(wide + mixed))
-
-
-class Block(nn.Module):
-    """Spatial attention, temporal attention, perceptron, each behind its modulation."""
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.spatial, self.temporal, self.perceptron = SpatialAttention(width, heads), TemporalAttention(width, heads), Perceptron(width)
-        self.modulation = nn.ModuleList(Modulation(width) for _ in range(3))
-
-    def forward(self, x: torch.Tensor, history: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-        first, second, third = self.modulation
-        x = x + first.gate * self.spatial(first(x))
-        x = x + second.gate * self.temporal(second(x), history, valid)
-        return x + third.gate * self.perceptron(third(x))
-
-
 class Stem(nn.Module):
-    """Trainable features of the input frame and mask at 1/2, 1/4, 1/8 of the size and as tokens at 1/16."""
+    """Trainable features of the input frame, mask and last picture at 1/2, 1/4, 1/8 of the size and as tokens at 1/16."""
 
     def __init__(self, c: NetConfig):
         super().__init__()
-        self.fine = nn.Conv2d(4 * (3 + MASK_CHANNELS), c.half, 3, padding=1)
+        self.fine = nn.Conv2d(4 * FRAME_CHANNELS, c.half, 3, padding=1)
         self.quarter = nn.Conv2d(c.half, c.quarter, 3, stride=2, padding=1)
         self.quarter_block = Residual(c.quarter)
         self.eighth = nn.Conv2d(c.quarter, c.eighth, 3, stride=2, padding=1)
@@ -156,39 +71,31 @@ class Stem(nn.Module):
 
 
 class FrameDecoder(nn.Module):
-    """Tokens and the input frame's features to the gate, the colour field and the residual."""
+    """Tokens, colour fields and the input frame's features to what is done to each pixel."""
 
     def __init__(self, c: NetConfig):
         super().__init__()
         self.up_eighth = nn.Conv2d(c.width, 4 * c.eighth, 1)
         self.latent = nn.Conv2d(LATENT, c.eighth, 3, padding=1)
+        self.fields = nn.Conv2d(FIELDS, c.eighth, 1)
         self.norm = nn.GroupNorm(1, c.eighth)
         self.eighth = Residual(c.eighth)
-        self.colour = nn.Conv2d(c.eighth, 12, 3, padding=1)
         self.up_quarter = nn.Conv2d(c.eighth, 4 * c.quarter, 1)
         self.quarter = Residual(c.quarter)
         self.up_half = nn.Conv2d(c.quarter, 4 * c.half, 1)
         self.fine = Residual(c.half)
-        self.pixels = nn.Conv2d(c.half, 16, 3, padding=1)
-        zero(self.colour)
+        self.pixels = nn.Conv2d(c.half, 4 * 5, 3, padding=1)
         zero(self.pixels)
 
-    def forward(self, tokens, latent, half, quarter, eighth) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Colour coefficients `[B, 12, H/8, W/8]`, residual `[B, 3, H, W]`, gate logits `[B, 1, H, W]`."""
+    def forward(self, tokens, latent, fields, half, quarter, eighth) -> tuple[torch.Tensor, ...]:
+        """Residual `[B, 3, H, W]`, and logits of gate and blend `[B, 1, H, W]`."""
         # Normalised, because a channel that drifts far below zero here is dead for good behind the next activation.
-        x = self.eighth(self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + eighth))
-        coefficients = self.colour(F.silu(x))
+        fields = F.interpolate(fields, eighth.shape[-2:], mode="bilinear", align_corners=False)
+        x = self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + self.fields(fields) + eighth)
+        x = self.eighth(x)
         x = self.quarter(F.pixel_shuffle(self.up_quarter(F.silu(x)), 2) + quarter)
         x = self.fine(F.pixel_shuffle(self.up_half(F.silu(x)), 2) + half)
-        residual, gate = F.pixel_shuffle(self.pixels(F.silu(x)), 2).split([3, 1], 1)
-        return coefficients, residual, gate
-
-
-def colour_change(rgb: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """What the colour field `[B, 12, h, w]` adds to `rgb` `[B, 3, H, W]`: per channel a + b x + c x^2 + d (luma - x)."""
-    a, b, c, d = F.interpolate(coefficients, rgb.shape[-2:], mode="bilinear", align_corners=False).chunk(4, 1)
-    luma = LUMA[0] * rgb[:, :1] + LUMA[1] * rgb[:, 1:2] + LUMA[2] * rgb[:, 2:]
-    return torch.addcmul(a, rgb, b + c * rgb) + d * (luma - rgb)
+        return F.pixel_shuffle(self.pixels(F.silu(x)), 2).float().split([3, 1, 1], 1)
 
 
 def hard_gate(logits: torch.Tensor, shut: float | torch.Tensor = SHUT_TRAINING) -> torch.Tensor:
@@ -200,26 +107,54 @@ def hard_gate(logits: torch.Tensor, shut: float | torch.Tensor = SHUT_TRAINING) 
     return soft + (soft.clamp(0, 1) - soft).detach() if torch.is_grad_enabled() else soft.clamp(0, 1)
 
 
+def of_mask(pair: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """The first of two numbers where no mask is known, the second where one is: known `[B, 1, H, W]`, 0 or 1."""
+    return pair[0] + (pair[1] - pair[0]) * known
+
+
+@torch.no_grad()
+def recoloured(rgb: torch.Tensor, told: torch.Tensor, fields: torch.Tensor, shut: torch.Tensor) -> torch.Tensor:
+    """`rgb` `[B, 3, H, W]` with altered colours undone as `fields` say: where they are surely altered (`hard_gate` with `shut`, without
+    a mask and with one) and, where told `[B, 2, H, W]` (the mask and whether it is known) knows, within the mask."""
+    mask, known = told.split(1, 1)
+    altered = hard_gate(altered_logits(fields, rgb.shape[-2:]), of_mask(shut, known))
+    return rgb + altered * (1 - known + mask) * colour_change(rgb, fields)
+
+
 @dataclass(frozen=True)
 class Enhanced:
-    """What one step gives: the frame `[B, 3, H, W]`, its latent `[B, 16, H/8, W/8]` for the history, the gate's logits `[B, 1, H, W]`,
-    and what the frame would be with an open gate `[B, 3, H, W]`."""
+    """What one step gives.
+
+    rgb      `[B, 3, H, W]`: the frame
+    base     `[B, 3, H, W]`: the input with altered colours undone
+    logits   `[B, 1, H, W]`: of the gate
+    ungated  `[B, 3, H, W]`: what the frame would be with an open gate
+    latent   `[B, 16, H/8, W/8]`: the enhanced frame's
+    past     what the next frame is given, still to be moved there
+    """
 
     rgb: torch.Tensor
-    latent: torch.Tensor
+    base: torch.Tensor
     logits: torch.Tensor
     ungated: torch.Tensor
+    latent: torch.Tensor
+    past: Past
 
 
 class Net(nn.Module):
-    """The whole network. `encoder` is the autoencoder's and `region_colour` is trained on palettes, both before and then frozen;
-    everything else is trained on pairs."""
+    """The whole network. `encoder` is the autoencoder's and `colour` is trained on thinned pictures, both before and then frozen;
+    everything else is trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one, and
+    `shut_colour` the same of altered colours: both are set in training (`enhance.calibrate`)."""
+
+    shut: torch.Tensor
+    shut_colour: torch.Tensor
 
     def __init__(self, config: NetConfig | None = None):
         super().__init__()
         config = config or NetConfig()
         self.config = config
         self.encoder = Encoder()
+        self.colour = ColourNet()
         self.stem = Stem(config)
         self.embed = nn.Conv2d(LATENT, config.width, PATCH, stride=PATCH)
         self.age = nn.Parameter(torch.zeros(config.history, config.width))
@@ -227,46 +162,48 @@ class Net(nn.Module):
         self.norm = nn.LayerNorm(config.width)
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
-        self.region_colour = RegionColour()
+        self.register_buffer("shut", torch.tensor([0.5, 0.5]))
+        self.register_buffer("shut_colour", torch.tensor([2.0, 2.0]))
         zero(self.denoise)
 
-    def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None, latents: torch.Tensor, valid: torch.Tensor) -> Enhanced:
+    def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None = None, past: Past | None = None) -> Enhanced:
         """One frame.
 
-        rgb      `[B, 3, H, W]`, sides multiples of 16
-        mask     `[B, 1, H, W]` in 0..1, where inserted or moving objects are; NaN throughout a frame, or None, where unknown
-        latents  `[B, K, 16, H/8, W/8]`, K from 0: enhanced before, newest first, already moved to this frame
-        valid    `[B, K, 1, H/8, W/8]`: 1 where those were inside the image
+        rgb   `[B, 3, H, W]`, sides multiples of 16
+        mask  `[B, 1, H, W]` in 0..1, where inserted or moving objects are; NaN throughout a frame, or None, where unknown
+        past  of the frames before, already moved to this one; None at the start
         """
+        past = past or Past.none(rgb)
         if mask is None:
             mask = rgb.new_full((rgb.shape[0], 1, *rgb.shape[-2:]), torch.nan)
         known = torch.isfinite(mask).to(rgb.dtype)
-        frame = torch.cat([rgb * 2 - 1, torch.nan_to_num(mask), known], 1).contiguous(memory_format=torch.channels_last)
+        told = torch.cat([torch.nan_to_num(mask), known], 1)
+        last = past.rgb * past.seen
+        frame = torch.cat([rgb * 2 - 1, told, last * 2 - past.seen, past.seen], 1).contiguous(memory_format=torch.channels_last)
         with torch.no_grad():
             latent = self.encoder(rgb.contiguous(memory_format=torch.channels_last))
+            fields, count = past.averaged(self.colour(thin(rgb), thin(told)))
         half, quarter, eighth, seen = self.stem(frame)
-        history, inside = self._history(latents, valid)
+        history, inside = self._history(past)
         x = (self.embed(latent) + seen).permute(0, 2, 3, 1)
         for block in self.blocks:
             x = block(x, history, inside)
         tokens = self.norm(x).permute(0, 3, 1, 2)
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
-        coefficients, residual, logits = self.decoder(tokens, enhanced, half, quarter, eighth)
-        logits = logits.float()
-        thin = (..., slice(None, None, 4), slice(None, None, 4))
-        with torch.no_grad():
-            # Only where the gate is more open than shut: a small region's palette must not drown in a large surrounding's doubts.
-            region = (2 * torch.sigmoid(logits[thin]) - 1).clamp_min(0)
-            whole = self.region_colour(rgb[thin], region) * (region.sum((2, 3)) / 20).clamp_max(1)
-        change = colour_change(rgb.float(), coefficients.float() + whole[:, :, None, None]) + residual.float()
-        shut = SHUT_TRAINING if torch.is_grad_enabled() else SHUT_ALONE + (SHUT_TOLD - SHUT_ALONE) * known
-        return Enhanced(rgb + hard_gate(logits, shut) * change, enhanced.float(), logits, rgb + change)
+        residual, logits, blend = self.decoder(tokens, enhanced, fields, half, quarter, eighth)
+        enhanced = enhanced.float()
+        base = recoloured(rgb.float(), told, fields, self.shut_colour)
+        ungated = base + residual + hard_gate(blend, 1.0) * past.seen * (last - base)
+        shut = SHUT_TRAINING if torch.is_grad_enabled() else of_mask(self.shut, known)
+        better = base + hard_gate(logits, shut) * (ungated - base)
+        after = past.followed(better, enhanced, fields, count, self.config.history)
+        return Enhanced(better, base, logits, ungated, enhanced, after)
 
-    def _history(self, latents: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Tokens of the history `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""
-        b, k = latents.shape[:2]
-        h, w = latents.shape[-2] // PATCH, latents.shape[-1] // PATCH
+    def _history(self, past: Past) -> tuple[torch.Tensor, torch.Tensor]:
+        """Tokens of the latents `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""
+        b, k = past.latents.shape[:2]
+        h, w = past.latents.shape[-2] // PATCH, past.latents.shape[-1] // PATCH
         if k == 0:
-            return latents.new_zeros(b, 0, h, w, self.config.width), valid.new_zeros(b, 0, h, w, dtype=torch.bool)
-        tokens = self.embed(latents.flatten(0, 1)).permute(0, 2, 3, 1).reshape(b, k, h, w, -1) + self.age[:k, None, None]
-        return tokens, F.max_pool2d(1 - valid.flatten(0, 1).float(), PATCH).reshape(b, k, h, w) < 0.5
+            return past.latents.new_zeros(b, 0, h, w, self.config.width), past.valid.new_zeros(b, 0, h, w, dtype=torch.bool)
+        tokens = self.embed(past.latents.flatten(0, 1)).permute(0, 2, 3, 1).reshape(b, k, h, w, -1) + self.age[:k, None, None]
+        return tokens, F.max_pool2d(1 - past.valid.flatten(0, 1).float(), PATCH).reshape(b, k, h, w) < 0.5

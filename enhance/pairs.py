@@ -55,9 +55,10 @@ def make_pairs(
 ) -> Path:
     """Make the pairs of a scene in the folder `out`; returns it. Scene and recording may be given loaded.
 
-    Of every clip of every camera: "underfit", the scene rendered from too few, too coarse splats (or from one of the scenes in
-    `unfinished`, the same drive stopped early) against the photo; "isp", the photo with the colours of its instances altered against
-    the photo; "clean", the photo against itself. All with flow, visibility and instances rendered from the scene.
+    Of every clip of every camera: "underfit", rendered from one of the scenes in `unfinished`, the same drive stopped early
+    (`recon.stopped_early`), or from the scene with too few, too coarse splats, against the photo; "isp", the photo with the
+    colours of its instances altered against the photo; "clean", the photo against itself. All with flow, visibility and instances
+    rendered from the scene.
 
     The same seed makes the same pairs. A run that was broken off goes on where it stopped. `progress` is called with clips done,
     clips in all, and the last one's name. A contact sheet of each kind, `<kind>.png`, stands beside the clips.
@@ -86,7 +87,7 @@ def make_pairs(
     for done, (camera, start) in enumerate(starts):
         name = f"{camera.name}_{start:04d}"
         if not all((out / kind / f"{name}.json").exists() for kind in kinds):
-            clip = _Clip(scene, camera, start, config, seed)
+            clip = _Clip(scene, camera, start, config, seed, {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta})
             for kind in kinds:
                 tensors, what = clip.make(kind, early)
                 write_shard(out / kind / f"{name}.safetensors", tensors, {"kind": kind, **clip.meta, **what})
@@ -116,7 +117,7 @@ def _starts(frames: int, config: PairConfig) -> Iterator[int]:
 class _Clip:
     """One clip's photos and geometry, and the damage done to it."""
 
-    def __init__(self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int):
+    def __init__(self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, rights: dict):
         self.scene, self.start = scene, start
         height = round(config.width * camera.height / camera.width)
         indices = range(start, min(start + config.frames, len(camera)))
@@ -128,7 +129,7 @@ class _Clip:
         self.seed = int.from_bytes(digest[:6], "little")
         split = "held out" if camera.name in config.held_out else "train"
         times = [c.time_us for c in self.cameras]
-        self.meta = {"split": split, "camera": camera.name, "start": start, "times_us": times, "seed": seed}
+        self.meta = {"split": split, "camera": camera.name, "start": start, "times_us": times, "seed": seed} | rights
         self._geometry: dict[str, torch.Tensor] | None = None
 
     def geometry(self) -> dict[str, torch.Tensor]:

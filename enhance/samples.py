@@ -13,7 +13,7 @@ from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
 from enhance.shards import PairSet, Shard, Window
 
-KIND_WEIGHTS = {"underfit": 0.4, "isp": 0.42, "clean": 0.18}
+KIND_WEIGHTS = {"underfit": 0.5, "isp": 0.32, "clean": 0.18}
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
@@ -28,6 +28,16 @@ class Sample:
     mask: torch.Tensor
     flow: torch.Tensor
     visible: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Thinned pictures `[B, C, h, w]`: given, target, region where colours are altered, mask (NaN where not told)."""
+
+    given: torch.Tensor
+    target: torch.Tensor
+    region: torch.Tensor
+    mask: torch.Tensor
 
 
 class Photos:
@@ -90,35 +100,50 @@ class Sampler:
         drawn = [self._sample(rng, frames, size, kind) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
-    def palettes(self, step: int, count: int, height: int = 54, width: int = 96) -> tuple[torch.Tensor, ...]:
-        """Whole pictures, thinned to `height` x `width` pixels, with a region in other colours.
-
-        Given, target `[count, 3, height, width]`, region `[count, 1, height, width]`, and a vague region as the gate's might be.
-        """
+    def thinned(self, step: int, count: int, height: int = 90, width: int = 160) -> Thinned:
+        """Large parts of pictures, thinned to `height` x `width` pixels, with regions in other colours or none."""
         rng = self.rng(step)
-        drawn = []
-        for _ in range(count):
-            rgb, instance = self._whole(rng, height, width)
-            target = random_isp(rng, 0.7)(rgb) if rng.random() < 0.7 else rgb
-            ids = [i for i in instance.unique().tolist() if 0 < i < 255 and rng.random() < 0.5]
-            inside = torch.isin(instance, torch.tensor(ids, dtype=instance.dtype)).float()
-            if inside.sum() < 50 or rng.random() < 0.3:
-                inside = (torch.from_numpy(random_mask(rng, height, width)) > 0.5).float()
-            region = inside[None]
-            guess = region * rng.uniform(0.6, 1) + (1 - region) * rng.choice([0.0, rng.uniform(0, 0.15)])
-            drawn.append((alter(target, region, random_isp(rng)), target, region, guess))
-        return tuple(torch.stack(parts) for parts in zip(*drawn, strict=True))
+        drawn = [self._thinned(rng, height, width) for _ in range(count)]
+        return Thinned(**{f.name: torch.stack([getattr(d, f.name) for d in drawn]) for f in fields(Thinned)})
 
-    def _whole(self, rng: np.random.Generator, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Evenly spaced pixels `[3, height, width]` of one whole picture, and their instances `[height, width]`."""
+    def _thinned(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
+        rgb, instance = self._part(rng, height, width)
+        target = random_isp(rng, 0.7)(rgb) if rng.random() < 0.7 else rgb
+        objects = ((instance > 0) & (instance < 255)).float()[None]
+        given, region = target, torch.zeros_like(objects)
+        for _ in range(rng.choice([0, 1, 2], p=[0.15, 0.6, 0.25])):
+            ids = [i for i in instance.unique().tolist() if 0 < i < 255 and rng.random() < 0.5]
+            one = torch.isin(instance, torch.tensor(ids, dtype=instance.dtype)).float()
+            if one.sum() < 40 or rng.random() < 0.35:
+                one = (torch.from_numpy(random_mask(rng, height, width)) > 0.5).float()
+            one = one[None] * (1 - region)
+            given = alter(given, one, random_isp(rng))
+            region = region + one
+        given = (given * 255).round() / 255
+        given = torch.where(region > 0, given, target)
+        told = region if rng.random() < 0.3 else torch.maximum(region, objects)
+        if rng.random() >= MASK_KNOWN:
+            told = torch.full_like(told, torch.nan)
+        if rng.random() < 0.5:
+            given, target, region, told = (x.flip(-1) for x in (given, target, region, told))
+        return Thinned(given, target, region, told)
+
+    def _part(self, rng: np.random.Generator, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Evenly spaced pixels `[3, height, width]` of a picture or a large part of it, and their instances `[height, width]`."""
         stored = [s for of in self.shards.values() for s in of]
-        if self.photos is not None and (not stored or rng.random() < 0.4):
+        if self.photos is not None and (not stored or rng.random() < 0.3):
             rgb = torch.from_numpy(self.photos.frames[rng.integers(len(self.photos.frames))])
             instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
         else:
             shard = stored[rng.integers(len(stored))]
-            rgb, instance = shard.target(int(rng.integers(shard.frames)))
-        y, x = (torch.linspace(0, side - 1, n).round().long() for side, n in zip(instance.shape, (height, width), strict=True))
+            rgb, instance = shard.frame("input" if shard.meta["kind"] == "underfit" else "target", int(rng.integers(shard.frames)))
+        zoom = 1.0 if rng.random() < 0.4 else rng.uniform(1.0, 2.5)
+        places = []
+        for side, n in zip(instance.shape, (height, width), strict=True):
+            span = (side - 1) / zoom
+            first = rng.uniform(0, side - 1 - span)
+            places.append(torch.linspace(first, first + span, n).round().long())
+        y, x = places
         return rgb[y[:, None], x].permute(2, 0, 1).float() / 255, instance[y[:, None], x]
 
     def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:

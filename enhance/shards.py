@@ -88,12 +88,12 @@ class Shard:
             visible=visible,
         )
 
-    def target(self, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """One target as stored, uint8 `[H, W, 3]`, and its instances `[H, W]`."""
+    def frame(self, which: str, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """One "input" or "target" as stored, uint8 `[H, W, 3]`, and its instances `[H, W]`."""
         from safetensors import safe_open
 
         with safe_open(self.path, "pt") as file:
-            return file.get_slice("target")[frame], file.get_slice("instance")[frame]
+            return file.get_slice(which)[index], file.get_slice("instance")[index]
 
 
 def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:

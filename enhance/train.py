@@ -1,8 +1,7 @@
-"""Training: the autoencoder on single images, the region's colour change on palettes alone, then, with the encoder frozen, the
-enhancer on pairs.
+"""Training: the autoencoder on single images, the colour network on thinned pictures, then, with both frozen, the enhancer on pairs.
 
-The enhancer's batches alternate: images without history, and clips that the network walks through with its own earlier
-outputs as history, of any length from 0 to K, so that it never sees a history better than the one it will make itself.
+The enhancer's batches alternate: images without a past, and clips that the network walks through with its own earlier outputs as
+their past, with any number of latents from 0 to K, so that it never sees a past better than the one it will make itself.
 """
 
 from __future__ import annotations
@@ -10,50 +9,58 @@ from __future__ import annotations
 import pickle
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.autoencoder import STRIDE, Autoencoder
-from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, temporal_loss
-from enhance.net import Net, NetConfig, colour_change
+from enhance.autoencoder import Autoencoder
+from enhance.calibrate import calibrate_colour, calibrate_gate
+from enhance.colour import altered_logits, colour_change
+from enhance.losses import PatchPerceptual, altered_loss, gate_loss, pixel_loss, region_loss, temporal_loss
+from enhance.net import Net, NetConfig
+from enhance.past import Past
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shards import PairSet
-from enhance.warp import carry
 from enhance.weights_file import save_net
 from scenes.atomic import atomic_file
 
 STAGES = ("autoencoder", "colour", "enhancer")
-FROZEN = ("encoder.", "region_colour.")  # parts of the network that the last stage leaves as they are
+FROZEN = ("encoder.", "colour.")  # parts of the network that the last stage leaves as they are
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """How to train."""
 
-    autoencoder: float = 0.25
+    autoencoder: float = 0.12
     """Share of the budget for the autoencoder."""
-    colour: float = 0.05
-    """Share of the budget for the region's colour change alone."""
+    colour: float = 0.33
+    """Share of the budget for the colour network."""
     crop: int = 160
-    """Side of training crops in pixels, a multiple of 16."""
+    """Side of the smallest training crops in pixels, a multiple of 16."""
     images: int = 8
-    """Crops in an image batch."""
+    """Smallest crops in an image batch; larger ones are fewer."""
     clips: int = 3
-    """Clips in a temporal batch."""
+    """Clips of smallest crops in a temporal batch."""
+    thinned: int = 24
+    """Thinned pictures in a batch of the colour network."""
     frames: int = 4
     """Frames of a training clip."""
-    temporal_every: int = 3
+    temporal_every: int = 4
     """Every how many steps a temporal batch comes; the others are images."""
     rate: float = 8e-4
     """Highest learning rate."""
     latent: float = 0.1
     """Weight of the distance of the enhanced latent to the target's."""
-    perceptual: float = 0.03
+    logarithm: float = 0.03
+    """Weight of the logarithm of the squared error beside the absolute one, in the region."""
+    gate: float = 0.1
+    """Weight of the cross entropy of the gate."""
+    perceptual: float = 0.01
     """Weight of the perceptual distance on a random patch."""
     temporal: float = 1.0
     """Weight of the warp error in temporal batches."""
@@ -78,7 +85,7 @@ class _Run:
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
-            "colour": torch.optim.AdamW(self.net.region_colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
+            "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "enhancer": torch.optim.AdamW(
                 [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
             ),
@@ -139,7 +146,7 @@ def train(
     seed      of the first weights and of every sample drawn
     out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
     photos    folders of images and videos, for the autoencoder, colour changes and clean frames
-    about     written into the weights' header: licence and attribution of the data
+    about     written into the weights' header, beside the data's attribution
     progress  called with the share done, 0..1, and a line of words
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
@@ -154,6 +161,7 @@ def train(
         raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed)
+    clean = pair_set.of("clean", "train") if pair_set else []
     run = _Run(config or TrainConfig(), net or NetConfig(), minutes, steps, seed)
     if resume and checkpoint.exists():
         run.load(checkpoint)
@@ -164,6 +172,7 @@ def train(
         _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
         if run.step["enhancer"] == 0:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+            calibrate_colour(run.net, clean)
             run.average.load_state_dict(run.net.state_dict())
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
@@ -172,9 +181,13 @@ def train(
     except KeyboardInterrupt:
         run.save(checkpoint)
         raise
+    calibrate_gate(run.average, clean)
     run.save(checkpoint)
     weights = out / "enhancer.safetensors"
-    made = {"seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
+    shards = pair_set.of(split="train") if pair_set else []
+    data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
+    data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
+    made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
     save_net(run.average, weights, {**(about or {}), **made})
     return weights
 
@@ -221,16 +234,28 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
 
 
 def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
-    rgb, target, region, guess = sampler.palettes(3 * step + 2, 4 * run.config.images)
-    better = rgb + region * colour_change(rgb, run.net.region_colour(rgb, guess)[:, :, None, None])
-    return _update(run, "colour", [pixel_loss(better, target, region)])
+    drawn = sampler.thinned(3 * step + 2, run.config.thinned)
+    known = torch.isfinite(drawn.mask).float()
+    with autocast(drawn.given.device):
+        fields = run.net.colour(drawn.given, torch.cat([torch.nan_to_num(drawn.mask), known], 1))
+    logits = altered_logits(fields, drawn.given.shape[-2:])
+    change = colour_change(drawn.given, fields)
+    loss = pixel_loss(drawn.given + drawn.region * change, drawn.target, drawn.region)
+    loss = loss + pixel_loss(drawn.given + torch.sigmoid(logits) * change, drawn.target, drawn.region)
+    return _update(run, "colour", [loss + 0.1 * altered_loss(logits, drawn.region)])
+
+
+CROPS = (1.0, 1.0, 1.5, 2.0)
+"""Sides of the crops that batches are made of, against the smallest: attention must work on small pictures and on large ones."""
 
 
 def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
     c = run.config
     temporal = step % c.temporal_every == 1 and c.frames > 1
     rng = np.random.default_rng([run.seed, 7, step])
-    sample = sampler.batch(2 * step + 1, c.clips if temporal else c.images, c.frames if temporal else 1, c.crop)
+    scale = float(rng.choice(CROPS))
+    count = max(1, round((c.clips if temporal else c.images) / scale**2))
+    sample = sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
     losses = rollout_losses(run.net, sample, perceptual, c, rng)
     total = _update(run, "enhancer", losses)
     decay = min(0.998, (1 + run.step["enhancer"]) / (10 + run.step["enhancer"]))
@@ -243,30 +268,29 @@ def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, ste
 def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: TrainConfig, rng: np.random.Generator):
     """Walk through the clips; yields each frame's loss when that frame is done, so that its graph can be freed at once.
 
-    The history has a random longest length and is, in one clip of four, left unmoved, as in a plain video without flow.
+    The past has a random number of latents and is, in one clip of four, left unmoved, as in a plain video without flow.
     """
-    b, frames = sample.input.shape[:2]
+    frames = sample.input.shape[1]
     longest = int(rng.integers(0, net.config.history + 1)) if frames > 1 else 0
     moved = rng.random() < 0.75
-    h, w = (side // STRIDE for side in sample.input.shape[-2:])
-    latents, valid = sample.input.new_zeros(b, 0, net.embed.in_channels, h, w), sample.input.new_zeros(b, 0, 1, h, w)
-    previous = None
+    past: Past | None = None
     for t in range(frames):
-        if t and moved:
-            latents, valid = carry(latents, valid, sample.flow[:, t], STRIDE)
-        with autocast(sample.input.device):
-            out = net(sample.input[:, t], sample.mask[:, t], latents, valid)
+        given, target, region = sample.input[:, t], sample.target[:, t], sample.region[:, t]
+        previous = past.rgb if past is not None else None
+        if past is not None:
+            past = replace(past, latents=past.latents[:, :longest], valid=past.valid[:, :longest])
+            past = past.moved(sample.flow[:, t]) if moved else past
+        with autocast(given.device):
+            out = net(given, sample.mask[:, t], past)
             with torch.no_grad():
-                wanted = net.encoder(sample.target[:, t].contiguous(memory_format=torch.channels_last))
-            seen = perceptual(out.rgb, sample.target[:, t], rng) if c.perceptual else 0.0
-        loss = pixel_loss(out.rgb, sample.target[:, t], sample.region[:, t]) + c.perceptual * seen
-        loss = loss + gate_loss(out.logits, out.ungated, sample.input[:, t], sample.target[:, t], sample.region[:, t])
+                wanted = net.encoder(target.contiguous(memory_format=torch.channels_last))
+            seen = perceptual(out.rgb, target, rng) if c.perceptual else 0.0
+        loss = pixel_loss(out.rgb, target, region, c.logarithm) + c.perceptual * seen
+        loss = loss + region_loss(out.ungated, target, region, c.logarithm) + c.gate * gate_loss(out.logits, out.base, target, region)
         loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
         if previous is not None:
             loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])
-        previous = out.rgb.detach()
-        latents = torch.cat([out.latent.detach()[:, None], latents], 1)[:, :longest]
-        valid = torch.cat([torch.ones_like(out.latent[:, None, :1]).detach(), valid], 1)[:, :longest]
+        past = out.past
         yield loss / frames
 
 

@@ -23,15 +23,17 @@ def warp(previous: torch.Tensor, flow_prev: torch.Tensor) -> tuple[torch.Tensor,
     return torch.where(inside, moved, 0).to(previous.dtype), inside.to(previous.dtype)
 
 
-def shrink_flow(flow: torch.Tensor, factor: int) -> torch.Tensor:
-    """Flow `[B, 2, H, W]` in pixels to the mean of each block of `factor` pixels, in blocks; unknown pixels do not count.
+def shrink_flow(flow: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
+    """Flow `[B, 2, H, W]` in pixels on a coarser grid of `size` (h, w), in its cells: means of what is known.
 
-    A block without any known pixel stays unknown (NaN).
+    A cell without any known pixel stays unknown (NaN).
     """
     known = torch.isfinite(flow).all(1, keepdim=True)
-    count = F.avg_pool2d(known.float(), factor)
-    mean = F.avg_pool2d(torch.where(known, flow, 0).float(), factor) / count
-    return torch.where(count > 0, mean / factor, torch.nan)
+    size = (size[0], size[1])
+    share = F.adaptive_avg_pool2d(known.float(), size)
+    mean = F.adaptive_avg_pool2d(torch.where(known, flow, 0).float(), size) / share
+    scale = mean.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])[:, None, None]
+    return torch.where(share > 0, mean * scale, torch.nan)
 
 
 def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance: float = 1.0) -> torch.Tensor:
@@ -43,17 +45,3 @@ def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance
     back, inside = warp(torch.where(torch.isfinite(previous_flow_next), previous_flow_next, 1e6), flow_prev)
     error = (torch.where(torch.isfinite(flow_prev), flow_prev, 1e6) + back).square().sum(1, keepdim=True).sqrt()
     return (inside > 0) & (error < tolerance)
-
-
-def carry(latents: torch.Tensor, valid: torch.Tensor, flow_prev: torch.Tensor | None, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A history `[B, K, C, h, w]` with its validity `[B, K, 1, h, w]` moved to the next frame by its flow `[B, 2, h stride, w stride]`.
-
-    Without flow the history stays where it is.
-    """
-    if flow_prev is None or latents.shape[1] == 0:
-        return latents, valid
-    b, k = latents.shape[:2]
-    flow = shrink_flow(flow_prev, stride).repeat_interleave(k, 0)
-    moved, inside = warp(torch.cat([latents.flatten(0, 1), valid.flatten(0, 1)], 1), flow)
-    latents, valid = moved[:, :-1].unflatten(0, (b, k)), ((moved[:, -1:] > 0.5) * inside).unflatten(0, (b, k))
-    return latents, valid

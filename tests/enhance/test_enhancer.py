@@ -4,7 +4,7 @@ import pytest
 import torch
 from small_net import SMALL, stirred
 
-from enhance.enhancer import Enhancer, Memory
+from enhance.enhancer import Enhancer
 from enhance.net import Net
 from enhance.weights_file import BUILTIN, load_net, save_net
 from render.frame_types import Frame
@@ -32,37 +32,37 @@ def test_any_size_comes_back_and_untrained_weights_are_the_identity(size):
     better, memory = Enhancer(Net(SMALL)).step(rgb)
     assert torch.equal(better, rgb) and memory.size == size
     again, memory = Enhancer(Net(SMALL)).step(rgb, memory)
-    assert torch.equal(again, rgb) and len(memory.latents) == 2
+    assert torch.equal(again, rgb) and memory.past.latents.shape[1] == 2
 
 
 def test_memory_grows_to_four_and_no_further(enhancer):
     memory = None
     for i in range(6):
         _, memory = enhancer.step(picture(seed=i), memory)
-        assert len(memory.latents) == min(i + 1, 4)
+        assert memory.past.latents.shape[1] == min(i + 1, 4)
 
 
 def test_state_is_passed_and_not_hidden(enhancer):
     _, memory = enhancer.step(picture(seed=1))
-    kept = memory.latents.clone()
+    kept = memory.past.rgb.clone()
     first, _ = enhancer.step(picture(seed=2), memory)
     enhancer.step(picture(seed=3))
     second, _ = enhancer.step(picture(seed=2), memory)
     alone, _ = enhancer.step(picture(seed=2))
-    assert torch.equal(first, second) and torch.equal(memory.latents, kept) and not torch.equal(first, alone)
+    assert torch.equal(first, second) and torch.equal(memory.past.rgb, kept) and not torch.equal(first, alone)
 
 
 def test_a_change_of_size_forgets(enhancer):
     _, memory = enhancer.step(picture())
     after, memory = enhancer.step(picture(40, 64), memory)
-    assert torch.equal(after, enhancer.step(picture(40, 64))[0]) and len(memory.latents) == 1
+    assert torch.equal(after, enhancer.step(picture(40, 64))[0]) and memory.past.latents.shape[1] == 1
 
 
 def test_a_frame_that_lost_its_flow_forgets(enhancer):
     _, memory = enhancer.step(frame(picture(), flow_prev=torch.zeros(32, 48, 2)))
     assert memory.flow
     after, memory = enhancer.step(frame(picture(seed=1)), memory)
-    assert torch.equal(after, enhancer.step(picture(seed=1))[0]) and len(memory.latents) == 1
+    assert torch.equal(after, enhancer.step(picture(seed=1))[0]) and memory.past.latents.shape[1] == 1
 
 
 def test_zero_flow_equals_an_unmoved_memory(enhancer):
@@ -109,11 +109,6 @@ def test_what_is_no_picture_is_refused(enhancer, wrong, says):
 def test_flow_of_another_size_is_refused(enhancer):
     with pytest.raises(ValueError, match="flow_prev"):
         enhancer.step(frame(picture(), flow_prev=torch.zeros(3, 4, 2)))
-
-
-def test_a_memory_that_does_not_fit_together_is_refused():
-    with pytest.raises(ValueError, match="valid"):
-        Memory(torch.zeros(2, 16, 4, 4), torch.zeros(1, 1, 4, 4), (32, 32), False)
 
 
 def test_weights_survive_the_file(tmp_path):

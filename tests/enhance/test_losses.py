@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from enhance.autoencoder import Encoder
-from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, temporal_loss
+from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, region_loss, temporal_loss
 
 
 def test_pixel_loss_is_least_at_the_target_and_counts_small_regions_fully():
@@ -28,9 +28,15 @@ def test_gate_loss_opens_the_gate_in_the_region_and_closes_it_elsewhere():
     region[:, :, :16] = 1
     given = target + 0.2 * region
     right, wrong = (2 * region - 1) * 8, (1 - 2 * region) * 8
-    assert gate_loss(right, target, given, target, region) < 0.05 < 0.1 < gate_loss(wrong, target, given, target, region)
-    assert gate_loss(right, target + 0.1 * region, given, target, region) > 0.1
-    assert gate_loss(right, target + 0.1 * (1 - region), given, target, region) < 0.05
+    assert gate_loss(right, given, target, region) < 0.5 < 1 < gate_loss(wrong, given, target, region)
+
+
+def test_region_loss_counts_the_region_alone():
+    target, region = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
+    region[:, :, :16] = 1
+    least = region_loss(target, target, region)
+    assert region_loss(target + 0.1 * region, target, region) > least + 0.1
+    assert region_loss(target + 0.1 * (1 - region), target, region) == least
 
 
 def test_temporal_loss_is_zero_for_a_picture_that_moves_with_its_flow():

@@ -77,8 +77,8 @@ def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
 
 
 def test_training_undoes_a_constant_error(pairs, tmp_path):
-    config = replace(QUICK, autoencoder=0.1, rate=3e-3)
-    weights = train(pairs, tmp_path, steps=150, config=config, net=SMALL)
+    config = replace(QUICK, autoencoder=0.05, colour=0.05, rate=3e-3)
+    weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
     rows = evaluate(pairs, Enhancer.load(weights))
     assert [r.method for r in rows] == ["identity", "ours", "ours + instances"] * 3
     by = {(r.kind, r.method): r for r in rows}

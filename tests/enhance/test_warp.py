@@ -2,7 +2,8 @@
 
 import torch
 
-from enhance.warp import carry, shrink_flow, visible, warp
+from enhance.past import Past
+from enhance.warp import shrink_flow, visible, warp
 
 
 def constant_flow(x, y, h=10, w=14):
@@ -33,7 +34,7 @@ def test_shrunk_flow_is_the_mean_in_blocks():
     flow = constant_flow(8, 16, 16, 16)
     flow[..., 0, 0] = torch.nan
     flow[..., 8:, 8:] = torch.inf
-    small = shrink_flow(flow, 8)
+    small = shrink_flow(flow, (2, 2))
     assert torch.allclose(small[0, :, 0, 0], torch.tensor([1.0, 2.0])) and torch.isnan(small[0, :, 1, 1]).all()
 
 
@@ -46,14 +47,24 @@ def test_points_that_return_are_visible_and_others_are_not():
     assert not visible(there, back)[0, 0, 5, 3]
 
 
-def test_history_without_flow_stays_in_place():
-    latents, valid = torch.rand(1, 2, 4, 3, 3), torch.ones(1, 2, 1, 3, 3)
-    same, still = carry(latents, valid, None, 8)
-    assert same is latents and still is valid
+def a_past(h=24, w=24):
+    grid = torch.rand(1, 13, h // 8, w // 8)
+    return Past(torch.rand(1, 2, 16, h // 8, w // 8), torch.ones(1, 2, 1, h // 8, w // 8), torch.rand(1, 3, h, w),
+                torch.ones(1, 1, h, w), grid, torch.full_like(grid[:, :1], 2))  # fmt: skip
 
 
-def test_history_moves_by_whole_latents_and_loses_what_left_the_image():
-    latents, valid = torch.rand(1, 2, 4, 3, 3), torch.ones(1, 2, 1, 3, 3)
-    moved, inside = carry(latents, valid, constant_flow(8, 0, 24, 24), 8)
-    assert torch.allclose(moved[..., :-1], latents[..., 1:], atol=1e-5)
-    assert inside[..., :-1].min() == 1 and inside[..., -1].max() == 0
+def test_all_of_the_past_moves_by_whole_cells_and_what_left_the_image_is_forgotten():
+    past = a_past()
+    moved = past.moved(constant_flow(8, 0, 24, 24))
+    for name in ("latents", "fields"):
+        assert torch.allclose(getattr(moved, name)[..., :-1], getattr(past, name)[..., 1:], atol=1e-5), name
+    assert torch.allclose(moved.rgb[..., :-8], past.rgb[..., 8:], atol=1e-5)
+    for kept in (moved.valid, moved.count / 2):
+        assert kept[..., :-1].min() == 1 and kept[..., -1].max() == 0
+    assert moved.seen[..., :-8].min() == 1 and moved.seen[..., -8:].max() == 0
+
+
+def test_unknown_flow_forgets_the_past_there():
+    moved = a_past().moved(torch.full((1, 2, 24, 24), torch.nan))
+    assert moved.valid.max() == 0 and moved.seen.max() == 0 and moved.count.max() == 0
+    assert all(torch.isfinite(value).all() for value in vars(moved).values())

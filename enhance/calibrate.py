@@ -1,0 +1,67 @@
+"""How sure must the network be before it changes anything? Chosen in training, so that clean pictures stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch.nn import functional as F
+
+from enhance.colour import thin
+from enhance.net import MULTIPLE, Net, hard_gate, recoloured
+from enhance.precision import autocast
+from enhance.shards import Shard
+
+CLEAN_DB = 50.0
+"""PSNR that clean training pictures must keep against themselves. New places fare worse: drive 002's front camera by 8 dB."""
+SHUTS = (2.0, 3.0, 4.0, 6.0, 9.0)
+PICTURES = 16
+
+Changed = Callable[[torch.Tensor, torch.Tensor], Callable[[float], torch.Tensor]]
+"""From a picture and its mask to what becomes of the picture at each shut."""
+
+
+@torch.no_grad()
+def calibrate_colour(net: Net, clean: Sequence[Shard]) -> None:
+    """Set `net.shut_colour`: the least of SHUTS at which clean pictures keep CLEAN_DB, without a mask and with one."""
+
+    def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
+        with autocast(rgb.device):
+            fields = net.colour(thin(rgb), thin(told))
+        return lambda shut: recoloured(rgb, told, fields, torch.tensor([shut, shut]))
+
+    _choose(net.shut_colour, clean, changed)
+
+
+@torch.no_grad()
+def calibrate_gate(net: Net, clean: Sequence[Shard]) -> None:
+    """Set `net.shut` in the same way, with altered colours undone or not as they are."""
+
+    def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
+        mask = torch.where(told[:, 1:] > 0, told[:, :1], torch.nan)
+        with autocast(rgb.device):
+            out = net(rgb, mask)
+        return lambda shut: rgb + hard_gate(out.logits, shut) * (out.ungated - out.base)
+
+    _choose(net.shut, clean, changed)
+
+
+def _choose(pair: torch.Tensor, clean: Sequence[Shard], changed: Changed) -> None:
+    """Write into `pair` the numbers for pictures without and with a mask; nothing where there are no clean pictures."""
+    for knowing in (0, 1):
+        errors = []
+        for rgb, told in _pictures(clean, knowing):
+            make = changed(rgb, told)
+            errors.append(torch.stack([(make(shut) - rgb).square().mean() for shut in SHUTS]))
+        if errors:
+            good = torch.stack(errors).mean(0) <= 10 ** (-CLEAN_DB / 10)
+            pair[knowing] = next((s for s, fine in zip(SHUTS, good.tolist(), strict=True) if fine), SHUTS[-1])
+
+
+def _pictures(clean: Sequence[Shard], knowing: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Pictures `[1, 3, H, W]` spread over the clips, sides padded for the network, and their masks with whether they are known."""
+    for shard in clean[:: max(1, len(clean) // PICTURES)]:
+        window = shard.window(shard.frames // 2, 1)
+        pad = (0, -shard.width % MULTIPLE, 0, -shard.height % MULTIPLE)
+        mask = F.pad((window.instance > 0).float(), pad) * knowing
+        yield F.pad(window.input, pad, mode="replicate"), torch.cat([mask, torch.full_like(mask, float(knowing))], 1)
