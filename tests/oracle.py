@@ -1,5 +1,9 @@
 """Truth: the splat model in float64 torch, slow and obviously right, differentiable by autograd.
 
+The model (projection, response, dilation, antialiasing) is what a scene was trained with. Its exact picture, which `truth` gives, sums
+all splats along every pixel's own ray in that ray's own order, with no cutoff, no clamp and no termination. `render` can also take the
+shortcuts of the kernels one by one (order by centres, cutoff, clamp), so that each kernel is held against exactly what it promises.
+
 Written from the papers' matrices (Zwicker et al. 2001; Julier and Uhlmann 1997 with alpha = 1, beta = 2, kappa = 0), not from the
 kernels' factored form, so that an error in that algebra shows.
 """
@@ -16,6 +20,8 @@ from scenes.poses import inverse, matrix_from_quat
 NEAR = 0.1
 NEAREST = 0.5
 REACH = 3.33
+TIE = 1e-5  # of its depth: two splats nearer to each other than this on a ray may stand in either order
+SEEN = 1e-5  # what such a swap must change to matter
 
 
 def to_float64(g: Gaussians) -> dict[str, torch.Tensor]:
@@ -85,10 +91,13 @@ def render(
     lens: torch.Tensor | None = None,
     cutoff: float = 0.0,
     alpha_max: float = 1.0,
+    order: str = "tile",
 ):
-    """rgb `[H, W, 3]`, alpha, depth, instance `[H, W]`, and `near_cutoff` `[H, W]`: pixels where a splat is within 1e-4 of the cutoff.
+    """rgb `[H, W, 3]`, alpha, depth, instance `[H, W]`, and `unsure` `[H, W]`: where the picture jumps within float32's rounding,
+    since a splat is within 1e-4 of the cutoff, or since two that show change places.
 
-    placed: (fields, world_from_local, instance id). Exact order by depth of the centres, no termination.
+    placed: (fields, world_from_local, instance id). order: "tile", by depth of the centres, or "pixel", by `ray_depths`, which is
+    exact; no termination.
     """
     world_from_cam = camera.world_from_cam if world_from_cam is None else world_from_cam
     lens = camera.lens.params() if lens is None else lens
@@ -113,32 +122,61 @@ def render(
     if model.antialias:
         opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
     conic = torch.linalg.inv(dilated)
+    shown = [
+        _composite(rays, pixels, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max)
+        for pixels, rays in _blocks(camera, lens, len(points))
+    ]
+    return tuple(torch.cat(part).reshape(camera.height, camera.width, *part[0].shape[1:]) for part in zip(*shown, strict=True))
 
-    pixels = camera.pixel_centres()
-    through = torch.ones(camera.height, camera.width, dtype=torch.float64)
-    rgb = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
-    depth = torch.zeros_like(through)
-    most, who = torch.zeros_like(through), torch.full(through.shape, -1)
-    near_cutoff = torch.zeros(through.shape, dtype=torch.bool)
-    for i in points[:, 2].argsort(stable=True):
-        d = pixels - mean[i]
-        s = 0.5 * torch.einsum("hwi,ij,hwj->hw", d, conic[i], d)
-        alpha = opacity[i] * torch.exp(-s)
-        if cutoff > 0:
-            margin = (opacity[i] / cutoff).log() - s
-            near_cutoff |= margin.abs() < 1e-4 * (1 + s)
-            alpha = torch.where(margin > 0, alpha, torch.zeros_like(alpha))
-        alpha = alpha.clamp_max(alpha_max)
-        weight = through * alpha
-        rgb = rgb + weight[..., None] * colour[i]
-        depth = depth + weight * points[i, 2]
-        leads = weight.detach() > most
-        most, who = torch.where(leads, weight.detach(), most), torch.where(leads, instances[i], who)
-        through = through * (1 - alpha)
-    alpha = 1 - through
-    drawn = alpha > 0
-    depth = torch.where(drawn, depth / torch.where(drawn, alpha, torch.ones_like(alpha)), torch.inf)
-    return rgb, alpha, depth, torch.where(alpha < 0.5, -1, who), near_cutoff
+
+def truth(placed, camera: Camera, model: SplatModel):
+    """The exact picture of float64 `placed` splats: rgb `[H, W, 3]`, alpha, depth, instance, and where it jumps, as of `render`."""
+    return render(placed, camera, model, order="pixel")
+
+
+def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
+    """`[P, N]`: where along each ray `[P, 3]`, in its own lengths, each 3D Gaussian is greatest; with z = 1, a depth in metres.
+
+    With A the Gaussian's scaled axes as columns, t = (A^-1 d) . (A^-1 p) / |A^-1 d|^2 (the order of StopThePop, Radl et al. 2024).
+    """
+    inverse_axes = (axes / axes.square().sum(1, keepdim=True)).transpose(1, 2)
+    d = torch.einsum("nij,pj->pni", inverse_axes, rays)
+    return (d * (inverse_axes @ points[..., None])[..., 0]).sum(-1) / d.square().sum(-1)
+
+
+def _blocks(camera: Camera, lens: torch.Tensor, count: int, room: int = 1 << 21):
+    """Pixels `[P, 2]` and their rays `[P, 3]` in parts small enough for `P * count` numbers."""
+    fx, fy, cx, cy = lens.detach()
+    for pixels in camera.pixel_centres().reshape(-1, 2).split(max(1, room // max(count, 1))):
+        yield pixels, torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones(len(pixels), dtype=torch.float64)], -1)
+
+
+def _composite(rays, pixels, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
+    """rgb `[P, 3]`, alpha, depth, instance and unsure `[P]` of some pixels."""
+    d = pixels[:, None] - mean
+    s = 0.5 * torch.einsum("pni,nij,pnj->pn", d, conic, d)
+    alpha = opacity * torch.exp(-s)
+    unsure = torch.zeros(len(pixels), dtype=torch.bool)
+    if cutoff > 0:
+        margin = (opacity / cutoff).log() - s
+        unsure = (margin.abs() < 1e-4 * (1 + s)).any(1)
+        alpha = torch.where(margin > 0, alpha, torch.zeros_like(alpha))
+    alpha = alpha.clamp_max(alpha_max)
+    keys = ray_depths(points, axes, rays) if order == "pixel" else points[:, 2].expand_as(alpha)
+    first = keys.detach().argsort(dim=1, stable=True)
+    sorted_alpha = alpha.gather(1, first)
+    passing = torch.cumprod(1 - sorted_alpha, 1)
+    before = torch.cat([torch.ones(len(pixels), 1, dtype=torch.float64), passing[:, :-1]], 1)
+    if order == "pixel":
+        depth_step = keys.detach().gather(1, first).diff(dim=1)
+        swap = (before * sorted_alpha)[:, :-1] * sorted_alpha[:, 1:] * (colour[first[:, 1:]] - colour[first[:, :-1]]).abs().amax(-1)
+        unsure = unsure | (torch.where(depth_step < TIE * points[first[:, 1:], 2], swap, torch.zeros_like(swap)).sum(1) > SEEN)
+    weight = alpha * before.gather(1, first.argsort(dim=1))
+    total = 1 - passing[:, -1] if len(points) else torch.zeros(len(pixels), dtype=torch.float64)
+    drawn = total > 0
+    depth = torch.where(drawn, weight @ points[:, 2] / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
+    who = instances[weight.detach().argmax(1)] if len(points) else torch.full((len(pixels),), -1)
+    return weight @ colour, total, depth, torch.where(total < 0.5, -1, who), unsure
 
 
 def as_oracle(placed: list[Placed]) -> list[tuple[dict[str, torch.Tensor], torch.Tensor, int]]:

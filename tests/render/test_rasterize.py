@@ -118,6 +118,25 @@ def test_the_oracles_gradients_are_its_finite_differences():
     assert torch.autograd.gradcheck(total, (*fields.values(), pose), eps=1e-6, atol=1e-5, rtol=1e-4)
 
 
+def test_the_exact_picture_of_two_crossing_walls_changes_order_where_they_cross():
+    """A red wall and a blue one, opaque, each turned by 45 degrees: by their centres one would hide the other everywhere."""
+    turn = math.sin(math.pi / 8)
+    red, blue = torch.tensor([1.0, -1, -1]), torch.tensor([-1.0, -1, 1])
+    walls = Gaussians(
+        torch.tensor([[0, 0, 5.0], [0, 0, 5.0001]]),
+        torch.tensor([[math.cos(math.pi / 8), 0, turn, 0], [math.cos(math.pi / 8), 0, -turn, 0]]),
+        torch.tensor([[1.0, 1.0, -7.0]]).repeat(2, 1),
+        torch.full((2,), 20.0),
+        torch.stack([red, blue])[:, None],
+    )
+    camera = replace(CAMERA, lens=Pinhole(60.0, 60.0, 35.0, 25.0), world_from_cam=torch.eye(4, dtype=torch.float64))
+    rgb, *_ = oracle.truth(oracle.as_oracle([Placed(walls, torch.eye(4, dtype=torch.float64))]), camera, SplatModel())
+    by_centre, *_ = oracle.render(oracle.as_oracle([Placed(walls, torch.eye(4, dtype=torch.float64))]), camera, SplatModel())
+    left, right = rgb[25, 30] > 0.5, rgb[25, 39] > 0.5
+    assert left.tolist() == [False, False, True] and right.tolist() == [True, False, False]
+    assert (by_centre[25, [30, 39], 0] > 0.5).all()
+
+
 def test_zero_splats_renders_background():
     sky = torch.tensor([0.1, 0.5, 0.9])
     frame = rasterize(Gaussians.empty(), CAMERA, ("rgb", "alpha", "depth", "instance"), background=sky)
