@@ -59,6 +59,7 @@ NEAREST = wp.constant(0.5)
 REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1/255
 CULLED = wp.constant(2147483647)
 TINY = wp.constant(1.0e-30)
+FARTHEST = wp.constant(1.0e12)  # metres from the camera beyond which a splat is not drawn: squares of squares must stay floats
 ROOM = wp.constant(1.0001)  # the box that sets room aside is this much wider than the ellipse, whatever rounding does to either
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
 vec_axis = wp.types.vector(length=8, dtype=wp.float32)
@@ -210,7 +211,7 @@ def project(
     depth_keys[j] = CULLED
     t = pose.rotation * means[i] + pose.translation
     opacity = sigmoid(logit_opacities[i])
-    if t[2] > view.near and wp.log(opacity) + view.log_cutoff > 0.0:
+    if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and wp.log(opacity) + view.log_cutoff > 0.0:
         axes = pose.rotation * rotation(quats[i])
         scale = exp_scale(log_scales[i])
         if in_view(t, axes, scale, view):
@@ -245,10 +246,12 @@ def project(
                 rows = tile_span(records[j, Y], ROOM * records[j, Y_EXT] + SLACK, view.tiles_y)
                 columns = tile_span(records[j, X], ROOM * c * root / k + SLACK, view.tiles_x)
                 total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
-                counts[j] = total
+                colour = wp.vec3(0.0)
                 if total > 0:
-                    depth_keys[j] = wp.cast(t[2], int)
                     colour = harmonics(sh, i, view.sh_count, wp.normalize(means[i] - pose.eye))
+                if total > 0 and wp.isfinite(colour):
+                    counts[j] = total
+                    depth_keys[j] = wp.cast(t[2], int)
                     records[j, RED] = wp.max(colour[0], 0.0)
                     records[j, GREEN] = wp.max(colour[1], 0.0)
                     records[j, BLUE] = wp.max(colour[2], 0.0)
