@@ -58,7 +58,13 @@ class Settings:
 
     @property
     def squarings(self) -> int:
-        return 3 if self.cutoff >= 1 / 400 else 5
+        """How often exp's polynomial is squared, so that its argument stays within 0.75."""
+        return max(3, math.ceil(math.log2(-math.log(self.cutoff) / 0.75)))
+
+    @property
+    def least_opacity(self) -> float:
+        """Splats up to this opacity are not drawn: all below the cutoff, or, where faint ones have cutoffs of their own, far below it."""
+        return self.cutoff if self.config.faint <= self.cutoff else self.cutoff / 64
 
     @property
     def alpha_max(self) -> float:
@@ -93,6 +99,7 @@ def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
     v.top, v.bottom = -(v.cy + margin) / v.fy, (settings.height - v.cy + margin) / v.fy
     v.tiles_x, v.tiles_y = settings.tiles_x, settings.tiles_y
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
+    v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
     v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
     return v
 

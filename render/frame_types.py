@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from render.budget import split
 from render.outputs import OUTPUTS as OUTPUTS
 from render.outputs import check_outputs as check_outputs
 from scenes.camera import Camera
@@ -16,15 +17,21 @@ class RenderConfig:
     """How far the picture may be from the exact sum over all splats.
 
     alpha_cutoff: contributions below it are skipped; alpha_max: no splat is more opaque;
-    termination: a pixel is finished when this much light still passes.
+    termination: a pixel is finished when this much light still passes; faint: splats less opaque than this are drawn out to
+    a cutoff that is less by as much. max_error: the largest error of a pixel's colour; it sets all the others (`render/budget.py`).
     """
 
     alpha_cutoff: float = 1 / 255
     alpha_max: float = 0.999
     termination: float = 1e-4
+    faint: float = 0.0
+    max_error: float | None = None
 
     def __post_init__(self):
-        for name in ("alpha_cutoff", "termination"):
+        if self.max_error is not None:
+            for name, limit in split(self.max_error).items():
+                object.__setattr__(self, name, limit)
+        for name in ("alpha_cutoff", "termination", "faint"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
         if not 0 < self.alpha_max <= 1:

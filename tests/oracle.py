@@ -20,6 +20,8 @@ from scenes.poses import inverse, matrix_from_quat
 NEAR = 0.1
 NEAREST = 0.5
 REACH = 3.33
+PART = 12  # pixels on a side of a part of a large picture
+BEYOND = 9.0  # sigma: exp(-40) is below float64's rounding of 1
 TIE = 1e-5  # of its depth: two splats nearer to each other than this on a ray may stand in either order
 SEEN = 1e-5  # what such a swap must change to matter
 
@@ -92,9 +94,10 @@ def render(
     cutoff: float = 0.0,
     alpha_max: float = 1.0,
     order: str = "tile",
+    jumps: bool = False,
 ):
     """rgb `[H, W, 3]`, alpha, depth, instance `[H, W]`, and `unsure` `[H, W]`: where the picture jumps within float32's rounding,
-    since a splat is within 1e-4 of the cutoff, or since two that show change places.
+    since a splat is within 1e-4 of the cutoff, or since two that show change places; with jumps, by how much instead.
 
     placed: (fields, world_from_local, instance id). order: "tile", by depth of the centres, or "pixel", by `ray_depths`, which is
     exact; no termination.
@@ -106,9 +109,7 @@ def render(
     for g, world_from_local, instance in placed:
         cam_from_local = cam_from_world @ world_from_local
         points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
-        eye = inverse(cam_from_local)[:3, 3]
-        sight = g["means"] - eye
-        colour = evaluate(g["sh"], sight / sight.norm(dim=-1, keepdim=True))
+        colour = _colours(g["sh"], g["means"] - inverse(cam_from_local)[:3, 3])
         axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
         parts.append((points, axes, colour, torch.sigmoid(g["logit_opacities"]), torch.full((len(points),), instance)))
     points, axes, colour, opacity, instances = (torch.cat(p) for p in zip(*parts, strict=True))
@@ -122,16 +123,35 @@ def render(
     if model.antialias:
         opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
     conic = torch.linalg.inv(dilated)
-    shown = [
-        _composite(rays, pixels, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max)
-        for pixels, rays in _blocks(camera, lens, len(points))
-    ]
-    return tuple(torch.cat(part).reshape(camera.height, camera.width, *part[0].shape[1:]) for part in zip(*shown, strict=True))
+    drawn = (points, axes, mean, conic, opacity, colour, instances)
+    reach = BEYOND * torch.diagonal(dilated.detach(), dim1=-2, dim2=-1).sqrt()
+    rows = []
+    for strip in _parts(camera.pixel_centres(), len(points)):
+        shown = []
+        for pixels in strip:
+            # of a part of a large picture only the splats that a float64 could see there
+            near = ((mean.detach() - pixels.mean((0, 1))).abs() < reach + 0.5 * pixels.shape[0]).all(1) if len(strip) > 1 else slice(None)
+            shown.append(_composite(pixels, lens, *(t[near] for t in drawn), order, cutoff, alpha_max))
+        rows.append([torch.cat(part, 1) for part in zip(*shown, strict=True)])
+    rgb, alpha, depth, instance, jump = (torch.cat(part) for part in zip(*rows, strict=True))
+    return rgb, alpha, depth, instance, jump if jumps else jump > SEEN
 
 
-def truth(placed, camera: Camera, model: SplatModel):
-    """The exact picture of float64 `placed` splats: rgb `[H, W, 3]`, alpha, depth, instance, and where it jumps, as of `render`."""
-    return render(placed, camera, model, order="pixel")
+def _colours(sh: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
+    return evaluate(sh, sight / sight.norm(dim=-1, keepdim=True))
+
+
+def colours(placed: Placed, camera: Camera) -> torch.Tensor:
+    """What colour `[N, 3]` each splat shows to `camera`."""
+    eye = (inverse(placed.world_from_local) @ camera.world_from_cam)[:3, 3].detach()
+    return _colours(placed.gaussians.sh.detach().double(), placed.gaussians.means.detach().double() - eye)
+
+
+def truth(placed: list[Placed], camera: Camera, model: SplatModel, order: str = "pixel"):
+    """The exact picture: rgb `[H, W, 3]`, and its `jump` `[H, W]`: how far rounding to float32 may move it, where splats change places."""
+    with torch.no_grad():
+        rgb, _, _, _, jump = render(as_oracle(placed), camera, model, order=order, jumps=True)
+    return rgb, jump
 
 
 def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
@@ -144,24 +164,27 @@ def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor) -> 
     return (d * (inverse_axes @ points[..., None])[..., 0]).sum(-1) / d.square().sum(-1)
 
 
-def _blocks(camera: Camera, lens: torch.Tensor, count: int, room: int = 1 << 21):
-    """Pixels `[P, 2]` and their rays `[P, 3]` in parts small enough for `P * count` numbers."""
-    fx, fy, cx, cy = lens.detach()
-    for pixels in camera.pixel_centres().reshape(-1, 2).split(max(1, room // max(count, 1))):
-        yield pixels, torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones(len(pixels), dtype=torch.float64)], -1)
+def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[torch.Tensor, ...]]:
+    """Rows of square parts of the picture's pixels `[H, W, 2]`; all of it where `count` splats times its pixels is not too much."""
+    if pixels.shape[0] * pixels.shape[1] * count <= room:
+        return [(pixels,)]
+    return [strip.split(PART, 1) for strip in pixels.split(PART, 0)]
 
 
-def _composite(rays, pixels, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
-    """rgb `[P, 3]`, alpha, depth, instance and unsure `[P]` of some pixels."""
+def _composite(pixels, lens, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
+    """rgb, alpha, depth, instance and jump of some pixels `[h, w, 2]`."""
+    shape, pixels = pixels.shape[:2], pixels.reshape(-1, 2)
     d = pixels[:, None] - mean
     s = 0.5 * torch.einsum("pni,nij,pnj->pn", d, conic, d)
     alpha = opacity * torch.exp(-s)
-    unsure = torch.zeros(len(pixels), dtype=torch.bool)
+    jump = torch.zeros(len(pixels), dtype=torch.float64)
     if cutoff > 0:
         margin = (opacity / cutoff).log() - s
-        unsure = (margin.abs() < 1e-4 * (1 + s)).any(1)
+        jump = (margin.abs() < 1e-4 * (1 + s)).any(1).double()
         alpha = torch.where(margin > 0, alpha, torch.zeros_like(alpha))
     alpha = alpha.clamp_max(alpha_max)
+    fx, fy, cx, cy = lens.detach()
+    rays = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones(len(pixels), dtype=torch.float64)], -1)
     keys = ray_depths(points, axes, rays) if order == "pixel" else points[:, 2].expand_as(alpha)
     first = keys.detach().argsort(dim=1, stable=True)
     sorted_alpha = alpha.gather(1, first)
@@ -170,13 +193,14 @@ def _composite(rays, pixels, points, axes, mean, conic, opacity, colour, instanc
     if order == "pixel":
         depth_step = keys.detach().gather(1, first).diff(dim=1)
         swap = (before * sorted_alpha)[:, :-1] * sorted_alpha[:, 1:] * (colour[first[:, 1:]] - colour[first[:, :-1]]).abs().amax(-1)
-        unsure = unsure | (torch.where(depth_step < TIE * points[first[:, 1:], 2], swap, torch.zeros_like(swap)).sum(1) > SEEN)
+        jump = jump + torch.where(depth_step < TIE * points[first[:, 1:], 2], swap, torch.zeros_like(swap)).sum(1)
     weight = alpha * before.gather(1, first.argsort(dim=1))
     total = 1 - passing[:, -1] if len(points) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
     depth = torch.where(drawn, weight @ points[:, 2] / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
     who = instances[weight.detach().argmax(1)] if len(points) else torch.full((len(pixels),), -1)
-    return weight @ colour, total, depth, torch.where(total < 0.5, -1, who), unsure
+    out = (weight @ colour, total, depth, torch.where(total < 0.5, -1, who), jump)
+    return tuple(t.reshape(*shape, *t.shape[1:]) for t in out)
 
 
 def as_oracle(placed: list[Placed]) -> list[tuple[dict[str, torch.Tensor], torch.Tensor, int]]:

@@ -211,7 +211,7 @@ def project(
     depth_keys[j] = CULLED
     t = pose.rotation * means[i] + pose.translation
     opacity = sigmoid(logit_opacities[i])
-    if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and wp.log(opacity) + view.log_cutoff > 0.0:
+    if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.least_opacity:
         axes = pose.rotation * rotation(quats[i])
         scale = exp_scale(log_scales[i])
         if in_view(t, axes, scale, view):
@@ -221,7 +221,9 @@ def project(
             det = f.det0 + view.dilation * (f.xx + f.yy + view.dilation)
             if view.antialias != 0:
                 opacity = opacity * wp.sqrt(f.det0 / wp.max(det, TINY))
-            s_max = wp.log(wp.max(opacity, TINY)) + view.log_cutoff
+            s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
+            if opacity <= view.least_opacity:
+                s_max = 0.0
             # written so that a NaN anywhere culls the splat instead of spreading
             if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
                 k2 = 0.5 * yy / det

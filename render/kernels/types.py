@@ -49,6 +49,8 @@ class View:
     dilation: float
     near: float
     log_cutoff: float  # ln(1 / alpha cutoff)
+    faint: float  # opacity below which a splat's cutoff shrinks with it
+    least_opacity: float  # splats up to it are not drawn
     unscented: int
     antialias: int
     sh_count: int

@@ -130,8 +130,9 @@ def test_the_exact_picture_of_two_crossing_walls_changes_order_where_they_cross(
         torch.stack([red, blue])[:, None],
     )
     camera = replace(CAMERA, lens=Pinhole(60.0, 60.0, 35.0, 25.0), world_from_cam=torch.eye(4, dtype=torch.float64))
-    rgb, *_ = oracle.truth(oracle.as_oracle([Placed(walls, torch.eye(4, dtype=torch.float64))]), camera, SplatModel())
-    by_centre, *_ = oracle.render(oracle.as_oracle([Placed(walls, torch.eye(4, dtype=torch.float64))]), camera, SplatModel())
+    placed = [Placed(walls, torch.eye(4, dtype=torch.float64))]
+    rgb, _ = oracle.truth(placed, camera, SplatModel())
+    by_centre, _ = oracle.truth(placed, camera, SplatModel(), order="tile")
     left, right = rgb[25, 30] > 0.5, rgb[25, 39] > 0.5
     assert left.tolist() == [False, False, True] and right.tolist() == [True, False, False]
     assert (by_centre[25, [30, 39], 0] > 0.5).all()

@@ -1,0 +1,87 @@
+"""`RenderConfig(max_error=e)`: no pixel is further than e from truth, on random scenes of every kind and on the presets."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import RenderConfig, rasterize
+from scenes import Camera, Pinhole, Placed, SplatModel
+from scenes.poses import translation
+from tests import oracle
+from tests.bench.presets import random_splats, uniform
+
+BUDGETS = (1 / 64, 1 / 255, 1 / 1024, 1 / 4096)
+CAMERA = Camera(Pinhole(40.0, 41.0, 20.0, 15.0), 40, 30, torch.eye(4, dtype=torch.float64))
+SCENES = 200
+PARTS = 10
+
+
+def random_scene(seed: int) -> tuple[list[Placed], SplatModel]:
+    """3 to 500 splats from dots to walls, from fog to paint, near and far, of both projections, with and without antialiasing."""
+    dice = torch.Generator().manual_seed(seed)
+    count, size, contrast, opacity, distance = torch.rand(5, generator=dice).tolist()
+    g = random_splats(round(10 ** (0.5 + 2.2 * count)), seed, sh_count=(1, 4, 9, 16)[seed % 4])
+    logits = g.logit_opacities * (0.5 + 2 * contrast) + 8 * opacity - 5
+    g = replace(g, log_scales=g.log_scales + 3 * size - 1.5, logit_opacities=logits)
+    model = SplatModel(projection=("ut", "ewa")[seed % 2], antialias=seed % 3 == 0)
+    return [Placed(g, translation(0, 0, 1 + 6 * distance))], model
+
+
+def fog(seed: int) -> tuple[list[Placed], SplatModel]:
+    """Thousands of splats, each of which is below the cutoff of a loose budget, together opaque."""
+    g = random_splats(3000, seed, sh_count=1)
+    return [Placed(replace(g, logit_opacities=torch.full((3000,), -4.0 - seed)), translation(0, 0, 5))], SplatModel()
+
+
+def brightest(placed: list[Placed], camera: Camera) -> float:
+    """The unit of a budget: the brightest colour that a splat shows the camera, 1 at least."""
+    return max(1.0, *(float(oracle.colours(p, camera).max()) for p in placed if len(p.gaussians)))
+
+
+def assert_kept(placed, camera, model, where: str) -> None:
+    rgb, jump = oracle.truth(placed, camera, model, order="tile")
+    unit = brightest(placed, camera)
+    for e in BUDGETS:
+        drawn = rasterize(placed, camera, ("rgb",), model=model, config=RenderConfig(max_error=e)).rgb
+        off = ((drawn.double() - rgb).abs().amax(-1) - jump).max()
+        assert off <= e * unit, f"{where}: {float(off / unit):.2e} from truth with a budget of {e:.2e}"
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_random_scenes_keep_every_budget(part):
+    for seed in range(part * SCENES // PARTS, (part + 1) * SCENES // PARTS):
+        placed, model = random_scene(seed)
+        assert_kept(placed, CAMERA, model, f"scene {seed}")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fog_of_splats_below_the_cutoff_keeps_every_budget(seed):
+    placed, model = fog(seed)
+    assert_kept(placed, CAMERA, model, f"fog {seed}")
+
+
+def test_the_uniform_preset_keeps_every_budget():
+    """As dense as uniform-100k, on 96x64."""
+    g, camera, model = uniform(1176, 96, 64)
+    assert_kept([Placed(g, torch.eye(4, dtype=torch.float64))], camera, model, "uniform")
+
+
+@pytest.mark.parametrize("e", [0.0, -1.0, 1.0, 1e-5, float("nan")])
+def test_a_budget_that_no_picture_can_keep_is_refused(e):
+    with pytest.raises(ValueError, match="max_error must be at least"):
+        RenderConfig(max_error=e)
+
+
+def test_a_looser_budget_draws_less():
+    """Entries of the tiles' lists, which is what time goes with: fewer for every step from strict to loose."""
+    from render.bridge import Settings
+    from tests.render.test_cuda import keep_forward
+
+    g, camera, model = uniform(3000, 192, 128)
+    entries = []
+    for e in BUDGETS:
+        settings = Settings(192, 128, model, RenderConfig(max_error=e), False, False, (0,))
+        kept, _ = keep_forward(settings, g, torch.eye(4, dtype=torch.float64), camera.lens)
+        entries.append(int(kept.lists.starts[-1]))
+    assert entries == sorted(entries) and entries[0] < 0.8 * entries[-1], entries
