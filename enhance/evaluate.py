@@ -19,7 +19,7 @@ from enhance.warp import warp
 from render.compare import psnr
 from render.frame_types import Frame
 from scenes.camera import Camera
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 
 HIGHEST = 60.0
 """PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""

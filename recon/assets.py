@@ -19,7 +19,7 @@ from scenes.databank import Databank
 from scenes.files import load
 from scenes.gaussians import Gaussians
 from scenes.harmonics import basis
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory
@@ -114,7 +114,7 @@ def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
             x, y, z, _ = (cam_from_box @ middle).tolist()
             if z < 0.5:
                 continue
-            u, v = camera.lens.fx * x / z + camera.lens.cx, camera.lens.fy * y / z + camera.lens.cy
+            u, v = camera.lens.project(torch.tensor([x, y, z], dtype=torch.float64)).tolist()
             if 0 <= u < camera.width and 0 <= v < camera.height:
                 away = math.hypot(x, y, z)
                 nearest = min(nearest, away)

@@ -15,10 +15,10 @@ from recon.start import Start
 from scenes.atomic import atomic_file
 from scenes.camera import RigCamera
 from scenes.ground import Ground
-from scenes.lens import Pinhole
+from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 1
+VERSION = 2
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -67,8 +67,18 @@ def _plain_start(start: Start) -> dict:
         ],
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
-        "rig": {n: [r.lens.params(), r.width, r.height, r.body_from_cam, r.times_us] for n, r in start.rig.items()},
+        "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
     }  # fmt: skip
+
+
+def _plain_camera(r: RigCamera) -> list:
+    return [r.lens.kind, r.lens.params(), r.width, r.height, r.body_from_cam, r.times_us, r.shutter, r.readout_us]
+
+
+def _camera(plain: list) -> RigCamera:
+    kind, params, width, height, body_from_cam, times_us, shutter, readout_us = plain
+    lens = LENSES[kind](*params.tolist())
+    return RigCamera(lens, width, height, body_from_cam, times_us=times_us, shutter=shutter, readout_us=readout_us)
 
 
 def _start(plain: dict, fit: dict) -> Start:
@@ -81,7 +91,7 @@ def _start(plain: dict, fit: dict) -> Start:
         )
         for t in plain["tracks"]
     ]  # fmt: skip
-    rig = {n: RigCamera(Pinhole(*r[0].tolist()), r[1], r[2], r[3], times_us=r[4]) for n, r in plain["rig"].items()}
+    rig = {n: _camera(r) for n, r in plain["rig"].items()}
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     return Start(splats, tracks, fit["sky"], fit["exposures"], Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell), rig)

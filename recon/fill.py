@@ -75,7 +75,7 @@ def unexplained(
     z = np.minimum(z[want], np.maximum(0.5, (floor - pose[2, 3]) / down))
     local = rays * z[:, None]
     colour = ndimage.uniform_filter(view.image.numpy().astype(np.float32) / 255, (STEP, STEP, 1))[rows[want], columns[want]] / gain
-    return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / float(camera.lens.fx)
+    return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / camera.lens.focal()[0]
 
 
 def _from_below(depth: np.ndarray) -> np.ndarray:

@@ -171,7 +171,7 @@ class Fit:
             poses, knots, shares = self._boxes[i]
             x, _, z = (from_world @ poses[row])[:3, 3].tolist()
             radius = float(np.linalg.norm(self.boxes[i]))
-            if z > -radius and abs(x) - radius * 1.5 < max(z, 0) * camera.width / (1.6 * float(camera.lens.fx)) + radius:
+            if z > -radius and abs(x) - radius * 1.5 < max(z, 0) * camera.width / (1.6 * camera.lens.focal()[0]) + radius:
                 near.append(i)
                 deltas.append(self.actors[i].correction(knots[row], shares[row]))
         if not near:

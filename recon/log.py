@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from scenes.camera import Camera, RigCamera
-from scenes.lens import Pinhole
+from scenes.lenses import Lens
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
@@ -21,7 +21,7 @@ class LogCamera:
     """A camera of the log: lens and native size, and per frame its file, time (us) and pose `world_from_cam` `[F, 4, 4]`."""
 
     name: str
-    lens: Pinhole
+    lens: Lens
     width: int
     height: int
     files: tuple[Path, ...]

@@ -18,7 +18,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
 from recon.unpickle import read_frame
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 from scenes.poses import interpolate, pose_from, translation
 from scenes.trajectory import Trajectory
 

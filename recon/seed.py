@@ -64,8 +64,7 @@ def project(points: np.ndarray, cam_from_local: np.ndarray, cam: Camera) -> tupl
     """Row, column, depth and whether in view, of points `[N, 3]`."""
     local = points @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
     z = np.maximum(local[:, 2], 1e-6)
-    column = np.floor(cam.lens.fx * local[:, 0] / z + cam.lens.cx)
-    row = np.floor(cam.lens.fy * local[:, 1] / z + cam.lens.cy)
+    column, row = np.floor(cam.lens.project(torch.from_numpy(np.column_stack([local[:, :2], z]))).numpy()).T
     seen = (local[:, 2] > 0.3) & (column >= 0) & (column < cam.width) & (row >= 0) & (row < cam.height)
     return np.where(seen, row, 0).astype(np.int64), np.where(seen, column, 0).astype(np.int64), z, seen
 

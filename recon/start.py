@@ -67,7 +67,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     cloud = Cloud(split.static[known], rgb[known])
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
-    sharpest = 1000 / max(float(r.lens.fx) for r in rig.values())
+    sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
     reach = sharpest * np.maximum(path.query(cloud.xyz)[0], 1.0)
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
 

@@ -57,7 +57,7 @@ def clip_cameras(
     times = scene.frame_times(camera) if times_us is None else torch.as_tensor(times_us, dtype=torch.int64)
     if len(times) == 0:
         raise ValueError(f"a clip of {camera} needs at least one frame, got no times")
-    return [rig_camera.at(ego.at(int(t)), int(t)) for t in times]
+    return [rig_camera.along(ego, int(t)) for t in times]
 
 
 def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | None = None, fps: float | None = None) -> torch.Tensor:

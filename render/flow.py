@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from render.rays import camera_rays
+from render.rays import camera_origins, camera_rays
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
@@ -18,14 +18,14 @@ def image_flow(
     """Flow `[H, W, 2]` in pixels: position in `other` minus position here, of each pixel's surface point.
 
     The point lies at the pixel's depth and moves rigidly with its instance. Where nothing is drawn (instance -1) the pixel is
-    sky and moves by the cameras' rotation only. Points behind the other camera have flow nan.
+    sky and moves by the cameras' rotation only. Points that the other lens does not see have flow nan.
     """
     device = depth.device
     other_from_world = inverse(other.world_from_cam)
     moved = {p.instance: p.world_from_local for p in there}
     rays = camera_rays(camera).to(device)
     sky = depth.isinf() | (instance < 0)
-    points = rays * torch.where(sky, torch.ones_like(depth), depth)[..., None]
+    points = camera_origins(camera).to(device) + rays * torch.where(sky, torch.ones_like(depth), depth)[..., None]
     turn = (other_from_world @ camera.world_from_cam)[:3, :3].to(device, torch.float32)
     out = points @ turn.T
     seen = set(instance.unique().tolist())
@@ -37,4 +37,4 @@ def image_flow(
         mine = (instance == p.instance) & ~sky
         out[mine] = points[mine] @ motion[:3, :3].T + motion[:3, 3]
     flow = other.lens.project(out) - camera.lens.project(points)
-    return torch.where(out[..., 2:] > 0, flow, torch.nan).to(torch.float32)
+    return torch.where(other.lens.valid(out)[..., None], flow, torch.nan).to(torch.float32)

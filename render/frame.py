@@ -41,7 +41,7 @@ def render_frame(
         if f"flow_{way}" in outputs and other is None:
             raise ValueError(f"flow_{way} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] = {
-        way: (scene.placed(c.time_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs
+        way: (scene.placed(c.time_us, c.readout_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs
     }
 
     casters = shadow_casters(scene, camera) if shadows and "rgb" in outputs else []
@@ -50,7 +50,7 @@ def render_frame(
         needed.add("alpha")
     if casters:
         needed |= {"depth", "instance"}
-    placed = scene.placed(camera.time_us)
+    placed = scene.placed(camera.time_us, camera.readout_us)
     frame = rasterize(placed, camera, tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
 
     rgb = frame.rgb if "rgb" in outputs else None
@@ -71,7 +71,9 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Ca
     through = alpha.detach() < 1 - SKY_SHOWS
     if not through.any():
         return rgb
-    colour = sky.colour(world_directions(camera)[through.cpu()]).to(rgb)
+    directions = world_directions(camera)
+    through = through & (directions != 0).any(-1).to(through.device)  # no direction leads to pixels past a lens's edge
+    colour = sky.colour(directions[through.cpu()]).to(rgb)
     behind = colour * (1 - alpha[through])[..., None]
     return rgb.index_put((through,), behind, accumulate=True)
 

@@ -1,4 +1,4 @@
-"""Directions through the pixels of a camera: the same for every frame of a clip, so kept."""
+"""Rays through the pixels of a camera: the same for every frame of a clip, so kept. All that follows projection sees of a lens."""
 
 from __future__ import annotations
 
@@ -7,12 +7,22 @@ from functools import lru_cache
 import torch
 
 from scenes.camera import Camera
+from scenes.lenses import Orthographic
 
 
 def camera_rays(camera: Camera) -> torch.Tensor:
-    """float32 `[H, W, 3]` directions in the camera, z = 1, through the pixel centres; shared, not to be written to."""
-    params = tuple(camera.lens.params().tolist())
-    return _rays(type(camera.lens), params, camera.width, camera.height)  # type: ignore[arg-type]  # mypy hashes the instance
+    """float32 `[H, W, 3]` directions of depth 1 in the camera through the pixel centres; shared, not to be written to.
+
+    0 0 0 where no direction leads to a pixel: past the edge of a fisheye's image.
+    """
+    return _rays(camera.lens.key(), camera.width, camera.height)
+
+
+def camera_origins(camera: Camera) -> torch.Tensor:
+    """float32 `[H, W, 3]` or, where all rays begin in the eye, `[3]`: where the rays begin, in the camera."""
+    if not isinstance(camera.lens, Orthographic):
+        return torch.zeros(3)
+    return camera.lens.origins(camera.pixel_centres()).detach().to(torch.float32)
 
 
 def world_directions(camera: Camera) -> torch.Tensor:
@@ -21,6 +31,7 @@ def world_directions(camera: Camera) -> torch.Tensor:
 
 
 @lru_cache(maxsize=16)
-def _rays(lens_type: type, params: tuple[float, ...], width: int, height: int) -> torch.Tensor:
-    camera = Camera(lens_type(*params), width, height, torch.eye(4, dtype=torch.float64))
+def _rays(key: tuple, width: int, height: int) -> torch.Tensor:
+    lens_type, *numbers = key
+    camera = Camera(lens_type(*numbers), width, height, torch.eye(4, dtype=torch.float64))
     return camera.lens.unproject(camera.pixel_centres()).to(torch.float32)

@@ -12,7 +12,7 @@ time         int64 microseconds; seconds only in text for people
 activation   the name carries it: `log_scales`, `logit_opacities`
 colour       SH to display-referred sRGB; linear only where a name says `linear`
 asset        origin at the base centre of its box, x forward, z up, size `[3]` in metres
-depth        z in metres, divided by alpha, inf where alpha is 0
+depth        z in metres, divided by alpha, inf where alpha is 0; the distance from the eye for lenses that see past 90 degrees
 flow         position in the other frame minus position in this one, pixels, x right y down
 instance     id of the largest compositing weight, -1 where alpha < 0.5; background 0, actors from 1
 """
@@ -23,7 +23,13 @@ _HOME = {
     "Gaussians": "gaussians",
     "Placed": "gaussians",
     "SplatModel": "gaussians",
-    "Pinhole": "lens",
+    "Lens": "lenses",
+    "Pinhole": "lenses",
+    "OpenCV": "lenses",
+    "Fisheye": "lenses",
+    "FTheta": "lenses",
+    "Equirectangular": "lenses",
+    "Orthographic": "lenses",
     "Camera": "camera",
     "RigCamera": "camera",
     "Trajectory": "trajectory",

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from scenes.checks import check_tensor
-from scenes.lens import Pinhole
+from scenes.lenses import Lens
 from scenes.poses import as_pose
+from scenes.trajectory import Trajectory
 
 SHUTTERS = ("global", "rows", "columns")
 
@@ -16,6 +17,13 @@ SHUTTERS = ("global", "rows", "columns")
 def neutral_exposure() -> torch.Tensor:
     """The affine colour `[3, 4]` that changes nothing."""
     return torch.eye(3, 4)
+
+
+def check_shutter(shutter: str, readout_us: int) -> None:
+    if shutter not in SHUTTERS:
+        raise ValueError(f"shutter must be one of {', '.join(SHUTTERS)}, got {shutter!r}")
+    if readout_us < 0 or (readout_us and shutter == "global"):
+        raise ValueError(f'readout_us must be 0 with a global shutter and at least 0 with any, got {readout_us} with "{shutter}"')
 
 
 def check_size(width: int, height: int) -> None:
@@ -27,11 +35,12 @@ def check_size(width: int, height: int) -> None:
 class Camera:
     """One exposure: lens, size in pixels, `world_from_cam` float64 `[4, 4]` (OpenCV axes), and time.
 
-    With an end pose and shutter "rows" or "columns" the pose moves from the first to the last row or column.
+    With an end pose and shutter "rows" or "columns" the pose moves while the image is read out: from `world_from_cam` at the image's
+    top (left) edge to `world_from_cam_end` at its bottom (right) edge, `readout_us` later; `time_us` is when the readout begins.
     `exposure` is an affine colour `[3, 4]` that `render_frame` applies last: rgb' = E[:, :3] rgb + E[:, 3].
     """
 
-    lens: Pinhole
+    lens: Lens
     width: int
     height: int
     world_from_cam: torch.Tensor
@@ -39,11 +48,11 @@ class Camera:
     time_us: int = 0
     shutter: str = "global"
     exposure: torch.Tensor | None = None
+    readout_us: int = 0
 
     def __post_init__(self):
         check_size(self.width, self.height)
-        if self.shutter not in SHUTTERS:
-            raise ValueError(f"shutter must be one of {', '.join(SHUTTERS)}, got {self.shutter!r}")
+        check_shutter(self.shutter, self.readout_us)
         for name in ("world_from_cam", "world_from_cam_end"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_pose(getattr(self, name)))
@@ -63,26 +72,40 @@ class Camera:
 
 @dataclass(frozen=True)
 class RigCamera:
-    """A camera fixed to the body: `body_from_cam` float64 `[4, 4]`, affine exposure `[3, 4]`, and when it took its frames."""
+    """A camera fixed to the body: `body_from_cam` float64 `[4, 4]`, affine exposure `[3, 4]`, and when it took its frames.
 
-    lens: Pinhole
+    shutter "rows" or "columns": an image is read out over `readout_us` from its time on.
+    """
+
+    lens: Lens
     width: int
     height: int
     body_from_cam: torch.Tensor
     exposure: torch.Tensor = field(default_factory=neutral_exposure)
     times_us: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    shutter: str = "global"
+    readout_us: int = 0
 
     def __post_init__(self):
         check_size(self.width, self.height)
+        check_shutter(self.shutter, self.readout_us)
         object.__setattr__(self, "body_from_cam", as_pose(self.body_from_cam))
         check_tensor("body_from_cam", self.body_from_cam, (4, 4), torch.float64)
         check_tensor("exposure", self.exposure, (3, 4))
         check_tensor("times_us", self.times_us, ("F",), torch.int64)
 
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
-        """The camera of a body at a pose."""
+        """The camera of a body that stands at a pose while the image is read out."""
         world_from_cam = world_from_body @ self.body_from_cam
         return Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure)
+
+    def along(self, ego: Trajectory, time_us: int) -> Camera:
+        """The camera of a body on its way, from `time_us` on. ValueError for a time off the path."""
+        camera = self.at(ego.at(time_us), time_us)
+        if self.shutter == "global" or not self.readout_us:
+            return camera
+        end = ego.near(time_us + self.readout_us) @ self.body_from_cam
+        return replace(camera, world_from_cam_end=end, shutter=self.shutter, readout_us=self.readout_us)
 
     def resized(self, width: int, height: int) -> RigCamera:
         """The same camera with an image of another size."""

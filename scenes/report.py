@@ -13,7 +13,7 @@ from scenes.asset import Asset
 from scenes.databank import Databank, Entry
 from scenes.files import USD_SUFFIXES, as_is, kind_of, read, splats_of
 from scenes.gaussians import Gaussians
-from scenes.lens import Pinhole
+from scenes.lenses import Lens
 from scenes.scene import Scene
 
 SCALE_RANGE = 1e-6, 1e4  # metres: beyond, a splat is an accident of training or of units
@@ -89,6 +89,7 @@ def _about_scene(scene: Scene) -> dict:
             "name": name,
             "pixels": f"{c.width}x{c.height}",
             "lens": _lens(c.lens),
+            **({} if c.shutter == "global" else {"shutter": f"{c.shutter} over {c.readout_us / 1000:g} ms"}),
             "frames": len(c.times_us),
             "seconds": [_seconds(t, times[0]) for t in (c.times_us[[0, -1]] if len(c.times_us) else [])],
         }
@@ -127,8 +128,9 @@ def _about_scene(scene: Scene) -> dict:
     }
 
 
-def _lens(lens: Pinhole) -> str:
-    return f"{type(lens).__name__.lower()} " + " ".join(f"{f.name}={float(getattr(lens, f.name)):.6g}" for f in fields(lens))
+def _lens(lens: Lens) -> str:
+    told = [(f, float(getattr(lens, f.name))) for f in fields(lens)]
+    return f"{lens.kind} " + " ".join(f"{f.name}={value:.6g}" for f, value in told if value != f.default)
 
 
 def _seconds(time_us, start_us) -> float:
@@ -168,7 +170,7 @@ def _cell(key: str, value) -> str:
         return "x".join(f"{v:.2f}" for v in value) + " m"
     if key == "seconds":
         return f"{value[0]:g} to {value[1]:g} s"
-    if key in ("name", "track", "id", "label", "pixels", "lens", "licence"):
+    if key in ("name", "track", "id", "label", "pixels", "lens", "shutter", "licence"):
         return str(value)
     if value is True:
         return key

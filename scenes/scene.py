@@ -51,18 +51,24 @@ class Scene:
 
     def camera(self, name: str, time_us: int, ego: Trajectory | None = None) -> Camera:
         """The named camera at a time, on the recorded path or on another one, as `ego.shifted(lateral=2)`."""
-        return self.rig_camera(name).at((ego or self.ego).at(time_us), time_us)
+        return self.rig_camera(name).along(ego or self.ego, time_us)
 
     def frame_times(self, name: str) -> torch.Tensor:
         """When the named camera took its frames, int64 `[F]`; the body's times where the log does not say."""
         times = self.rig_camera(name).times_us
         return times if len(times) else self.ego.times_us
 
-    def placed(self, time_us: int) -> list[Placed]:
-        """Background and the actors that exist at a time, each at its pose and under its instance id."""
+    def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:
+        """Background and the actors that exist at a time, each at its pose and under its instance id; with the pose to which it
+        moves while an image is read out, where that takes `readout_us`."""
         actors = [
-            Placed(a.asset.gaussians, a.trajectory.at(time_us), instance=i + 1)
+            Placed(a.asset.gaussians, a.trajectory.at(time_us), _end(a, time_us, readout_us), instance=i + 1)
             for i, a in enumerate(self.actors)
             if a.trajectory.covers(time_us)
         ]
         return [self.background, *actors]
+
+
+def _end(actor: Actor, time_us: int, readout_us: int) -> torch.Tensor | None:
+    moves = readout_us > 0 and len(actor.trajectory) > 1
+    return actor.trajectory.near(time_us + readout_us) if moves else None

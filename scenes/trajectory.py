@@ -57,6 +57,11 @@ class Trajectory:
         t0, t1 = int(self.times_us[later - 1]), int(self.times_us[later])
         return interpolate(self.world_from_body[later - 1], self.world_from_body[later], (int(time_us) - t0) / (t1 - t0))
 
+    def near(self, time_us: int) -> torch.Tensor:
+        """`world_from_body` `[4, 4]` at a time, or at the nearest that is covered: where a readout ends after the path does."""
+        first, last = self.span_us()
+        return self.at(min(max(int(time_us), first), last))
+
     def shifted(self, lateral: float = 0.0, vertical: float = 0.0, forward: float = 0.0) -> Trajectory:
         """Every pose moved by metres along its own body axes: forward x, left y, up z."""
         return replace(self, world_from_body=self.world_from_body @ translation(forward, lateral, vertical))

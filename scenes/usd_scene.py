@@ -27,7 +27,7 @@ from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.hdr import load_hdr, save_hdr
-from scenes.lens import Pinhole
+from scenes.lenses import LENSES, Orthographic
 from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
@@ -36,7 +36,6 @@ from scenes.usd_splats import Clean, only_splats, read_asset, read_splats, save_
 
 FORMAT = "sidestep scene"
 VERSION = 1
-LENSES = {"pinhole": Pinhole}
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # USD cameras look along -z with y up
 _SKY_TURN = Gf.Quatf(0.5, 0.5, 0.5, 0.5)  # a latlong texture has +y up and +z in its centre: z -> x, x -> y, y -> z
 _APERTURE = 0.20955  # of a 20.955 mm wide film, in USD's tenths of a scene unit: only its ratio to the focal length counts
@@ -171,15 +170,20 @@ def _author_world(stage: Usd.Stage, scene: Scene, cameras: dict[str, str], track
 
 
 def _author_camera(stage: Usd.Stage, where: str, camera: RigCamera) -> None:
-    """A USD camera that sees what the pinhole part of the lens sees: film offsets point to where the image centre looks."""
+    """A USD camera that sees what the lens would see without distortion: film offsets point to where the image centre looks."""
     usd = UsdGeom.Camera.Define(stage, where)
-    fx, fy, cx, cy = camera.lens.params()[:4].tolist()
+    (fx, fy), cx, cy = camera.lens.focal(), float(camera.lens.cx), float(camera.lens.cy)
+    parallel = isinstance(camera.lens, Orthographic)
+    wide = 10 * camera.width / fx if parallel else _APERTURE  # a parallel view's film is as wide as what it sees, in tenths again
     focal = _APERTURE * fx / camera.width
-    tall = focal * camera.height / fy
-    usd.CreateFocalLengthAttr(focal)
-    usd.CreateHorizontalApertureAttr(_APERTURE)
+    tall = wide * fx / camera.width * camera.height / fy
+    if parallel:
+        usd.CreateProjectionAttr("orthographic")
+    else:
+        usd.CreateFocalLengthAttr(focal)
+    usd.CreateHorizontalApertureAttr(wide)
     usd.CreateVerticalApertureAttr(tall)
-    usd.CreateHorizontalApertureOffsetAttr((camera.width / 2 - cx) / camera.width * _APERTURE)
+    usd.CreateHorizontalApertureOffsetAttr((camera.width / 2 - cx) / camera.width * wide)
     usd.CreateVerticalApertureOffsetAttr((cy - camera.height / 2) / camera.height * tall)
     usd.CreateClippingRangeAttr(Gf.Vec2f(0.05, 100_000.0))
     author_pose(usd.GetPrim(), camera.body_from_cam @ _FLIP)
@@ -195,19 +199,21 @@ def _load_camera(stage: Usd.Stage, entry: dict, name: str) -> RigCamera:
         raise ValueError(f"camera {name} has a {kind} lens; this Sidestep knows {', '.join(LENSES)}")
     exposure = torch.tensor(entry["exposure"], dtype=torch.float32)
     times = torch.tensor(entry["times_us"], dtype=torch.int64)
-    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], local_pose(prim) @ _FLIP, exposure, times)
+    shutter = entry.get("shutter", "global"), entry.get("readout_us", 0)  # absent from scenes of before
+    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], local_pose(prim) @ _FLIP, exposure, times, *shutter)
 
 
 def _metadata(scene: Scene, cameras: dict[str, str], origin: int) -> str:
-    kinds = {lens: kind for kind, lens in LENSES.items()}
     table = {
         name: {
             "prim": cameras[name],
-            "lens": {"type": kinds[type(c.lens)], **{f.name: float(getattr(c.lens, f.name)) for f in fields(c.lens)}},
+            "lens": {"type": c.lens.kind, **{f.name: float(getattr(c.lens, f.name)) for f in fields(c.lens)}},
             "width": c.width,
             "height": c.height,
             "exposure": c.exposure.detach().cpu().tolist(),
             "times_us": c.times_us.tolist(),
+            "shutter": c.shutter,
+            "readout_us": c.readout_us,
         }
         for name, c in scene.rig.items()
     }

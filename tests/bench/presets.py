@@ -13,7 +13,7 @@ import torch
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, SplatModel
 from scenes.harmonics import sh_from_rgb
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 
 SHARED = Path(os.environ.get("SIDESTEP_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 

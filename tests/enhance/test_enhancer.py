@@ -9,7 +9,7 @@ from enhance.net import Net
 from enhance.weights_file import BUILTIN, load_net, save_net
 from render.frame_types import Frame
 from scenes.camera import Camera
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from recon.fill import FAR, SkyPicture, unexplained
 from recon.frames import View
 from recon.skies import like_sky, sky_mask
 from scenes.camera import Camera
-from scenes.lens import Pinhole
+from scenes.lenses import Pinhole
 
 
 def house_under_sky():
