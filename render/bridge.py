@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from render.chunks import Sums, room_in, windows
 from render.frame_types import RenderConfig
 from render.kernels.composite import composite, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.project import project, project_backward
-from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, lanes
+from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, Window, lanes
 from render.launch import BANDS, run, run_blocks, stage, view
-from render.order import TileLists, tile_lists
+from render.order import TileLists, depth_order, tile_lists
 from scenes.gaussians import SplatModel
 
 NEAR = 0.1
@@ -48,11 +49,6 @@ class Settings:
         return -(-self.height // TILE)
 
     @property
-    def pitch(self) -> int:
-        """Tiles of a stored row: odd, so that the 16 rows of a tile do not fall into one cache set on wide images."""
-        return self.tiles_x | 1
-
-    @property
     def cutoff(self) -> float:
         return max(self.config.alpha_cutoff, 1e-10)
 
@@ -80,12 +76,34 @@ class Settings:
         """Entries between two looks for pixels that are done: (1 - alpha_max)^early may be 1e-24 at least."""
         return 8 if self.alpha_max <= 0.999 else 4
 
-    def planes(self, count: int, device) -> torch.Tensor:
-        """Row-major planes `[count, rows, pitch * 16]`, not initialised: the kernels write every pixel of every tile."""
-        return torch.empty(count, self.tiles_y * TILE, self.pitch * TILE, device=device)
-
     def crop(self, planes: torch.Tensor) -> torch.Tensor:
         return planes[..., : self.height, : self.width]
+
+
+@dataclass
+class Part:
+    """A window of the image, as drawn: its lists and their exact counts (None where backward shall make them again, to save memory),
+    where compositing ended, and the final transmittance."""
+
+    window: Window
+    lists: TileLists | None = None
+    counts: torch.Tensor | None = None
+    ends: tuple[torch.Tensor, ...] = ()
+    final_t: torch.Tensor | None = None
+
+
+def _planes(window: Window, count: int, device) -> torch.Tensor:
+    """Row-major planes `[count, rows, pitch * 16]` of a window, not initialised: the kernels write every pixel of every tile.
+
+    A stored row has an odd number of tiles, so that the 16 rows of a tile do not fall into one cache set on wide images.
+    """
+    return torch.empty(count, window.tiles_y * TILE, (window.tiles_x | 1) * TILE, device=device)
+
+
+def _inside(planes: torch.Tensor, window: Window) -> torch.Tensor:
+    """The window's pixels of planes of the whole image."""
+    top, left = window.top * TILE, window.left * TILE
+    return planes[..., top : top + window.tiles_y * TILE, left : left + window.tiles_x * TILE]
 
 
 def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
@@ -144,10 +162,22 @@ class Rasterize(torch.autograd.Function):
             uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
             uniforms.append(uniform)
             run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
-        lists = tile_lists(records, keys, counts, settings.tiles_x, settings.tiles_y, counting=device.type == "cpu")
-        planes, ends = _composite(settings, lists, records)
-        ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.lists = settings, groups, uniforms, sizes, lists
-        ctx.records, ctx.counts, ctx.ends, ctx.final_t = records, counts, ends, planes[0]
+        order = depth_order(keys)
+        parts = [Part(w) for w in windows(records, counts, settings.tiles_x, settings.tiles_y, settings.config.most_entries)]
+        planes = records
+        for part in parts:
+            room = counts if len(parts) == 1 else room_in(records, counts, part.window)
+            lists = tile_lists(records, order, room, part.window, counting=device.type == "cpu")
+            drawn, part.ends = _composite(settings, part.window, lists, records)
+            part.final_t = drawn[0]
+            if len(parts) == 1:
+                planes, part.lists, part.counts = drawn, lists, room
+            else:
+                if part is parts[0]:
+                    planes = drawn.new_empty(len(drawn), settings.tiles_y * TILE, settings.tiles_x * TILE)
+                _inside(planes, part.window).copy_(drawn[..., : part.window.tiles_x * TILE])
+        ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.parts = settings, groups, uniforms, sizes, parts
+        ctx.records, ctx.counts, ctx.order = records, counts, order
         ctx.like_pose, ctx.like_lens = cam_from_local.new_empty(0), lens.new_empty(0)
         rgb = settings.crop(planes[1:4])
         alpha = 1 - settings.crop(planes[0])
@@ -160,80 +190,100 @@ class Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, _g_instance):
-        settings, lists, device = ctx.settings, ctx.lists, ctx.records.device
-        total = lists.ids.shape[0]
-        slots = torch.empty(total, GRADIENTS, device=device)
+        settings, device = ctx.settings, ctx.records.device
         outputs: list = []
         g_uniform = []
         with stage(device):
-            grads = settings.planes(6 if settings.depth else 4, device).zero_()
-            settings.crop(grads[:3]).copy_(g_rgb)
-            settings.crop(grads[3]).copy_(g_alpha).neg_().mul_(settings.crop(ctx.final_t))  # alpha = 1 - T
-            if settings.depth:
-                settings.crop(grads[4]).copy_(g_z)
-                settings.crop(grads[5]).copy_(g_weights)
-            _composite_backward(settings, lists, ctx.records, grads, ctx.ends, ctx.final_t, slots)
+            sums = Sums(ctx.counts) if len(ctx.parts) > 1 else None
+            for part in ctx.parts:
+                counts, lists = part.counts, part.lists
+                if lists is None:
+                    counts = room_in(ctx.records, ctx.counts, part.window)
+                    lists = tile_lists(ctx.records, ctx.order, counts, part.window, counting=device.type == "cpu")
+                grads = _part_gradients(settings, part, g_rgb, g_alpha, g_z, g_weights)
+                slots = _composite_backward(settings, part, lists, ctx.records, grads)
+                starts = lists.first_slot
+                if sums is not None:
+                    sums.add(counts, lists, slots)
+                    counts, starts, slots = sums.counts, sums.starts, sums.slots
             for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
                 out = [torch.empty_like(f) for f in group]
                 chunk = POSE_CHUNK if device.type == "cpu" else 1
-                parts = -(-size // chunk)
-                shared = torch.empty(parts, UNIFORM_GRADIENTS, device=device)
-                args = [*_arrays(group), *uniform, size, chunk, view(ctx.counts, int), view(lists.first_slot, int), view(slots, float)]
-                run(project_backward, parts, [*args, *_arrays(out), view(shared, float)], device)
+                items = -(-size // chunk)
+                shared = torch.empty(items, UNIFORM_GRADIENTS, device=device)
+                args = [*_arrays(group), *uniform, size, chunk, view(counts, int), view(starts, int), view(slots, float)]
+                run(project_backward, items, [*args, *_arrays(out), view(shared, float)], device)
                 outputs += out
                 g_uniform.append(shared)
         if not any(ctx.needs_input_grad[1:3]):
             return None, None, None, *outputs
-        sums = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
-        g_pose = sums.new_zeros(len(sums), 4, 4)
-        g_pose[:, :3, :3] = sums[:, :9].reshape(-1, 3, 3)
-        g_pose[:, :3, 3] = sums[:, 9:12]
-        return None, g_pose.to(ctx.like_pose), sums[:, 12:].sum(0).to(ctx.like_lens), *outputs
+        shared = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
+        g_pose = shared.new_zeros(len(shared), 4, 4)
+        g_pose[:, :3, :3] = shared[:, :9].reshape(-1, 3, 3)
+        g_pose[:, :3, 3] = shared[:, 9:12]
+        return None, g_pose.to(ctx.like_pose), shared[:, 12:].sum(0).to(ctx.like_lens), *outputs
 
 
-def _lane_planes(settings: Settings, planes: torch.Tensor) -> list:
-    return [view(p.view(p.shape[0], settings.pitch, TILE), lanes) for p in planes]
+def _part_gradients(settings: Settings, part: Part, g_rgb, g_alpha, g_z, g_weights) -> torch.Tensor:
+    """The window's planes of dL/d (r, g, b), T * dL/dT, and, with depth, dL/d (w z, w); 0 beyond the image."""
+    assert part.final_t is not None
+    grads = _planes(part.window, 6 if settings.depth else 4, part.final_t.device).zero_()
+    image = [g_rgb, g_alpha[None], *((g_z[None], g_weights[None]) if settings.depth else ())]
+    first = 0
+    for g in image:
+        inside = _inside(g, part.window)
+        grads[first : first + len(g), : inside.shape[1], : inside.shape[2]] = inside
+        first += len(g)
+    grads[3].neg_().mul_(part.final_t)  # alpha = 1 - T
+    return grads
 
 
-def _composite(settings: Settings, lists: TileLists, records: torch.Tensor):
+def _lane_planes(planes: torch.Tensor) -> list:
+    return [view(p.view(p.shape[0], -1, TILE), lanes) for p in planes]
+
+
+def _composite(settings: Settings, window: Window, lists: TileLists, records: torch.Tensor):
     """Planes (T, r, g, b[, w z, w][, instance]) and where compositing ended: one past the last entry of each row, and where in the
     tile's list each pixel went dark (CPU); one past the last entry of each pixel (CUDA)."""
-    device, tiles = records.device, settings.tiles_x * settings.tiles_y
-    planes = settings.planes(7 if settings.instance else 6 if settings.depth else 4, device)
+    device, tiles = records.device, window.tiles_x * window.tiles_y
+    planes = _planes(window, 7 if settings.instance else 6 if settings.depth else 4, device)
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(records, float)]
     limits = [settings.alpha_max, settings.termination]
     if device.type == "cuda":
         last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
         out = [view(planes[min(i, len(planes) - 1)], float) for i in range(7)]
         kernel = composite_blocks(settings.depth, settings.instance, TILE)
-        run_blocks(kernel, tiles, TILE * TILE, [*lists_of, settings.tiles_x, *limits, *out, view(last, int)], device)
+        run_blocks(kernel, tiles, TILE * TILE, [*lists_of, window, *limits, *out, view(last, int)], device)
         return planes, (last,)
-    last = torch.empty(planes.shape[1], settings.pitch, dtype=torch.int32)
-    dark_at = settings.planes(1, device)[0]
-    rows = _lane_planes(settings, planes)
+    last = torch.empty(planes.shape[1], planes.shape[2] // TILE, dtype=torch.int32)
+    dark_at = _planes(window, 1, device)
+    rows = _lane_planes(planes)
     out = [rows[min(i, len(rows) - 1)] for i in range(7)]
-    grid = [settings.tiles_x, tiles, BANDS]
     kernel = composite(settings.depth, settings.instance, settings.squarings, settings.early)
-    run(kernel, BANDS, [*lists_of, *grid, *limits, *_working(), *out, view(last, int), *_lane_planes(settings, dark_at[None])], device)
+    run(kernel, BANDS, [*lists_of, window, BANDS, *limits, *_working(), *out, view(last, int), *_lane_planes(dark_at)], device)
     return planes, (last, dark_at)
 
 
-def _composite_backward(settings: Settings, lists: TileLists, records, grads, ends, final_t, slots) -> None:
-    """Fill `slots`; grads are planes (r, g, b, T * dL/dT[, w z, w])."""
-    device, tiles = records.device, settings.tiles_x * settings.tiles_y
+def _composite_backward(settings: Settings, part: Part, lists: TileLists, records: torch.Tensor, grads: torch.Tensor) -> torch.Tensor:
+    """The gradient slots `[I, GRADIENTS]` of the window's entries; grads are planes as of `_part_gradients`."""
+    assert part.final_t is not None
+    device, tiles = records.device, part.window.tiles_x * part.window.tiles_y
+    slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float)]
     on_cuda = device.type == "cuda"
-    r, g, b, t_gradient, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(settings, grads)
+    r, g, b, t_gradient, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(grads)
     z, w = extra or (r, r)
     if on_cuda:
         kernel = composite_blocks_gradient(settings.depth, TILE)
-        args = [*lists_of, settings.tiles_x, settings.alpha_max, r, g, b, z, w, view(ends[0], int), view(final_t, float), t_gradient]
+        ends = [view(part.ends[0], int), view(part.final_t, float)]
+        args = [*lists_of, part.window, settings.alpha_max, r, g, b, z, w, *ends, t_gradient]
         run_blocks(kernel, tiles, TILE * TILE, [*args, view(slots, float)], device)
-        return
-    args = [*lists_of, settings.tiles_x, tiles, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(ends[0], int)]
+        return slots
+    args = [*lists_of, part.window, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(part.ends[0], int)]
     kernel = composite_gradient(settings.depth, settings.squarings, settings.early)
-    lanes_of_pixels = [*_lane_planes(settings, ends[1][None]), *_lane_planes(settings, final_t[None])]
+    lanes_of_pixels = [*_lane_planes(part.ends[1]), *_lane_planes(part.final_t[None])]
     run(kernel, BANDS, [*args, *lanes_of_pixels, t_gradient, view(slots, float)], device)
+    return slots
 
 
 def _working() -> list:

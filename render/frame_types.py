@@ -18,7 +18,8 @@ class RenderConfig:
 
     alpha_cutoff: contributions below it are skipped; alpha_max: no splat is more opaque;
     termination: a pixel is finished when this much light still passes; faint: splats less opaque than this are drawn out to
-    a cutoff that is less by as much. max_error: the largest error of a pixel's colour; it sets all the others (`render/budget.py`).
+    a cutoff that is less by as much. max_error: the largest error of a pixel's colour; it sets all these (`render/budget.py`).
+    most_entries: splat-tile entries that are drawn at once; it bounds memory and changes no pixel (`render/chunks.py`).
     """
 
     alpha_cutoff: float = 1 / 255
@@ -26,6 +27,7 @@ class RenderConfig:
     termination: float = 1e-4
     faint: float = 0.0
     max_error: float | None = None
+    most_entries: int = 1 << 25
 
     def __post_init__(self):
         if self.max_error is not None:
@@ -34,6 +36,8 @@ class RenderConfig:
         for name in ("alpha_cutoff", "termination", "faint"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
+        if not 1 <= self.most_entries < 2**31:
+            raise ValueError(f"most_entries must be at least 1 and below 2^31, got {self.most_entries}")
         if not 0 < self.alpha_max <= 1:
             raise ValueError(f"alpha_max must be above 0 and at most 1, got {self.alpha_max}")
 

@@ -8,6 +8,7 @@ import torch
 
 from render.kernels.bin import count_chunks, emit_chunks, emit_pairs
 from render.kernels.project import CULLED
+from render.kernels.types import Window
 from render.launch import run, sort_pairs, view
 
 CHUNKS = 8
@@ -40,20 +41,15 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
     return pair[1, :n]
 
 
-def tile_lists(
-    records: torch.Tensor, keys: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, counting: bool = True
-) -> TileLists:
-    """Sort the visible records by depth once, then deal them to tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
+def tile_lists(records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, counting: bool = True) -> TileLists:
+    """Deal the visible records, sorted by depth, to the window's tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
     counts `[N]`: entries to set aside for each record; replaced by how many it has.
     """
-    device, tiles = records.device, tiles_x * tiles_y
-    order = depth_order(keys)
+    device, tiles = records.device, window.tiles_x * window.tiles_y
     visible = order.shape[0]
     ends = counts[order].cumsum(0)
     total = int(ends[-1]) if visible else 0
-    if total >= 2**31:
-        raise ValueError(f"{total} splat-tile intersections do not fit one pass (2^31); render a smaller image or fewer, smaller splats")
     first_slot = torch.empty_like(counts)
     first_slot[order] = (ends - counts[order]).to(torch.int32)
     ids = torch.empty(total, dtype=torch.int32, device=device)
@@ -63,7 +59,7 @@ def tile_lists(
         chunk = -(-visible // CHUNKS)
         histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
         tile_keys = torch.empty(total, dtype=torch.int32)
-        args = [view(records, float), view(order, int), visible, chunk, tiles_x, tiles_y, view(first_slot, int)]
+        args = [view(records, float), view(order, int), visible, chunk, window, view(first_slot, int)]
         run(count_chunks, CHUNKS, [*args, view(counts, int), view(histogram, int), view(tile_keys, int)], device)
         by_tile = histogram.t().reshape(-1)
         after = by_tile.cumsum(0, dtype=torch.int32)
@@ -74,7 +70,7 @@ def tile_lists(
     elif total:
         pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
         owner = torch.empty(total, dtype=torch.int32, device=device)
-        args = [view(records, float), view(order, int), tiles_x, tiles_y, view(first_slot, int), view(counts, int)]
+        args = [view(records, float), view(order, int), window, view(first_slot, int), view(counts, int)]
         run(emit_pairs, visible, [*args, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
         sort_pairs(pair[0], pair[1], total)
         slot_of = pair[1, :total].clone()

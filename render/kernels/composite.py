@@ -1,7 +1,7 @@
 """Front-to-back compositing on lane vectors, and its backward, for the CPU: a thread takes a band of tiles, a lane vector one row of one.
 
-Planes are `[rows, tiles_x]` lane vectors: plain row-major images whose width is padded to the tile. While a tile is worked on,
-its rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row would
+Planes are `[rows, tiles_x]` lane vectors of one window: row-major images whose width is padded to the tile. While a tile is worked on, its
+rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row would
 be another page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to
 front from a stored last entry per row: the front-to-back form (total minus prefix) cancels in float32.
 
@@ -40,6 +40,7 @@ from render.kernels.types import (
     H,
     K,
     M,
+    Window,
     X,
     Y,
     Z,
@@ -100,7 +101,7 @@ def composite(depth: bool, instance: bool, squarings: int, early: int):
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
-        tiles_x: int, tiles: int, bands: int, alpha_max: float, termination: float,
+        window: Window, bands: int, alpha_max: float, termination: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
         out_t: wp.array2d[lanes], out_r: wp.array2d[lanes], out_g: wp.array2d[lanes], out_b: wp.array2d[lanes],
         out_z: wp.array2d[lanes], out_w: wp.array2d[lanes], out_instance: wp.array2d[lanes], last: wp.array2d[int],
@@ -113,11 +114,13 @@ def composite(depth: bool, instance: bool, squarings: int, early: int):
         """
         band = first + wp.tid()
         column = columns[0]
+        tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % tiles_x
-            row0 = (tile // tiles_x) * TILE
-            x0 = float(tx * TILE) + 0.5
-            y0 = float(row0) + 0.5
+            tx = tile % window.tiles_x
+            ty = tile // window.tiles_x
+            row0 = ty * TILE
+            x0 = float((window.left + tx) * TILE) + 0.5
+            y0 = float((window.top + ty) * TILE) + 0.5
             start = tile_starts[tile]
             for r in range(TILE):
                 state[band, 0, r] = lanes(1.0)
@@ -207,7 +210,7 @@ def composite_gradient(depth: bool, squarings: int, early: int):
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        tiles_x: int, tiles: int, bands: int, alpha_max: float,
+        window: Window, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
         g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes], g_w: wp.array2d[lanes],
         last: wp.array2d[int], dark_at: wp.array2d[lanes], final_t: wp.array2d[lanes], t_gradient: wp.array2d[lanes],
@@ -222,11 +225,13 @@ def composite_gradient(depth: bool, squarings: int, early: int):
         band = first + wp.tid()
         column = columns[0]
         one = lanes(1.0)
+        tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % tiles_x
-            row0 = (tile // tiles_x) * TILE
-            x0 = float(tx * TILE) + 0.5
-            y0 = float(row0) + 0.5
+            tx = tile % window.tiles_x
+            ty = tile // window.tiles_x
+            row0 = ty * TILE
+            x0 = float((window.left + tx) * TILE) + 0.5
+            y0 = float((window.top + ty) * TILE) + 0.5
             start = tile_starts[tile]
             stop = start
             for r in range(TILE):

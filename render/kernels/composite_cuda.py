@@ -29,6 +29,7 @@ from render.kernels.types import (
     H,
     K,
     M,
+    Window,
     X,
     Y,
     Z,
@@ -44,15 +45,15 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
-        tiles_x: int, alpha_max: float, termination: float,
+        window: Window, alpha_max: float, termination: float,
         out_t: wp.array2d[float], out_r: wp.array2d[float], out_g: wp.array2d[float], out_b: wp.array2d[float],
         out_z: wp.array2d[float], out_w: wp.array2d[float], out_instance: wp.array2d[float], last: wp.array2d[int],
     ):  # fmt: skip
         tile, thread = wp.tid()
-        px = (tile % tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
-        py = (tile // tiles_x) * wp.static(tile_size) + thread // wp.static(tile_size)
-        x = float(px) + 0.5
-        y = float(py) + 0.5
+        px = (tile % window.tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
+        py = (tile // window.tiles_x) * wp.static(tile_size) + thread // wp.static(tile_size)
+        x = float(window.left * wp.static(tile_size) + px) + 0.5
+        y = float(window.top * wp.static(tile_size) + py) + 0.5
         t = float(1.0)
         colour = wp.vec3(0.0)
         z = float(0.0)
@@ -101,16 +102,16 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        tiles_x: int, alpha_max: float,
+        window: Window, alpha_max: float,
         g_r: wp.array2d[float], g_g: wp.array2d[float], g_b: wp.array2d[float], g_z: wp.array2d[float], g_w: wp.array2d[float],
         last: wp.array2d[int],
         final_t: wp.array2d[float], t_gradient: wp.array2d[float], slots: wp.array2d[float],
     ):  # fmt: skip
         tile, thread = wp.tid()
-        px = (tile % tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
-        py = (tile // tiles_x) * wp.static(tile_size) + thread // wp.static(tile_size)
-        x = float(px) + 0.5
-        y = float(py) + 0.5
+        px = (tile % window.tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
+        py = (tile // window.tiles_x) * wp.static(tile_size) + thread // wp.static(tile_size)
+        x = float(window.left * wp.static(tile_size) + px) + 0.5
+        y = float(window.top * wp.static(tile_size) + py) + 0.5
         start = tile_starts[tile]
         count = tile_starts[tile + 1] - start
         t = final_t[py, px]

@@ -15,7 +15,7 @@ a splat is not drawn when its ellipsoid of 3.33 sigma lies wholly beyond one sid
 
 import warp as wp
 
-from render.kernels.bin import tile_span
+from render.kernels.bin import ROOM, tile_span
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
@@ -60,7 +60,6 @@ REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1
 CULLED = wp.constant(2147483647)
 TINY = wp.constant(1.0e-30)
 FARTHEST = wp.constant(1.0e12)  # metres from the camera beyond which a splat is not drawn: squares of squares must stay floats
-ROOM = wp.constant(1.0001)  # the box that sets room aside is this much wider than the ellipse, whatever rounding does to either
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
 vec_axis = wp.types.vector(length=8, dtype=wp.float32)
 vec_uniform = wp.types.vector(length=UNIFORM_GRADIENTS, dtype=wp.float32)

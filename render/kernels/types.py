@@ -29,6 +29,16 @@ SLACK = wp.constant(0.01)  # px: extents are widened by this, so that rounding n
 
 
 @wp.struct
+class Window:
+    """Part of the image that is drawn at once, in tiles."""
+
+    left: int
+    top: int
+    tiles_x: int
+    tiles_y: int
+
+
+@wp.struct
 class View:
     """A camera and how to draw: everything that is the same for all splats."""
 

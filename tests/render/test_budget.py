@@ -83,5 +83,5 @@ def test_a_looser_budget_draws_less():
     for e in BUDGETS:
         settings = Settings(192, 128, model, RenderConfig(max_error=e), False, False, (0,))
         kept, _ = keep_forward(settings, g, torch.eye(4, dtype=torch.float64), camera.lens)
-        entries.append(int(kept.lists.starts[-1]))
+        entries.append(int(kept.parts[0].lists.starts[-1]))
     assert entries == sorted(entries) and entries[0] < 0.8 * entries[-1], entries

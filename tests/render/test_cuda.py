@@ -9,13 +9,14 @@ import warp as wp
 
 from render import rasterize
 from render.bridge import Rasterize, Settings
+from render.chunks import window
 from render.frame_types import RenderConfig
 from render.kernels import bin as bin_kernels
 from render.kernels import project as project_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.types import GRADIENTS, TILE
 from render.launch import run, run_blocks, view
-from render.order import tile_lists
+from render.order import depth_order, tile_lists
 from scenes import Pinhole, SplatModel
 from scenes.poses import translation
 from tests.bench.presets import random_splats
@@ -57,6 +58,10 @@ def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhol
     return kept, Rasterize.forward(kept, settings, pose[None], lens.params(), *gaussians.tensors().values())
 
 
+def whole(settings: Settings):
+    return window(0, 0, settings.tiles_x, settings.tiles_y)
+
+
 def lane_result():
     """Forward of the lane kernels with depth and instance: settings, kept state, outputs."""
     settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), True, True, (5,))
@@ -87,7 +92,7 @@ def test_block_kernels_agree_with_lane_kernels():
     last = torch.empty(HEIGHT, WIDTH, dtype=torch.int32)
     lists = [view(starts, int), view(ids, int)]
     limits = [settings.alpha_max, settings.config.termination]
-    args = [*lists, view(records, float), WIDTH, *limits, *(view(p, float) for p in planes), view(last, int)]
+    args = [*lists, view(records, float), window(0, 0, WIDTH, HEIGHT), *limits, *(view(p, float) for p in planes), view(last, int)]
     cpu = torch.device("cpu")
     run_blocks(composite_blocks(True, True, 1), pixels, 1, args, cpu)
     rgb, alpha, z, weights, instance = outputs
@@ -99,8 +104,14 @@ def test_block_kernels_agree_with_lane_kernels():
     slots = torch.empty(n * pixels, GRADIENTS)
     backs = [*g_rgb, g_z, g_w]
     t_gradient = -g_alpha * planes[0]
-    args = [*lists, view(slot_of, int), view(records, float), WIDTH, settings.alpha_max, *(view(p.contiguous(), float) for p in backs)]
-    args += [view(last, int), view(planes[0], float), view(t_gradient, float), view(slots, float)]
+    args = [*lists, view(slot_of, int), view(records, float), window(0, 0, WIDTH, HEIGHT), settings.alpha_max]
+    args += [
+        *(view(p.contiguous(), float) for p in backs),
+        view(last, int),
+        view(planes[0], float),
+        view(t_gradient, float),
+        view(slots, float),
+    ]
     run_blocks(composite_blocks_gradient(True, 1), pixels, 1, args, cpu)
     out = [torch.empty_like(t) for t in group]
     shared = torch.empty(2, 16)
@@ -119,8 +130,8 @@ def test_sorted_pairs_make_the_same_lists_as_counting():
     keys = torch.where(kept.counts > 0, kept.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     box = kept.counts + (kept.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
     count, pair = box.clone(), box.clone()
-    counted = tile_lists(kept.records, keys, count, settings.tiles_x, settings.tiles_y)
-    paired = tile_lists(kept.records, keys, pair, settings.tiles_x, settings.tiles_y, counting=False)
+    counted = tile_lists(kept.records, depth_order(keys), count, whole(settings))
+    paired = tile_lists(kept.records, depth_order(keys), pair, whole(settings), counting=False)
     assert torch.equal(count, kept.counts) and torch.equal(pair, kept.counts)
     total = int(counted.starts[-1])
     assert total == int(kept.counts.sum()) > 100

@@ -322,9 +322,9 @@ def test_a_tile_lists_a_splat_exactly_when_one_of_its_pixels_shows_it(seed):
     x, y, k, m, h, _, s_max = kept.records[:, :7].double().unbind(1)
     rows, columns = torch.meshgrid(torch.arange(settings.tiles_y * TILE) + 0.5, torch.arange(settings.tiles_x * TILE) + 0.5, indexing="ij")
     listed = torch.zeros(len(g), settings.tiles_x * settings.tiles_y, dtype=torch.bool)
-    total = int(kept.lists.starts[-1])
-    tile = torch.repeat_interleave(torch.arange(listed.shape[1]), kept.lists.starts.diff().long())
-    listed[kept.lists.ids[:total].long(), tile] = True
+    total = int(kept.parts[0].lists.starts[-1])
+    tile = torch.repeat_interleave(torch.arange(listed.shape[1]), kept.parts[0].lists.starts.diff().long())
+    listed[kept.parts[0].lists.ids[:total].long(), tile] = True
     assert total == int(listed.sum()) == int(kept.counts.sum()), "an entry twice, or a count that lies"
     reached = 0
     for i in torch.nonzero(kept.counts > 0).flatten():
