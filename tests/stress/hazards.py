@@ -236,17 +236,27 @@ def run(name: str, device: str = "cpu") -> Outcome:
     """All cases of one hazard."""
     outcome = Outcome()
     for case in HAZARDS[name]():
-        held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        start = time.perf_counter()
-        wrong = examine(case, device)
-        outcome.milliseconds = max(outcome.milliseconds, 1000 * (time.perf_counter() - start))
-        taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - held
-        outcome.memory = max(outcome.memory, taken)
-        if taken > MOST_BYTES:
-            wrong.append(f"took {taken / 2**30:.1f} GiB")
-        outcome.cases += 1
-        outcome.failures += [f"{case.name}: {what}" for what in wrong]
+        _measure(outcome, lambda c=case: [f"{c.name}: {what}" for what in examine(c, device)])
     return outcome
+
+
+def run_conduct(check: Callable[[str], list[str]], device: str = "cpu") -> Outcome:
+    """One conduct, as one case."""
+    outcome = Outcome()
+    _measure(outcome, lambda: check(device))
+    return outcome
+
+
+def _measure(outcome: Outcome, work: Callable[[], list[str]]) -> None:
+    held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    start = time.perf_counter()
+    outcome.failures += work()
+    outcome.milliseconds = max(outcome.milliseconds, 1000 * (time.perf_counter() - start))
+    taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - held
+    outcome.memory = max(outcome.memory, taken)
+    if taken > MOST_BYTES:
+        outcome.failures.append(f"took {taken / 2**30:.1f} GiB")
+    outcome.cases += 1
 
 
 def table(outcomes: dict[str, Outcome]) -> str:
