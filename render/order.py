@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from render.kernels.bin import count_chunks, emit_chunks, emit_pairs
-from render.kernels.project import CULLED
-from render.kernels.types import Window
+from render.kernels.types import CULLED, Window
 from render.launch import run, sort_pairs, view
 
 CHUNKS = 8

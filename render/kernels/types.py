@@ -26,6 +26,12 @@ UNIFORM_GRADIENTS = 16
 """Floats of the gradient shared by all splats of an instance: rotation (row major), translation, fx, fy, cx, cy."""
 
 SLACK = wp.constant(0.01)  # px: extents are widened by this, so that rounding never drops a pixel that the exponent admits
+ROOT3 = wp.constant(1.7320508075688772)
+NEAREST = wp.constant(0.5)  # of the centre's depth: sigma points nearer than that are not looked at
+REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1/255
+FARTHEST = wp.constant(1.0e12)  # metres from the camera beyond which a splat is not drawn: squares of squares must stay floats
+CULLED = wp.constant(2147483647)
+TINY = wp.constant(1.0e-30)
 
 
 @wp.struct

@@ -1,0 +1,140 @@
+"""The 2D Gaussian of a splat behind a pinhole, EWA or unscented, in closed form, and its derivative.
+
+Axis k of the splat, as an offset o from its centre t in the camera, moves the pixel along e = f (o_xy - n o_z), n = t_xy / t_z. EWA
+moves it by e / z. The unscented transform (alpha = 1, beta = 2, kappa = 0, so sigma points at +-sqrt(3)) moves it by +-r e with
+r = sqrt(3) / (z +- sqrt(3) o_z): exact for a pinhole and free of cancellation, since nothing is measured from the image origin. Then
+
+    covariance = sum_k w_k e_k e_k' + mu mu',   mu = sum_k b_k e_k,   w = (r+^2 + r-^2) / 6,  b = (r+ - r-) / 6
+
+and its determinant is a sum of squares (Cauchy-Binet), so that needles keep all their digits. Near the camera plane the moments of
+a perspective Gaussian diverge and a splat beside the car would flood the image, so: a sigma point nearer than half the centre's
+depth, or behind the camera, is projected as if it lay at that half, and n is taken no further out than 1.3 times half the view.
+All continuous where it can be seen.
+"""
+
+import warp as wp
+
+from render.kernels.types import NEAREST, ROOT3, View
+
+vec_axis = wp.types.vector(length=8, dtype=wp.float32)
+
+
+@wp.struct
+class Axis:
+    """One principal axis of a splat in the camera and on the image."""
+
+    offset: wp.vec3
+    e: wp.vec2
+    w: float
+    b: float
+    near_z: float  # of the sigma point at -sqrt(3), after the clamp
+    far_z: float
+
+
+@wp.struct
+class Footprint:
+    """The 2D Gaussian before dilation; det0 is the determinant of its covariance."""
+
+    n: wp.vec2  # where on the image plane z = 1 the Jacobian is taken
+    u: Axis
+    v: Axis
+    w: Axis
+    mu: wp.vec2
+    xx: float
+    xy: float
+    yy: float
+    det0: float
+
+
+@wp.func
+def cross2(a: wp.vec2, b: wp.vec2):
+    return a[0] * b[1] - a[1] * b[0]
+
+
+@wp.func
+def project_axis(offset: wp.vec3, n: wp.vec2, z: float, view: View):
+    a = Axis()
+    a.offset = offset
+    a.e = wp.vec2(view.fx * (offset[0] - n[0] * offset[2]), view.fy * (offset[1] - n[1] * offset[2]))
+    if view.unscented == 0:
+        a.w = 1.0 / (z * z)
+        a.b = 0.0
+    else:
+        a.far_z = wp.max(z + ROOT3 * offset[2], NEAREST * z)
+        a.near_z = wp.max(z - ROOT3 * offset[2], NEAREST * z)
+        r_far = ROOT3 / a.far_z
+        r_near = ROOT3 / a.near_z
+        a.w = (r_far * r_far + r_near * r_near) / 6.0
+        a.b = ROOT3 * (a.near_z - a.far_z) / (6.0 * a.near_z * a.far_z)
+    return a
+
+
+@wp.func
+def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
+    """axes: the splat's principal directions in the camera, as columns; scale in metres."""
+    f = Footprint()
+    z = t[2]
+    f.n = wp.vec2(wp.clamp(t[0] / z, view.clamp_left, view.clamp_right), wp.clamp(t[1] / z, view.clamp_top, view.clamp_bottom))
+    f.u = project_axis(scale[0] * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
+    f.v = project_axis(scale[1] * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
+    f.w = project_axis(scale[2] * wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)
+    f.mu = f.u.b * f.u.e + f.v.b * f.v.e + f.w.b * f.w.e
+    f.xx = f.u.w * f.u.e[0] * f.u.e[0] + f.v.w * f.v.e[0] * f.v.e[0] + f.w.w * f.w.e[0] * f.w.e[0] + f.mu[0] * f.mu[0]
+    f.xy = f.u.w * f.u.e[0] * f.u.e[1] + f.v.w * f.v.e[0] * f.v.e[1] + f.w.w * f.w.e[0] * f.w.e[1] + f.mu[0] * f.mu[1]
+    f.yy = f.u.w * f.u.e[1] * f.u.e[1] + f.v.w * f.v.e[1] * f.v.e[1] + f.w.w * f.w.e[1] * f.w.e[1] + f.mu[1] * f.mu[1]
+    uv = cross2(f.u.e, f.v.e)
+    uw = cross2(f.u.e, f.w.e)
+    vw = cross2(f.v.e, f.w.e)
+    um = cross2(f.u.e, f.mu)
+    vm = cross2(f.v.e, f.mu)
+    wm = cross2(f.w.e, f.mu)
+    f.det0 = f.u.w * f.v.w * uv * uv + f.u.w * f.w.w * uw * uw + f.v.w * f.w.w * vw * vw
+    f.det0 += f.u.w * um * um + f.v.w * vm * vm + f.w.w * wm * wm
+    return f
+
+
+@wp.func
+def cross_gradient(b: wp.vec2, g: float):
+    """g times d cross2(a, b) / d a; by b it is minus the same with a in place of b."""
+    return wp.vec2(g * b[1], -g * b[0])
+
+
+@wp.func
+def quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
+    return xx * v[0] * v[0] + xy * v[0] * v[1] + yy * v[1] * v[1]
+
+
+@wp.func
+def gradient_of_quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
+    return wp.vec2(2.0 * xx * v[0] + xy * v[1], xy * v[0] + 2.0 * yy * v[1])
+
+
+@wp.func
+def axis_backward(a: Axis, g_e: wp.vec2, g_w: float, g_b: float, n: wp.vec2, z: float, view: View):
+    """d loss / d (offset, n, z, f) packed as a vector of 8."""
+    g_z = float(0.0)
+    g_oz = float(0.0)
+    if view.unscented == 0:
+        g_z = -2.0 * a.w / z * g_w
+    else:
+        r_far = ROOT3 / a.far_z
+        r_near = ROOT3 / a.near_z
+        g_far = -(g_w * r_far / 3.0 + g_b / 6.0) * r_far / a.far_z
+        g_near = -(g_w * r_near / 3.0 - g_b / 6.0) * r_near / a.near_z
+        if z + ROOT3 * a.offset[2] >= NEAREST * z:
+            g_z += g_far
+            g_oz += ROOT3 * g_far
+        else:
+            g_z += NEAREST * g_far
+        if z - ROOT3 * a.offset[2] >= NEAREST * z:
+            g_z += g_near
+            g_oz -= ROOT3 * g_near
+        else:
+            g_z += NEAREST * g_near
+    gx = view.fx * g_e[0]
+    gy = view.fy * g_e[1]
+    g_oz -= gx * n[0] + gy * n[1]
+    return vec_axis(
+        gx, gy, g_oz, -gx * a.offset[2], -gy * a.offset[2], g_z,
+        g_e[0] * (a.offset[0] - n[0] * a.offset[2]), g_e[1] * (a.offset[1] - n[1] * a.offset[2]),
+    )  # fmt: skip

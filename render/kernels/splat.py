@@ -1,0 +1,192 @@
+"""What every projection ends in: the record of a 2D Gaussian, with its colour, and the way back from the gradient slots.
+
+Nothing from here on knows of lenses or shutters.
+"""
+
+import warp as wp
+
+from render.kernels.bin import ROOM, tile_span
+from render.kernels.harmonics import harmonics, harmonics_backward
+from render.kernels.types import (
+    BLUE,
+    CULLED,
+    G_BLUE,
+    G_GREEN,
+    G_H,
+    G_K,
+    G_M,
+    G_OPACITY,
+    G_RED,
+    G_X,
+    G_Y,
+    G_Z,
+    GRADIENTS,
+    GREEN,
+    INSTANCE,
+    INV_C,
+    INV_K,
+    OPACITY,
+    RED,
+    S_MAX,
+    SLACK,
+    TINY,
+    Y_AT_EXT,
+    Y_EXT,
+    H,
+    K,
+    M,
+    View,
+    X,
+    Y,
+    Z,
+)
+
+vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
+
+
+@wp.struct
+class Ellipse:
+    """A splat on the image before dilation: mean, covariance, and its determinant by a way that does not cancel."""
+
+    x: float
+    y: float
+    xx: float
+    xy: float
+    yy: float
+    det0: float
+
+
+@wp.struct
+class EllipseGradient:
+    """d loss / d Ellipse and what else a record carries."""
+
+    x: float
+    y: float
+    xx: float
+    xy: float
+    yy: float
+    det0: float
+    depth: float
+    logit: float
+    rgb: wp.vec3
+
+
+@wp.func
+def write_splat(
+    e: Ellipse, opacity: float, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
+    records: wp.array2d[float], depth_keys: wp.array[int], counts: wp.array[int], j: int,
+):  # fmt: skip
+    """Record j, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
+
+    sight: from the eye to the splat in its local frame, of any length.
+    """
+    xx = e.xx + view.dilation
+    yy = e.yy + view.dilation
+    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
+    if view.antialias != 0:
+        opacity = opacity * wp.sqrt(e.det0 / wp.max(det, TINY))
+    s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
+    if opacity <= view.least_opacity:
+        s_max = 0.0
+    # written so that a NaN anywhere culls the splat instead of spreading
+    if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
+        k2 = 0.5 * yy / det
+        k = wp.sqrt(k2)
+        m = e.xy / yy
+        h = 0.5 / yy
+        c = k2 * m * m + h
+        records[j, X] = e.x
+        records[j, Y] = e.y
+        records[j, K] = k
+        records[j, M] = m
+        records[j, H] = h
+        records[j, OPACITY] = opacity
+        records[j, S_MAX] = s_max
+        records[j, Z] = depth
+        records[j, INSTANCE] = instance
+        records[j, Y_EXT] = wp.sqrt(s_max / h)
+        records[j, INV_K] = 1.0 / k
+        records[j, INV_C] = 1.0 / c
+        root = wp.sqrt(s_max / (c * h))
+        records[j, Y_AT_EXT] = k * m * root
+        rows = tile_span(e.y, ROOM * records[j, Y_EXT] + SLACK, view.tiles_y)
+        columns = tile_span(e.x, ROOM * c * root / k + SLACK, view.tiles_x)
+        total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
+        colour = wp.vec3(0.0)
+        if total > 0:
+            colour = harmonics(sh, i, view.sh_count, wp.normalize(sight))
+        if total > 0 and wp.isfinite(colour):
+            counts[j] = total
+            depth_keys[j] = wp.cast(depth, int)
+            records[j, RED] = wp.max(colour[0], 0.0)
+            records[j, GREEN] = wp.max(colour[1], 0.0)
+            records[j, BLUE] = wp.max(colour[2], 0.0)
+
+
+@wp.func
+def cull(depth_keys: wp.array[int], counts: wp.array[int], j: int):
+    counts[j] = 0
+    depth_keys[j] = CULLED
+
+
+@wp.func
+def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: int, count: int):
+    """Sum a splat's slots in fixed order and carry them from its record to its ellipse; o is its opacity."""
+    g = vec_gradients()
+    for slot in range(start, start + count):
+        for c in range(GRADIENTS):
+            g[c] = g[c] + slots[slot, c]
+    yy = e.yy + view.dilation
+    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
+    k = wp.sqrt(0.5 * yy / det)
+    m = e.xy / yy
+    h = 0.5 / yy
+
+    out = EllipseGradient()
+    g_det = -0.5 * g[G_K] * k / det  # det = det0 + dilation (xx0 + yy0 + dilation)
+    g_trace = g_det
+    out.det0 = g_det
+    out.xy = g[G_M] / yy
+    g_o = g[G_OPACITY]
+    if view.antialias != 0:
+        # opacity sqrt(det0 / det): its two derivatives by det0 nearly cancel for large splats, so they are taken together
+        ratio = wp.sqrt(e.det0 / det)
+        g_ratio = 0.5 * g_o * o * ratio / det
+        g_trace -= g_ratio
+        out.det0 += g_ratio * view.dilation * (e.xx + e.yy + view.dilation) / wp.max(e.det0, TINY)
+        g_o = g_o * ratio
+    out.logit = g_o * o * (1.0 - o)
+    out.xx = g_trace * view.dilation
+    out.yy = (0.5 * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * view.dilation
+    out.x = g[G_X]
+    out.y = g[G_Y]
+    out.depth = g[G_Z]
+    out.rgb = wp.vec3(g[G_RED], g[G_GREEN], g[G_BLUE])
+    return out
+
+
+@wp.func
+def colour_backward(sh: wp.array2d[wp.vec3], i: int, count: int, sight: wp.vec3, g_rgb: wp.vec3, g_sh: wp.array2d[wp.vec3]):
+    """Write d loss / d sh of splat i; return d loss / d sight."""
+    distance = wp.max(wp.length(sight), TINY)
+    direction = sight / distance
+    colour = harmonics(sh, i, count, direction)
+    g = wp.vec3(g_rgb[0], g_rgb[1], g_rgb[2])
+    for c in range(3):
+        if colour[c] <= 0.0:
+            g[c] = 0.0
+    g_direction = harmonics_backward(sh, i, count, direction, g, g_sh)
+    return (g_direction - direction * wp.dot(direction, g_direction)) / distance
+
+
+@wp.func
+def no_gradient(
+    i: int, sh_count: int, g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
+    g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3],
+):  # fmt: skip
+    g_means[i] = wp.vec3(0.0)
+    g_quats[i] = wp.vec4(0.0)
+    g_log_scales[i] = wp.vec3(0.0)
+    g_logit_opacities[i] = 0.0
+    for b in range(sh_count):
+        g_sh[i, b] = wp.vec3(0.0)
