@@ -21,11 +21,12 @@ from scenes.asset import Actor, Asset
 from scenes.camera import RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
+from scenes.lenses import Pinhole
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 
-DEFAULT_CAMERAS = ("front_camera", "front_left_camera", "front_right_camera")
-SIZE = (960, 540)
+PIXELS = 960 * 540
+"""Of the pictures that are fitted, where nobody says."""
 HELD_OUT = 8
 
 
@@ -35,7 +36,7 @@ def reconstruct(
     cameras: Sequence[str] | None = None,
     start_us: int = 0,
     duration_us: int | None = None,
-    size: tuple[int, int] = SIZE,
+    size: tuple[int, int] | None = None,
     held_out: int = HELD_OUT,
     resume: bool = False,
     config: FitConfig = FitConfig(),  # noqa: B008 - frozen
@@ -45,8 +46,8 @@ def reconstruct(
     """Fit a scene to a log's images and write it to the folder `output`.
 
     cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
-    are fitted. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr. An interrupted fit
-    leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
+    are fitted, `fit_size` where None. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr. An
+    interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
 
     Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
@@ -58,6 +59,7 @@ def reconstruct(
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
+    size = size or fit_size(log, names)
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)
@@ -89,8 +91,19 @@ def choose(
     log: Log, cameras: Sequence[str] | None = None, start_us: int = 0, duration_us: int | None = None
 ) -> tuple[list[str], tuple[int, int]]:
     """The cameras to fit, the front ones where None, and the span of time in microseconds. ValueError for what the log has not."""
-    names = list(cameras or [n for n in DEFAULT_CAMERAS if n in log.cameras] or list(log.cameras)[:1])
+    names = list(cameras or log.front or list(log.cameras)[:1])
+    for name in names:
+        if not isinstance(log.camera(name).lens, Pinhole):
+            fix = "undistort its pictures with: colmap image_undistorter"
+            raise ValueError(f"camera {name} has a {log.camera(name).lens.kind} lens, but pinholes only can be fitted so far; {fix}")
     return names, _span(log, names, start_us, duration_us)
+
+
+def fit_size(log: Log, names: Sequence[str]) -> tuple[int, int]:
+    """Width and height to fit at: the first camera's own, shrunk to `PIXELS` where it has more."""
+    camera = log.camera(names[0])
+    shrink = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+    return round(camera.width * shrink), round(camera.height * shrink)
 
 
 def begin(

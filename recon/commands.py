@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import fresh
-from scenes.options import FitSize, Flag, Names, Output, Overwrite, ScenePath, Time, TimeOrAll
+from scenes.options import FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 
 
 @dataclass
@@ -17,7 +17,7 @@ class Recon:
     """Reconstruct a recorded drive as a scene: background, movers, sky, exposure; reports its quality on held-out frames."""
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
-    """Folder of one drive, as pandaset/002."""
+    """Folder of one drive, as pandaset/002: PandaSet or a COLMAP workspace."""
     output: Output
     """Folder of the new scene."""
     cameras: Names = None
@@ -28,6 +28,10 @@ class Recon:
     """How much of the drive to use."""
     size: FitSize = None
     """Size of the pictures that are fitted."""
+    camera_height: LengthOrNone = None
+    """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
+    metres_per_unit: Ratio = None
+    """The same for a COLMAP folder by number: metres that one unit of its model has."""
     resume: Flag = False
     """Go on from where an interrupted run of the same command stopped."""
     overwrite: Overwrite = False
@@ -35,17 +39,16 @@ class Recon:
 
     def run(self) -> None:
         from recon import open_log, reconstruct
-        from recon.build import SIZE
         from scenes.usd_scene import is_scene
 
         fresh(self.output, self.overwrite)
         if self.output.exists() and not is_scene(self.output):
             raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
-        log = open_log(self.data)
+        log = open_log(self.data, self.camera_height, self.metres_per_unit)
         try:
             reconstruct(
                 log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
-                size=self.size or SIZE, resume=self.resume, overwrite=self.overwrite,
+                size=self.size, resume=self.resume, overwrite=self.overwrite,
             )  # fmt: skip
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None

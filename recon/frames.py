@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import ndimage
 
+from recon.gains import picture_gains
 from recon.log import Log
 from recon.skies import sky_mask
+from scenes.poses import inverse
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,11 @@ class View:
 
 @dataclass(frozen=True)
 class Frames:
-    """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera (0, 8, ...) takes no part in it."""
+    """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
+
+    From the first on (0, 8, ...), or, where frames are photos taken steps apart, from the middle of the eight (4, 12, ...): what the
+    first photo shows at its edges, no other one does.
+    """
 
     names: list[str]
     width: int
@@ -57,19 +63,47 @@ def load_frames(
 ) -> Frames:
     """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
 
-    `report` is called after each. Raises ValueError where a camera has no frame left to train on, or a file does not decode.
+    `report` is called after each. Photos of a log without lidar are brought to one exposure (`picture_gains`). Raises ValueError
+    where a camera has no frame left to train on, or a file does not decode.
     """
+    first = held_out // 2 if log.points is not None else 0
     views = []
     for c, name in enumerate(names):
         camera = log.camera(name)
         chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
         for i in chosen:
             image = torch.from_numpy(camera.image(i, *size).copy())
-            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == 0, _sky(image)))
+            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, _sky(image)))
             report()
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
-    return Frames(names, *size, views)
+    return Frames(names, *size, views if log.points is None else _balanced(log, names, views))
+
+
+def _balanced(log: Log, names: list[str], views: list[View]) -> list[View]:
+    """The views with their pictures divided by what each was exposed more than the others, by the points that they share."""
+    assert log.points is not None
+    colours, shown = [], []
+    for view in views:
+        camera = log.camera(names[view.camera]).camera(view.index, view.image.shape[1], view.image.shape[0])
+        points = log.points.seen[names[view.camera]][view.index]
+        back = inverse(camera.world_from_cam)
+        local = torch.from_numpy(log.points.xyz[points]) @ back[:3, :3].T + back[:3, 3]
+        pixels = camera.lens.project(local).floor().long()
+        size = torch.tensor([camera.width, camera.height])
+        inside = ((pixels >= 0) & (pixels < size)).all(1) & (local[:, 2] > 0)
+        column, row = pixels[inside].T
+        # a point's own pixel is at an edge as likely as not: what is around it is steadier
+        smooth = ndimage.uniform_filter(view.image.numpy().astype(np.float32), (5, 5, 0)) / 255
+        colours.append(smooth[row, column])
+        shown.append(points[inside.numpy()])
+    gains = picture_gains(colours, shown, len(log.points.xyz))
+    return [replace(v, image=divided(v.image, torch.from_numpy(g).float())) for v, g in zip(views, gains, strict=True)]
+
+
+def divided(image: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
+    """A uint8 image with a gain `[3]` taken out."""
+    return (image.float() / gain).round().clamp(0, 255).to(torch.uint8)
 
 
 def _sky(image: torch.Tensor) -> torch.Tensor:

@@ -94,8 +94,20 @@ class Track:
 
 
 @dataclass(frozen=True)
+class SparsePoints:
+    """What pictures alone showed (structure from motion): `xyz` float64 `[N, 3]` in the world; `seen` by camera: each frame's points."""
+
+    xyz: np.ndarray
+    seen: dict[str, tuple[np.ndarray, ...]]
+
+
+@dataclass(frozen=True)
 class Log:
-    """A drive: cameras by name, lidar sweeps (gaps are normal), tracks, and the body's trajectory. The world starts near its first pose."""
+    """A drive: cameras by name, lidar sweeps (gaps are normal), tracks, and the body's trajectory. The world starts near its first pose.
+
+    `front` names the cameras that a reconstruction takes where nobody names any; the first one where it is empty. `points` stand
+    in for lidar where the poses come from pictures. `meta["metric"]` is False where the world's unit is not the metre.
+    """
 
     name: str
     path: Path
@@ -104,6 +116,8 @@ class Log:
     tracks: tuple[Track, ...]
     ego: Trajectory
     meta: dict
+    front: tuple[str, ...] = ()
+    points: SparsePoints | None = None
 
     def camera(self, name: str) -> LogCamera:
         """The camera of that name; ValueError naming the nearest where there is none."""

@@ -39,6 +39,7 @@ KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": 
 VEHICLES = {"car", "pickup", "truck", "bus", "vehicle", "construction-vehicle", "emergency-vehicle", "trailer", "pedicab", "train", "tram"}
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 PICKLES = (".pkl.gz", ".pkl")
+FRONT = ("front_camera", "front_left_camera", "front_right_camera")
 
 
 def read_pandaset(path: Path) -> Log:
@@ -66,7 +67,8 @@ def read_pandaset(path: Path) -> Log:
         "world_origin": origin.tolist(),
         **_geodetic(path / "meta" / "gps.json"),
     }
-    return Log(meta["name"], path, cameras, sweeps, _tracks(path, lidar_times, origin.numpy(), home @ body), ego, meta)
+    tracks = _tracks(path, lidar_times, origin.numpy(), home @ body)
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
 
 
 def _json(path: Path):

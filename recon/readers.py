@@ -7,10 +7,12 @@ from pathlib import Path
 from recon.log import Log
 
 
-def open_log(path: str | Path) -> Log:
+def open_log(path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
     """The drive in a folder, by the layout of its files; reads no image and no sweep yet.
 
-    Raises FileNotFoundError where there is no such folder and ValueError where its layout is not known or a file is corrupt.
+    camera_height, metres_per_unit: what makes a world that pictures alone made metric: metres of the cameras above the ground, or
+    metres a unit of the model. Raises FileNotFoundError where there is no such folder and ValueError where its layout is not known,
+    a file is corrupt, or metres are given to a log that has its own.
     """
     path = Path(path)
     if not path.is_dir():
@@ -18,7 +20,18 @@ def open_log(path: str | Path) -> Log:
     if (path / "camera").is_dir():
         from recon.pandaset import read_pandaset
 
+        _without_metres(path, camera_height, metres_per_unit)
         return read_pandaset(path)
+    from recon.colmap import find_model, read_colmap
+
+    if find_model(path) is not None:
+        return read_colmap(path, camera_height, metres_per_unit)
     inside = sorted(p.name for p in path.iterdir() if (p / "camera").is_dir())
     hint = f" Did you mean {path / inside[0]}?" if inside else ""
     raise ValueError(f"{path} is not a known layout of a drive: PandaSet's has a camera/ folder.{hint}")
+
+
+def _without_metres(path: Path, camera_height: float | None, metres_per_unit: float | None) -> None:
+    given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
+    if given:
+        raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")

@@ -17,6 +17,7 @@ from recon.log import Log, Track
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from recon.skies import like_sky, sky_mask
+from recon.sparse import cloud_from_points
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
@@ -55,16 +56,19 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
-    ground = estimate_ground(split.static, log.ego)
-
     report("colouring points")
-    seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
-    gains = first_exposures(seen)
-    rgb = merged_colours(seen, gains)
-    known = np.isfinite(rgb[:, 0])
-    if not known.any():
-        raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
-    cloud = Cloud(split.static[known], rgb[known])
+    if log.points is not None:
+        cloud, gains = cloud_from_points(log, frames), np.ones((len(frames.names), 3))
+        ground = estimate_ground(cloud.xyz, log.ego)
+    else:
+        ground = estimate_ground(split.static, log.ego)
+        seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
+        gains = first_exposures(seen)
+        rgb = merged_colours(seen, gains)
+        known = np.isfinite(rgb[:, 0])
+        if not known.any():
+            raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
+        cloud = Cloud(split.static[known], rgb[known])
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())

@@ -11,6 +11,7 @@ from render.frame_types import Frame, RenderConfig
 from render.outputs import check_outputs
 from scenes.asset import Actor
 from scenes.camera import Camera
+from scenes.metres import require_metres
 from scenes.poses import inverse
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory
@@ -32,7 +33,8 @@ def render_clip(
     shift: metres to the left of the recorded path (negative: right), or any other path of the body.
     times_us: when; the camera's own frame times by default. width, height: pixels, the camera's own by default.
     The first frame has no flow_prev and the last no flow_next: they are None.
-    Raises ValueError, before the first frame, for an unknown camera or output, no times, or a time off the path.
+    Raises ValueError, before the first frame, for an unknown camera or output, no times, a time off the path, or a shift of a scene
+    that is not metric.
     """
     cameras = clip_cameras(scene, camera, shift, times_us, width, height)
     outputs = check_outputs(outputs)
@@ -53,6 +55,8 @@ def clip_cameras(
         raise ValueError("width and height go together; give both or neither")
     if width is not None and height is not None:
         rig_camera = rig_camera.resized(width, height)
+    if not isinstance(shift, Trajectory) and shift != 0:
+        require_metres(scene, "a lateral shift")
     ego = shift if isinstance(shift, Trajectory) else scene.ego.shifted(lateral=shift)
     times = scene.frame_times(camera) if times_us is None else torch.as_tensor(times_us, dtype=torch.int64)
     if len(times) == 0:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from scenes.asset import Actor, Asset
+from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
 from scenes.scene import Scene
@@ -31,8 +32,9 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
 
     start_us: the time of the clip's first frame, to whose body pose the placement is relative; the drive's first by default.
     The actor gets a track of its own and `inserted` in its asset's meta. ValueError where the time is off the path or the
-    trajectory file is bad.
+    trajectory file is bad; where the scene is not metric.
     """
+    require_metres(scene, f"the place of {placement.asset}")
     start_us = int(scene.ego.times_us[0]) if start_us is None else start_us
     if not scene.ego.covers(start_us):
         after, lasts = ((t - int(scene.ego.times_us[0])) / 1e6 for t in (start_us, int(scene.ego.times_us[-1])))

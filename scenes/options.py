@@ -41,17 +41,29 @@ def _rate(text: str) -> float:
     return rate
 
 
+def _ratio(text: str) -> float:
+    try:
+        ratio = float(text)
+    except ValueError:
+        ratio = 0.0
+    if not 0 < ratio < float("inf"):
+        raise ValueError(f'"{text}" is not a ratio; write a positive number, as 0.5')
+    return ratio
+
+
 def names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 Length = Annotated[float, written(units.length, "LENGTH", "0m")]
+LengthOrNone = Annotated[float | None, written(units.length, "LENGTH", "none")]
+Ratio = Annotated[float | None, written(_ratio, "NUMBER", "none")]
 Angle = Annotated[float, written(units.angle, "ANGLE", "0deg")]
 Speed = Annotated[float, written(units.speed, "SPEED", "0m/s")]
 Time = Annotated[int, written(units.duration_us, "TIME", "0s")]
 TimeOrAll = Annotated[int | None, written(units.duration_us, "TIME", "the rest")]
 Size = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded")]
-FitSize = Annotated[tuple[int, int] | None, written(_size, "WxH", "960x540")]
+FitSize = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded, at most as many pixels as 960x540")]
 Names = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "all")]
 Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]

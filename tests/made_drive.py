@@ -58,10 +58,16 @@ def write_drive(folder: Path, street, width=96, height=54) -> Path:
         if i < 5:
             rows.append(_cuboid("mover-b", "mover-a", 1, pose, mover.asset.size.numpy(), False))
         rows.append(_cuboid("parked", "-", -1, bodies[0] @ _at(14.0, -4.0), np.array([4.0, 1.8, 1.5]), True))
-        pd.DataFrame(rows).to_pickle(cuboids / f"{i:02d}.pkl.gz")
+        pickle_frame(rows, cuboids / f"{i:02d}.pkl.gz")
     (folder / "meta").mkdir()
     _write(folder / "meta" / "gps.json", [{"lat": 37.7, "long": -122.4, "height": 2.0, "xvel": 0.0, "yvel": 0.0}] * frames)
     return folder
+
+
+def pickle_frame(rows, path: Path) -> None:
+    """Pickle a table as the official files are: text as objects, also where pyarrow is installed and pandas would use its strings."""
+    with pd.option_context("future.infer_string", False):
+        pd.DataFrame(rows).to_pickle(path)
 
 
 def _write(path: Path, value) -> None:
@@ -88,7 +94,7 @@ def _sweep(path: Path, street, mover, pose, stamp: int, scanned: int, generator)
     xyz[: len(static), :2] += generator.uniform(-0.25, 0.25, (len(static), 2))  # a lidar does not hit the same spot again
     times = np.concatenate([np.full(len(static), stamp - 20_000), np.full(len(own), scanned)]) / 1e6
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "i": np.zeros(len(xyz)), "t": times, "d": np.zeros(len(xyz), np.int64)}
-    pd.DataFrame(columns).to_pickle(path)
+    pickle_frame(columns, path)
 
 
 def _cuboid(uuid: str, sibling: str, sensor: int, pose: torch.Tensor, size: np.ndarray, still: bool) -> dict:

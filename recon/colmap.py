@@ -1,0 +1,160 @@
+"""Reads a COLMAP model with its pictures (Schönberger and Frahm 2016; the files as in COLMAP's doc/format.rst).
+
+A model has no clock: pictures follow each other half a second apart in the order of their names, unless `times.json` beside the
+model's files gives microseconds by picture name. The body is the first camera, turned to x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.gauge import find_gauge
+from recon.log import Log, LogCamera, SparsePoints
+from recon.sfm import Model, ModelCamera, ModelImage, is_model, read_model
+from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
+from scenes.names import nearest
+from scenes.trajectory import Trajectory
+
+STEP_US = 500_000
+CAM_FROM_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def find_model(folder: Path) -> Path | None:
+    """The model's folder in a COLMAP workspace: `folder` itself, its sparse/0, or another one up to two levels down; the fullest."""
+    inside = [p for level in ("*", "*/*") for p in sorted(folder.glob(level)) if p.is_dir()]
+    models = [p for p in [folder, *inside] if is_model(p)]
+    return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")), default=None)
+
+
+def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
+    """The drive in a COLMAP workspace: a model and the pictures it registers.
+
+    camera_height: metres of the cameras above the ground; metres_per_unit: of the model's unit; without either the log is not
+    metric. FileNotFoundError and ValueError name the file or lens that is missing or wrong.
+    """
+    where = find_model(path)
+    if where is None:
+        raise FileNotFoundError(f"{path} holds no COLMAP model; it has cameras.bin, images.bin and points3D.bin, as in {path / 'sparse/0'}")
+    model = read_model(where)
+    names = camera_names(model)
+    moments = _moments(where, model)
+    poses = np.stack([np.linalg.inv(i.cam_from_world) for i in model.images])
+    lead = _lead(model)
+    gauge = find_gauge(poses[[i.camera == lead for i in model.images]], model.xyz, camera_height, metres_per_unit)
+    placed = gauge.poses(poses)
+
+    mine = [k for k, i in enumerate(model.images) if i.camera == lead]
+    order = sorted(mine, key=lambda k: moments[k])
+    ego = Trajectory(torch.tensor([moments[k] for k in order]), placed[order] @ torch.from_numpy(CAM_FROM_BODY))
+    pictures = _picture_folder(path, where, model.images[0].name)
+    cameras, seen = {}, {}
+    for key in sorted(names, key=lambda k: (k != lead, names[k])):
+        chosen = [k for k, i in enumerate(model.images) if i.camera == key and ego.covers(moments[k])]
+        chosen.sort(key=lambda k: moments[k])
+        if not chosen:
+            continue
+        files = tuple(pictures / model.images[k].name for k in chosen)
+        for file in files:
+            if not file.is_file():
+                raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file)}")
+        found, times = model.cameras[key], torch.tensor([moments[k] for k in chosen])
+        cameras[names[key]] = LogCamera(names[key], lens_of(found, where), found.width, found.height, files, times, placed[chosen])
+        seen[names[key]] = tuple(model.images[k].points for k in chosen)
+    about = path.resolve()
+    meta: dict = {
+        "name": about.parent.name if about.name in ("images", "sparse") else about.name,
+        "source": f"COLMAP model of {len(model.images)} pictures in {about.name}",
+        "body": f"camera {names[lead]}, turned to x forward, y left, z up",
+        "metric": gauge.metric,
+        "world_from_model": {"rotation": gauge.rotation.tolist(), "origin": gauge.origin.tolist(), "scale": gauge.scale},
+    }
+    return Log(meta["name"], path, cameras, (), (), ego, meta, tuple(cameras), SparsePoints(gauge.points(model.xyz), seen))
+
+
+def lens_of(camera: ModelCamera, where: Path) -> Lens:
+    """Our lens for COLMAP's (src/colmap/sensor/models.h): the same formulas, parameters in another order. ValueError for other lenses."""
+    p = camera.params
+    make = LENSES.get(camera.lens)
+    if make is None:
+        fix = "undistort the pictures with: colmap image_undistorter"
+        raise ValueError(f"{where} has a camera with the lens {camera.lens}; read are {', '.join(LENSES)}. For others, {fix}")
+    return make(*p)
+
+
+LENSES: dict[str, Callable[..., Lens]] = {
+    "SIMPLE_PINHOLE": lambda f, cx, cy: Pinhole(f, f, cx, cy),
+    "PINHOLE": Pinhole,
+    "SIMPLE_RADIAL": lambda f, cx, cy, k: OpenCV(f, f, cx, cy, k),
+    "RADIAL": lambda f, cx, cy, k1, k2: OpenCV(f, f, cx, cy, k1, k2),
+    "OPENCV": OpenCV,
+    "FULL_OPENCV": OpenCV,
+    "SIMPLE_RADIAL_FISHEYE": lambda f, cx, cy, k: Fisheye(f, f, cx, cy, k),
+    "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: Fisheye(f, f, cx, cy, k1, k2),
+    "OPENCV_FISHEYE": Fisheye,
+}
+
+
+def camera_names(model: Model) -> dict[int, str]:
+    """A name for every camera that took a picture: "camera" for the only one, else its pictures' folder, else camera_<id>.
+
+    ValueError where nearly every picture has a camera of its own: one lens a picture is no rig.
+    """
+    taken = {key: [i.name for i in model.images if i.camera == key] for key in sorted({i.camera for i in model.images})}
+    if len(taken) == 1:
+        return {key: "camera" for key in taken}
+    if len(model.images) < 2 * len(taken):
+        fix = "let COLMAP share one: colmap feature_extractor --ImageReader.single_camera 1"
+        raise ValueError(f"the model has {len(taken)} cameras for {len(model.images)} pictures; {fix}")
+    folders = {key: {str(Path(n).parent) for n in some} for key, some in taken.items()}
+    flat = [next(iter(f)) for f in folders.values() if len(f) == 1]
+    if len(set(flat)) == len(taken) and "." not in flat:
+        return {key: re.sub(r"\W", "_", next(iter(f))) for key, f in folders.items()}
+    return {key: f"camera_{key}" for key in taken}
+
+
+def _lead(model: Model) -> int:
+    """The camera that stands for the body: the one with most pictures, one whose name says front among equals."""
+    keys = sorted({i.camera for i in model.images})
+    count = {key: sum(i.camera == key for i in model.images) for key in keys}
+    ahead = {key: any("front" in i.name.lower() for i in model.images if i.camera == key) for key in keys}
+    return max(keys, key=lambda k: (count[k], ahead[k], -k))
+
+
+def _moments(where: Path, model: Model) -> list[int]:
+    """Microseconds of every picture. Those of one frame of a rig, or of one file name in several folders, share a moment."""
+    clock = where / "times.json"
+    if clock.is_file():
+        try:
+            times = json.loads(clock.read_text())
+            return [int(times[i.name]) for i in model.images]
+        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, ValueError) as problem:
+            raise ValueError(f"{clock} must give whole microseconds by picture name ({problem!r})") from None
+    several = len({i.camera for i in model.images}) > 1
+
+    def moment(image: ModelImage) -> object:
+        return image.frame if model.rigid else Path(image.name).stem if several else image.name
+
+    first: dict[object, str] = {}
+    for image in model.images:
+        first.setdefault(moment(image), Path(image.name).name)
+    order = {key: i for i, key in enumerate(sorted(first, key=lambda k: (first[k], str(k))))}
+    return [order[moment(i)] * STEP_US for i in model.images]
+
+
+def _picture_folder(path: Path, where: Path, name: str) -> Path:
+    """Where the pictures lie: in the workspace, its images/, or beside the model."""
+    tried = [path / "images", path, where / "images", where.parent / "images", where.parent.parent / "images", path.parent / "images"]
+    for folder in tried:
+        if (folder / name).is_file():
+            return folder
+    raise FileNotFoundError(f"{path / 'images' / name} is missing; put the pictures that the model registers into {path / 'images'}")
+
+
+def _beside(file: Path) -> str:
+    return nearest(file.name, [p.name for p in file.parent.iterdir()] if file.parent.is_dir() else [])

@@ -1,0 +1,93 @@
+"""Structure from motion through pycolmap, the only module that imports it: COLMAP models are read here as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+PARTS = ("cameras", "images", "points3D")
+FIX = "COLMAP models are read by pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
+
+
+@dataclass(frozen=True)
+class ModelCamera:
+    """A calibrated camera: COLMAP's name of its lens model, size in pixels, and that model's parameters in COLMAP's order."""
+
+    lens: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """A registered picture: its name below the folder of images, camera, frame of the rig, `cam_from_world` float64 `[4, 4]`, and which
+    points it shows, int64 `[P]`."""
+
+    name: str
+    camera: int
+    frame: int
+    cam_from_world: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """What structure from motion found, in its own units: cameras by id, pictures in the order of their names, points `[N, 3]`;
+    `rigid` where its rigs hold several cameras, so that pictures of one frame were taken at one moment."""
+
+    cameras: dict[int, ModelCamera]
+    images: tuple[ModelImage, ...]
+    xyz: np.ndarray
+    rigid: bool
+
+
+def pycolmap():
+    """The module; ModuleNotFoundError's fix as ValueError where it is not installed."""
+    try:
+        import pycolmap as module
+    except ModuleNotFoundError:
+        raise ValueError(FIX) from None
+    module.logging.minloglevel = module.logging.Level.FATAL.value
+    return module
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds COLMAP's files, binary or text."""
+    return any(all((folder / f"{part}{end}").is_file() for part in PARTS[:2]) for end in (".bin", ".txt"))
+
+
+def read_model(folder: Path) -> Model:
+    """The COLMAP model in `folder`. ValueError where a file is missing, corrupt, or no picture is registered."""
+    for end in (".bin", ".txt"):
+        have = [p for p in PARTS if (folder / f"{p}{end}").is_file()]
+        if have and len(have) < len(PARTS):
+            lost = next(p for p in PARTS if p not in have)
+            raise FileNotFoundError(f"{folder / f'{lost}{end}'} is missing; a COLMAP model has {', '.join(p + end for p in PARTS)}")
+    try:
+        found = pycolmap().Reconstruction(str(folder))
+    except (RuntimeError, ValueError, IndexError, MemoryError) as problem:
+        if FIX in str(problem):
+            raise
+        raise ValueError(f"{folder} is not a whole COLMAP model ({_first_line(problem)}); export it again") from None
+    place = {key: i for i, key in enumerate(sorted(found.points3D))}
+    xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
+    cameras = {key: ModelCamera(c.model_name, c.width, c.height, tuple(map(float, c.params))) for key, c in found.cameras.items()}
+    images = []
+    for image in sorted((i for i in found.images.values() if i.has_pose), key=lambda i: i.name):
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        shown = [place[p.point3D_id] for p in image.get_observation_points2D() if p.point3D_id in place]
+        images.append(ModelImage(image.name, image.camera_id, image.frame_id, pose, np.unique(np.array(shown, dtype=np.int64))))
+    if not images:
+        raise ValueError(f"{folder} registers no picture; COLMAP found no pose, so there is nothing to reconstruct from")
+    values = np.concatenate([xyz.ravel(), *(i.cam_from_world.ravel() for i in images)])
+    if not np.isfinite(values).all():
+        raise ValueError(f"{folder} holds a pose or a point that is not finite; run COLMAP's mapper again")
+    return Model(cameras, tuple(images), xyz, any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values()))
+
+
+def _first_line(problem: Exception) -> str:
+    return (str(problem).strip().splitlines() or ["it does not parse"])[-1][:160]

@@ -1,0 +1,235 @@
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
+
+from recon import open_log, reconstruct
+from recon.fit import FitConfig
+from recon.frames import load_frames
+from recon.gains import picture_gains
+from recon.gauge import find_gauge, up_from_cameras
+from recon.sparse import cloud_from_points
+from render import render_clip
+from scenes import Scene, load
+from scenes.insert import insert
+from scenes.placement import Placement
+from scenes.poses import inverse
+
+pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+ALL = (0, 2**62)
+
+
+@pytest.fixture(scope="module")
+def workspace(street, tmp_path_factory):
+    """Twelve pictures along the street; not to be changed."""
+    return write_colmap(tmp_path_factory.mktemp("colmap") / "walk", street, {"": pictures_along(street)})
+
+
+@pytest.fixture
+def own(workspace, tmp_path):
+    return shutil.copytree(workspace, tmp_path / "walk")
+
+
+def relative(poses: torch.Tensor) -> torch.Tensor:
+    """Poses as the first one sees them: what no choice of world changes."""
+    return inverse(poses[:1]) @ poses
+
+
+def test_a_workspace_reads_as_its_pictures_were_taken(workspace, street):
+    log = open_log(workspace, metres_per_unit=1 / UNIT)
+    camera = log.camera("camera")
+    truth = torch.stack([c.world_from_cam for c in pictures_along(street)])
+    torch.testing.assert_close(relative(camera.world_from_cam), relative(truth), atol=1e-6, rtol=0)
+    assert [f.name for f in camera.files] == [f"{i:03d}.png" for i in range(12)] and camera.image(3).shape == (54, 96, 3)
+    assert log.sweeps == () and log.meta["metric"] is True and camera.times_us.diff().unique().tolist() == [500_000]
+
+
+def test_z_is_up_and_the_body_looks_ahead_whatever_way_the_model_lies(workspace):
+    log = open_log(workspace)
+    body = log.ego.world_from_body[0]
+    assert body[2, 2] > 0.999 and body[0, 0] > 0.999 and body[:3, 3].abs().max() < 1e-9
+
+
+def test_the_cameras_height_makes_metres(workspace):
+    log = open_log(workspace, camera_height=HEIGHT)
+    walked = (log.ego.world_from_body[-1] - log.ego.world_from_body[0])[:3, 3].norm()
+    assert log.meta["metric"] and float(walked) == pytest.approx(11 * 0.5, rel=0.06)
+
+
+def test_without_metres_a_log_says_so_and_stands_at_a_streets_size(workspace):
+    log = open_log(workspace)
+    assert log.meta["metric"] is False
+    assert 3 < float((log.ego.world_from_body[-1] - log.ego.world_from_body[0])[:3, 3].norm()) < 9
+
+
+def test_metres_given_twice_or_to_a_log_that_has_them_are_refused(workspace, drive):
+    with pytest.raises(ValueError, match="give one of them"):
+        open_log(workspace, camera_height=1.5, metres_per_unit=2.0)
+    with pytest.raises(ValueError, match="is in metres already; leave out --camera-height"):
+        open_log(drive, camera_height=1.5)
+    with pytest.raises(ValueError, match="--metres-per-unit must be positive"):
+        open_log(workspace, metres_per_unit=0.0)
+
+
+def test_points_stand_where_their_pictures_show_them(workspace):
+    log = open_log(workspace, metres_per_unit=1 / UNIT)
+    frames = load_frames(log, ["camera"], ALL, (96, 54), 0)
+    cloud = cloud_from_points(log, frames)
+    assert len(cloud.xyz) > 1000
+    height = cloud.xyz[:, 2] + HEIGHT  # the road is flat and everything else above it
+    assert np.quantile(height, 0.02) > -0.15 and (np.abs(height) < 0.15).mean() > 0.2
+
+
+def test_the_middle_of_every_eight_photos_is_held_out(workspace):
+    frames = load_frames(open_log(workspace), ["camera"], ALL, (48, 27), 8)
+    assert [v.index for v in frames.held_out()] == [4]
+
+
+def test_photos_of_different_exposure_are_brought_to_one(street, tmp_path):
+    gains = [1.0, 0.6, 0.8, 1.0, 0.7, 0.9]
+    dark = write_colmap(tmp_path / "dark", street, {"": pictures_along(street, count=6)}, gains)
+    even = write_colmap(tmp_path / "even", street, {"": pictures_along(street, count=6)})
+    sizes = (["camera"], ALL, (96, 54), 0)
+    made, wanted = ([v.image.float().mean() for v in load_frames(open_log(p), *sizes).views] for p in (dark, even))
+    ratio = torch.stack(made) / torch.stack(wanted)
+    assert ratio.std() / ratio.mean() < 0.03 < torch.tensor(gains).std() / torch.tensor(gains).mean()
+
+
+def test_gains_follow_the_points_that_pictures_share():
+    generator = np.random.default_rng(0)
+    own = generator.uniform(0.2, 0.6, (400, 3))
+    truth = np.array([[1.0, 1.0, 1.0], [0.7, 0.8, 0.9], [1.3, 1.2, 1.1]])
+    shown = [generator.choice(400, 200, replace=False) for _ in truth]
+    found = picture_gains([own[p] * g for p, g in zip(shown, truth, strict=True)], shown, 400)
+    np.testing.assert_allclose(found / found[0], truth, rtol=1e-3)
+    assert (picture_gains([own[:5], own[:5] * 2], [np.arange(5)] * 2, 400) == 1).all()  # too few to tell
+
+
+def test_up_needs_no_second_direction_of_view():
+    """A car's camera that looks ahead and down still finds up: the car moves level."""
+    tilt = 0.2
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 0] = [0, -1, 0]
+    poses[:, :3, 1] = [-np.sin(tilt), 0, -np.cos(tilt)]
+    poses[:, :3, 2] = [np.cos(tilt), 0, -np.sin(tilt)]
+    poses[:, 0, 3] = np.arange(5)
+    np.testing.assert_allclose(up_from_cameras(poses), [0, 0, 1], atol=0.01)
+    one = up_from_cameras(poses[:1])  # a single picture has but its own up
+    np.testing.assert_allclose(one, -poses[0, :3, 1], atol=1e-6)
+
+
+def test_a_height_without_ground_is_refused_with_the_other_fix():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    with pytest.raises(ValueError, match="--metres-per-unit"):
+        find_gauge(poses, np.zeros((0, 3)), camera_height=1.5)
+
+
+def test_two_cameras_share_the_moments_of_equal_names(street, tmp_path):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
+    assert list(log.cameras) == ["front", "left"] == list(log.front)
+    assert log.cameras["front"].times_us.tolist() == log.cameras["left"].times_us.tolist()
+    rig = log.rig(96, 54)
+    apart = inverse(rig["front"].body_from_cam) @ rig["left"].body_from_cam
+    truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
+    torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
+
+
+def test_a_clock_beside_the_model_is_read(own):
+    names = sorted(p.name for p in (own / "images").iterdir())
+    (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * i for i, n in enumerate(names)}))
+    assert open_log(own).camera("camera").times_us.diff().unique().tolist() == [40_000]
+    (own / "sparse/0/times.json").write_text(json.dumps({names[0]: 0}))
+    with pytest.raises(ValueError, match="times.json must give whole microseconds"):
+        open_log(own)
+
+
+def test_a_missing_picture_is_named(own):
+    (own / "images/007.png").unlink()
+    with pytest.raises(FileNotFoundError, match="images/007.png is missing"):
+        open_log(own)
+
+
+def test_a_model_that_lacks_a_file_or_is_cut_short_is_named(own):
+    points = own / "sparse/0/points3D.txt"
+    whole = points.read_text()
+    points.unlink()
+    with pytest.raises(FileNotFoundError, match="points3D.txt is missing"):
+        open_log(own)
+    points.write_text(whole)
+    images = own / "sparse/0/images.txt"
+    images.write_text(images.read_text()[:200])
+    with pytest.raises(ValueError, match="sparse/0"):
+        open_log(own)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["SIMPLE_RADIAL 96 54 58 48 27 -0.1", "OPENCV 96 54 58 57 48 27 -0.1 0.02 0.001 -0.002", "RADIAL_FISHEYE 96 54 58 48 27 0.05 -0.01",
+     "FULL_OPENCV 96 54 58 57 48 27 -0.1 0.02 0.001 -0.002 0.01 0.02 0.01 0.003", "OPENCV_FISHEYE 96 54 58 57 48 27 0.1 -0.02 0.01 0.001"],
+)  # fmt: skip
+def test_distorted_lenses_project_as_colmaps_do(own, line):
+    import pycolmap
+
+    (own / "sparse/0/cameras.txt").write_text(f"1 {line}\n")
+    lens = open_log(own).camera("camera").lens
+    kind, width, height, *params = line.split()
+    theirs = pycolmap.Camera(model=kind, width=int(width), height=int(height), params=[float(p) for p in params])
+    points = np.random.default_rng(0).uniform([-0.6, -0.4, 1.0], [0.6, 0.4, 1.0], (50, 3)) * 3
+    np.testing.assert_allclose(lens.project(torch.from_numpy(points)).numpy(), theirs.img_from_cam(points), atol=1e-9)
+
+
+def test_a_lens_that_is_not_read_is_named_with_the_fix(own):
+    cameras = own / "sparse/0/cameras.txt"
+    cameras.write_text("1 FOV 96 54 57.6 57.6 48 27 0.1\n")
+    with pytest.raises(ValueError, match="FOV.*colmap image_undistorter"):
+        open_log(own)
+
+
+def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ValueError, match=r"pip install 'sidestep\[colmap\]'"):
+        open_log(workspace)
+
+
+@pytest.fixture(scope="module")
+def scene(workspace, tmp_path_factory):
+    out = tmp_path_factory.mktemp("fit") / "walk"
+    config = FitConfig(steps=150, budget=6000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
+    reconstruct(open_log(workspace), out, config=config)
+    return out
+
+
+def test_pictures_alone_become_a_scene(scene):
+    made = load(scene)
+    assert isinstance(made, Scene) and (made.rig["camera"].width, made.rig["camera"].height) == (96, 54)
+    row = made.meta["held_out"][0]
+    assert row["frames"] == [4] and row["psnr"] > 22 and row["psnr"] > row["mean_psnr"] + 2
+
+
+def test_a_scene_without_metres_refuses_what_is_in_metres(scene, street):
+    made = load(scene)
+    assert made.meta["metric"] is False
+    with pytest.raises(ValueError, match="lateral shift is in metres.*--camera-height 1.5m"):
+        render_clip(made, "camera", shift=2.0)
+    with pytest.raises(ValueError, match="--metres-per-unit"):
+        insert(made, street.actors[0].asset, Placement("car/0001", 5, 0))
+    assert len(list(render_clip(made, "camera", width=32, height=18))) == 12
+    metric = replace(made, meta={**made.meta, "metric": True})
+    assert next(render_clip(metric, "camera", shift=2.0, width=32, height=18)).rgb is not None
+
+
+def test_lund_reads_with_all_its_pictures(shared):
+    log = open_log(shared / "lund", camera_height=1.6)
+    assert len(log.camera("camera")) == 24 and len(log.points.xyz) == 1453
+    # a walk of a hundred metres down a street: level, and straight ahead
+    walked = log.ego.world_from_body[:, :3, 3].diff(dim=0)
+    assert 60 < float(walked.norm(dim=1).sum()) < 180 and float(walked[:, 2].abs().sum()) < 0.05 * float(walked.norm(dim=1).sum())
+    bodies = log.ego.world_from_body
+    assert (bodies[:, 2, 2] > 0.97).all() and (bodies[:, 0, 0] > 0.8).all()
