@@ -71,11 +71,6 @@ class Settings:
         """Transmittance below which a pixel is done. Not 0: backward divides by what is left, so nothing may underflow."""
         return max(self.config.termination, 1e-10)
 
-    @property
-    def early(self) -> int:
-        """Entries between two looks for pixels that are done: (1 - alpha_max)^early may be 1e-24 at least."""
-        return 8 if self.alpha_max <= 0.999 else 4
-
     def crop(self, planes: torch.Tensor) -> torch.Tensor:
         return planes[..., : self.height, : self.width]
 
@@ -247,7 +242,7 @@ def _composite(settings: Settings, window: Window, lists: TileLists, records: to
     tile's list each pixel went dark (CPU); one past the last entry of each pixel (CUDA)."""
     device, tiles = records.device, window.tiles_x * window.tiles_y
     planes = _planes(window, 7 if settings.instance else 6 if settings.depth else 4, device)
-    lists_of = [view(lists.starts, int), view(lists.ids, int), view(records, float)]
+    lists_of = [view(lists.starts, int), view(lists.ids, int), view(records, float if device.type == "cuda" else lanes)]
     limits = [settings.alpha_max, settings.termination]
     if device.type == "cuda":
         last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
@@ -259,7 +254,7 @@ def _composite(settings: Settings, window: Window, lists: TileLists, records: to
     dark_at = _planes(window, 1, device)
     rows = _lane_planes(planes)
     out = [rows[min(i, len(rows) - 1)] for i in range(7)]
-    kernel = composite(settings.depth, settings.instance, settings.squarings, settings.early)
+    kernel = composite(settings.depth, settings.instance, settings.squarings)
     run(kernel, BANDS, [*lists_of, window, BANDS, *limits, *_working(), *out, view(last, int), *_lane_planes(dark_at)], device)
     return planes, (last, dark_at)
 
@@ -268,9 +263,9 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, record
     """The gradient slots `[I, GRADIENTS]` of the window's entries; grads are planes as of `_part_gradients`."""
     assert part.final_t is not None
     device, tiles = records.device, part.window.tiles_x * part.window.tiles_y
-    slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
-    lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float)]
     on_cuda = device.type == "cuda"
+    slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
+    lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int), view(records, float if on_cuda else lanes)]
     r, g, b, t_gradient, *extra = [view(p, float) for p in grads] if on_cuda else _lane_planes(grads)
     z, w = extra or (r, r)
     if on_cuda:
@@ -280,7 +275,7 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, record
         run_blocks(kernel, tiles, TILE * TILE, [*args, view(slots, float)], device)
         return slots
     args = [*lists_of, part.window, BANDS, settings.alpha_max, *_working(), r, g, b, z, w, view(part.ends[0], int)]
-    kernel = composite_gradient(settings.depth, settings.squarings, settings.early)
+    kernel = composite_gradient(settings.depth, settings.squarings)
     lanes_of_pixels = [*_lane_planes(part.ends[1]), *_lane_planes(part.final_t[None])]
     run(kernel, BANDS, [*args, *lanes_of_pixels, t_gradient, view(slots, float)], device)
     return slots

@@ -6,8 +6,8 @@ be another page. Kernels are made per set of outputs, so that what was not asked
 front from a stored last entry per row: the front-to-back form (total minus prefix) cancels in float32.
 
 Backward finds each transmittance by dividing the final one, so none may underflow. A lane whose neighbours see far may meet any
-number of splats after it is dark. So every `early` entries dark lanes are taken out: their transmittance is kept aside with the
-place in the list, and goes on as 0, which costs nothing an entry; backward brings it back at that place.
+number of splats after it is dark. So every LOOK entries, and sooner where they are opaque, dark lanes are taken out: their transmittance
+is kept aside with the place in the list, and goes on as 0, which costs nothing an entry; backward brings it back at that place.
 """
 
 from functools import cache
@@ -50,6 +50,9 @@ from render.kernels.types import (
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
 ROLLED = OPTIONS | {"max_unroll": 8}  # loops over a tile's 16 rows stay loops: unrolled they compile ten times as long and run no faster
+LOOK = wp.constant(32)
+FAINTEST = wp.constant(1.0e-20)  # times termination, and once more 1 - alpha_max, is a float yet
+vec_rows = wp.types.vector(length=TILE, dtype=wp.int32)
 NEVER = wp.constant(16777216.0)  # the place in a tile's list of a lane that never went dark; floats count exactly up to it
 
 
@@ -60,6 +63,13 @@ def below(limit: float, z: lanes):
 
 
 @wp.func
+def before(place: float, places: lanes):
+    """Those of `places`, whole numbers, that are less than `place`; -1 for the others."""
+    less = wp.min(wp.max(lanes(place) - places, lanes(0.0)), lanes(1.0))
+    return wp.cw_mul(less, places + lanes(1.0)) - lanes(1.0)
+
+
+@wp.func
 def exp_series(z: lanes):
     """exp(-z) for z in [0, 0.75]: Taylor to degree 6, relative error 2e-5 at the end."""
     tail = lanes(0.041666668) - wp.cw_mul(z, lanes(0.008333334) - z * 0.00138889)
@@ -67,40 +77,48 @@ def exp_series(z: lanes):
 
 
 @wp.func
-def row_range(records: wp.array2d[float], i: int, x0: float, y0: float):
+def lesser(a: float, b: float):
+    """Half the instructions of `wp.min`, which minds NaN."""
+    return wp.where(a < b, a, b)
+
+
+@wp.func
+def greater(a: float, b: float):
+    return wp.where(a > b, a, b)
+
+
+@wp.func
+def row_range(record: lanes, x0: float, y0: float):
     """First and last row that the ellipse reaches within the columns of the tile whose first pixel centre is x0, y0."""
-    px = records[i, X] - x0
-    py = records[i, Y] - y0
-    k = records[i, K]
-    m = records[i, M]
-    h = records[i, H]
-    inv_c = records[i, INV_C]
+    px = record[X] - x0
+    py = record[Y] - y0
+    k = record[K]
+    m = record[M]
+    h = record[H]
+    inv_c = record[INV_C]
     k2 = k * k
-    cs = (k2 * m * m + h) * records[i, S_MAX]
+    cs = (k2 * m * m + h) * record[S_MAX]
     k2h = k2 * h
     slope = k2 * m * inv_c
-    x_at_ext = m * records[i, Y_EXT]
+    x_at_ext = m * record[Y_EXT]
     left = -px - SLACK
     right = WIDTH - px + SLACK
-    dx_low = wp.clamp(x_at_ext, left, right)
-    dx_high = wp.clamp(-x_at_ext, left, right)
-    low = slope * dx_low + wp.sqrt(wp.max(cs - k2h * dx_low * dx_low, 0.0)) * inv_c + SLACK
-    high = slope * dx_high - wp.sqrt(wp.max(cs - k2h * dx_high * dx_high, 0.0)) * inv_c - SLACK
+    dx_low = lesser(greater(x_at_ext, left), right)
+    dx_high = lesser(greater(-x_at_ext, left), right)
+    low = slope * dx_low + wp.sqrt(greater(cs - k2h * dx_low * dx_low, 0.0)) * inv_c + SLACK
+    high = slope * dx_high - wp.sqrt(greater(cs - k2h * dx_high * dx_high, 0.0)) * inv_c - SLACK
     return wp.vec2i(wp.max(0, int(wp.ceil(py + high))), wp.min(LAST, int(wp.floor(py + low))))
 
 
 @cache
-def composite(depth: bool, instance: bool, squarings: int, early: int):
-    """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10.
-
-    early: entries between two looks for lanes that went dark, few enough that alpha_max cannot take one from there to underflow.
-    """
+def composite(depth: bool, instance: bool, squarings: int):
+    """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10."""
     scale = 0.5**squarings
     root = scale**0.5
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes],
         window: Window, bands: int, alpha_max: float, termination: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
         out_t: wp.array2d[lanes], out_r: wp.array2d[lanes], out_g: wp.array2d[lanes], out_b: wp.array2d[lanes],
@@ -130,39 +148,49 @@ def composite(depth: bool, instance: bool, squarings: int, early: int):
                     state[band, 6, r] = lanes(-1.0)
                 state[band, 8, r] = lanes(NEVER)
                 state[band, 9, r] = lanes(0.0)
-                last[row0 + r, tx] = start
             row_max = lanes(1.0)
+            row_last = vec_rows(start)
+            strength = float(1.0)  # at most so much weaker has any lane become since the last look
+            next_look = start + LOOK
             stop = tile_starts[tile + 1]
             next_rows = wp.vec2i(0, -1)
             if stop > start:
-                next_rows = row_range(records, ids[start], x0, y0)
+                next_rows = row_range(records[ids[start]], x0, y0)
             for n in range(start, stop):
-                if (n - start) % wp.static(early) == wp.static(early - 1):
+                if n == next_look or strength < FAINTEST:
+                    strength = float(1.0)
+                    next_look = n + LOOK
+                    gone = lanes(0.0)
                     for r in range(TILE):
                         seen = state[band, 0, r]
-                        dark = below(termination, seen)
-                        kept = wp.cw_mul(dark, seen)
-                        state[band, 8, r] = wp.min(state[band, 8, r], lanes(NEVER) + dark * (float(n - start) - NEVER))
-                        state[band, 9, r] = state[band, 9, r] + kept
-                        state[band, 0, r] = seen - kept
-                        row_max[r] = wp.max(seen - kept)
-                    if wp.max(row_max) <= 0.0:
-                        break
-                i = ids[n]
-                px = records[i, X] - x0
-                py = records[i, Y] - y0
-                k = records[i, K] * wp.static(root)
-                m = records[i, M]
-                h = records[i, H] * wp.static(scale)
-                z_max = records[i, S_MAX] * wp.static(scale)
-                opacity = records[i, OPACITY]
-                red = records[i, RED]
-                green = records[i, GREEN]
-                blue = records[i, BLUE]
+                        gone = wp.max(gone, wp.cw_mul(below(termination, seen), seen))
+                    if wp.max(gone) > 0.0:
+                        for r in range(TILE):
+                            seen = state[band, 0, r]
+                            dark = below(termination, seen)
+                            kept = wp.cw_mul(dark, seen)
+                            state[band, 8, r] = wp.min(state[band, 8, r], lanes(NEVER) + dark * (float(n - start) - NEVER))
+                            state[band, 9, r] = state[band, 9, r] + kept
+                            state[band, 0, r] = seen - kept
+                            row_max[r] = wp.max(seen - kept)
+                        if wp.max(row_max) <= 0.0:
+                            break
+                record = records[ids[n]]
+                px = record[X] - x0
+                py = record[Y] - y0
+                k = record[K] * wp.static(root)
+                m = record[M]
+                h = record[H] * wp.static(scale)
+                z_max = record[S_MAX] * wp.static(scale)
+                opacity = record[OPACITY]
+                red = record[RED]
+                green = record[GREEN]
+                blue = record[BLUE]
+                strength *= 1.0 - lesser(opacity, alpha_max)
                 rows = wp.vec2i(next_rows[0], next_rows[1])  # a copy: plain assignment would be another name for the same variable
                 # the next entry's rows are found before this one's are drawn: the branch that ends a loop of unknown
                 # length is mispredicted, and then only what came before it is already done
-                next_rows = row_range(records, ids[wp.min(n + 1, stop - 1)], x0, y0)
+                next_rows = row_range(records[ids[wp.min(n + 1, stop - 1)]], x0, y0)
                 for r in range(rows[0], rows[1] + 1):
                     if row_max[r] > 0.0:
                         dy = float(r) - py
@@ -177,17 +205,18 @@ def composite(depth: bool, instance: bool, squarings: int, early: int):
                         state[band, 2, r] = state[band, 2, r] + w * green
                         state[band, 3, r] = state[band, 3, r] + w * blue
                         if wp.static(depth):
-                            state[band, 4, r] = state[band, 4, r] + w * records[i, Z]
+                            state[band, 4, r] = state[band, 4, r] + w * record[Z]
                             state[band, 5, r] = state[band, 5, r] + w
                         if wp.static(instance):
                             most = state[band, 7, r]
                             leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
-                            state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(records[i, INSTANCE]) - state[band, 6, r])
+                            state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(record[INSTANCE]) - state[band, 6, r])
                             state[band, 7, r] = wp.max(most, w)
                         state[band, 0, r] = t - w
-                        last[row0 + r, tx] = n + 1
+                        row_last[r] = n + 1
             for r in range(TILE):
                 out_t[row0 + r, tx] = state[band, 0, r] + state[band, 9, r]
+                last[row0 + r, tx] = row_last[r]
                 dark_at[row0 + r, tx] = state[band, 8, r]
                 out_r[row0 + r, tx] = state[band, 1, r]
                 out_g[row0 + r, tx] = state[band, 2, r]
@@ -202,14 +231,14 @@ def composite(depth: bool, instance: bool, squarings: int, early: int):
 
 
 @cache
-def composite_gradient(depth: bool, squarings: int, early: int):
+def composite_gradient(depth: bool, squarings: int):
     """The backward kernel: writes one gradient slot for every entry of every tile, on every path."""
     scale = 0.5**squarings
     root = scale**0.5
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes],
         window: Window, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
         g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes], g_w: wp.array2d[lanes],
@@ -234,8 +263,11 @@ def composite_gradient(depth: bool, squarings: int, early: int):
             y0 = float((window.top + ty) * TILE) + 0.5
             start = tile_starts[tile]
             stop = start
+            row_last = vec_rows(start)
             for r in range(TILE):
+                row_last[r] = last[row0 + r, tx]
                 stop = wp.max(stop, last[row0 + r, tx])
+            next_dark = lanes(-1.0)  # by column: the last place, before the one at hand, where a lane went dark
             for r in range(TILE):
                 since = dark_at[row0 + r, tx]
                 lit = wp.min(wp.max(since - lanes(float(stop - start - 1)), lanes(0.0)), one)
@@ -248,32 +280,38 @@ def composite_gradient(depth: bool, squarings: int, early: int):
                     state[band, 5, r] = g_z[row0 + r, tx]
                     state[band, 6, r] = g_w[row0 + r, tx]
                 state[band, 7, r] = since
+                next_dark = wp.max(next_dark, before(float(stop - start), since))
+            brighten = wp.max(next_dark)
             for n in range(stop, tile_starts[tile + 1]):
                 slot = slot_of[n]
                 for c in range(GRADIENTS):
                     slots[slot, c] = 0.0
             next_rows = wp.vec2i(0, -1)
             if stop > start:
-                next_rows = row_range(records, ids[stop - 1], x0, y0)
+                next_rows = row_range(records[ids[stop - 1]], x0, y0)
             for back in range(stop - start):
                 n = stop - 1 - back
-                if (n + 1 - start) % wp.static(early) == wp.static(early - 1) and back > 0:
+                if float(n + 1 - start) == brighten:
+                    next_dark = lanes(-1.0)
                     for r in range(TILE):
-                        off = state[band, 7, r] - lanes(float(n + 1 - start))
+                        since = state[band, 7, r]
+                        off = since - lanes(brighten)
                         here = one - wp.min(wp.max(off, lanes(0.0) - off), one)
                         state[band, 0, r] = state[band, 0, r] + wp.cw_mul(here, final_t[row0 + r, tx])
                         state[band, 1, r] = state[band, 1, r] + wp.cw_mul(here, t_gradient[row0 + r, tx])
-                i = ids[n]
-                px = records[i, X] - x0
-                py = records[i, Y] - y0
-                k = records[i, K] * wp.static(root)
-                m = records[i, M]
-                h = records[i, H] * wp.static(scale)
-                z_max = records[i, S_MAX] * wp.static(scale)
-                opacity = records[i, OPACITY]
-                red = records[i, RED]
-                green = records[i, GREEN]
-                blue = records[i, BLUE]
+                        next_dark = wp.max(next_dark, before(brighten, since))
+                    brighten = wp.max(next_dark)
+                record = records[ids[n]]
+                px = record[X] - x0
+                py = record[Y] - y0
+                k = record[K] * wp.static(root)
+                m = record[M]
+                h = record[H] * wp.static(scale)
+                z_max = record[S_MAX] * wp.static(scale)
+                opacity = record[OPACITY]
+                red = record[RED]
+                green = record[GREEN]
+                blue = record[BLUE]
                 sum_r = lanes(0.0)
                 sum_g = lanes(0.0)
                 sum_b = lanes(0.0)
@@ -282,12 +320,12 @@ def composite_gradient(depth: bool, squarings: int, early: int):
                 sum_ey = lanes(0.0)
                 sum_eyy = lanes(0.0)
                 rows = wp.vec2i(next_rows[0], next_rows[1])  # a copy: plain assignment would be another name for the same variable
-                next_rows = row_range(records, ids[wp.max(n - 1, start)], x0, y0)
+                next_rows = row_range(records[ids[wp.max(n - 1, start)]], x0, y0)
                 # moments are taken about a point of the ridge amid these rows: about the centre, which may lie
                 # hundreds of pixels away, the sums of a needle would cancel
                 middle = 0.5 * float(rows[0] + rows[1])
                 for r in range(rows[0], rows[1] + 1):
-                    if n < last[row0 + r, tx]:
+                    if n < row_last[r]:
                         dy = float(r) - py
                         u = column * k - lanes(k * (px + m * dy))
                         z = wp.cw_mul(u, u) + lanes(h * dy * dy)
@@ -306,7 +344,7 @@ def composite_gradient(depth: bool, squarings: int, early: int):
                         d = gr * red + gg * green + gb * blue
                         if wp.static(depth):
                             gz = state[band, 5, r]
-                            d = d + gz * records[i, Z] + state[band, 6, r]
+                            d = d + gz * record[Z] + state[band, 6, r]
                             sum_z = sum_z + wp.cw_mul(w, gz)
                         rest = state[band, 1, r]
                         de = wp.cw_mul(wp.cw_mul(wp.cw_mul(t, d) - wp.cw_mul(rest, inverse), below(alpha_max, full)), e)
@@ -331,11 +369,11 @@ def composite_gradient(depth: bool, squarings: int, early: int):
                 ety = xey - m * eyy + from_centre * et
                 edy = ey + from_centre * e0
                 edyy = eyy + from_centre * (2.0 * ey + from_centre * e0)
-                k1 = records[i, K]
+                k1 = record[K]
                 slope = 2.0 * k1 * k1 * opacity  # dL/ds = -opacity dL/da e throughout
                 slot = slot_of[n]
                 slots[slot, G_X] = slope * et
-                slots[slot, G_Y] = 2.0 * records[i, H] * opacity * edy - slope * m * et
+                slots[slot, G_Y] = 2.0 * record[H] * opacity * edy - slope * m * et
                 slots[slot, G_K] = -2.0 * k1 * opacity * ett
                 slots[slot, G_M] = slope * ety
                 slots[slot, G_H] = -opacity * edyy
