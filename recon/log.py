@@ -12,7 +12,7 @@ import torch
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import Lens
 from scenes.names import unknown
-from scenes.poses import inverse
+from scenes.poses import interpolate, inverse
 from scenes.trajectory import Trajectory
 
 
@@ -139,6 +139,28 @@ class Log:
         cam = self.camera(name)
         bodies = torch.stack([self.ego.at(int(t)) for t in cam.times_us])
         return inverse(bodies) @ cam.world_from_cam
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """Width and height of an image file, without decoding it. ValueError naming a file that is none."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as opened:
+            return opened.size
+    except FileNotFoundError:
+        raise
+    except (OSError, UnidentifiedImageError) as problem:
+        raise ValueError(f"{file} does not decode as an image ({problem}); fetch the file again") from None
+
+
+def lengthened(times_us: np.ndarray, poses: torch.Tensor) -> Trajectory:
+    """A body's trajectory with one more pose at either end, at constant velocity: sensors fire up to a sweep off its stamps."""
+    if len(times_us) > 1:
+        before, after = interpolate(poses[0], poses[1], -1.0), interpolate(poses[-2], poses[-1], 2.0)
+        times_us = np.concatenate([[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]])
+        poses = torch.cat([before[None], poses, after[None]])
+    return Trajectory(torch.from_numpy(times_us), poses)
 
 
 def mean_pose(poses: torch.Tensor) -> torch.Tensor:

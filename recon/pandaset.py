@@ -9,17 +9,17 @@ degrees. An object seen by two lidars has two cuboid tracks that name each other
 from __future__ import annotations
 
 import json
-import re
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.tracks import named, slug
 from recon.unpickle import read_frame
 from scenes.lenses import Pinhole
-from scenes.poses import interpolate, pose_from, translation
+from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory
 
 LABELS = {
@@ -35,8 +35,6 @@ LABELS = {
     "Towed Object": "trailer",
     "Cones": "cone",
 }
-KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": "cyc"}
-VEHICLES = {"car", "pickup", "truck", "bus", "vehicle", "construction-vehicle", "emergency-vehicle", "trailer", "pedicab", "train", "tram"}
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 PICKLES = (".pkl.gz", ".pkl")
 FRONT = ("front_camera", "front_left_camera", "front_right_camera")
@@ -52,7 +50,7 @@ def read_pandaset(path: Path) -> Log:
     if not cameras:
         raise ValueError(f"{path / 'camera'} holds no camera; PandaSet's has front_camera and five more")
     cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != "front_camera", item[0])))
-    ego = _extended(lidar_times, home @ body)
+    ego = lengthened(lidar_times, home @ body)
     sweeps = tuple(
         Sweep(i, int(t), partial(_points, file, origin.numpy()))
         for i, t in enumerate(lidar_times)
@@ -67,7 +65,7 @@ def read_pandaset(path: Path) -> Log:
         "world_origin": origin.tolist(),
         **_geodetic(path / "meta" / "gps.json"),
     }
-    tracks = _tracks(path, lidar_times, origin.numpy(), home @ body)
+    tracks = _tracks(path, lidar_times, origin.numpy(), ego)
     return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
 
 
@@ -99,33 +97,18 @@ def _stamped(folder: Path) -> tuple[np.ndarray, torch.Tensor]:
 
 
 def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
-    from PIL import Image, UnidentifiedImageError
-
     times_us, poses = _stamped(folder)
     files = tuple(folder / f"{i:02d}.jpg" for i in range(len(times_us)))
     for file in files:
         if not file.is_file():
             raise FileNotFoundError(f"{file} is missing; {folder / 'timestamps.json'} names {len(files)} frames")
-    try:
-        with Image.open(files[0]) as first:
-            width, height = first.size
-    except (OSError, UnidentifiedImageError) as problem:
-        raise ValueError(f"{files[0]} does not decode as an image ({problem}); fetch the file again") from None
+    width, height = image_size(files[0])
     lens = _json(folder / "intrinsics.json")
     try:
         pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
     except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
     return LogCamera(folder.name, pinhole, width, height, files, torch.from_numpy(times_us), home @ poses)
-
-
-def _extended(times_us: np.ndarray, poses: torch.Tensor) -> Trajectory:
-    """The body's trajectory with one more pose at either end, at constant velocity: cameras fire up to 81 ms before the first stamp."""
-    if len(times_us) > 1:
-        before, after = interpolate(poses[0], poses[1], -1.0), interpolate(poses[-2], poses[-1], 2.0)
-        times_us = np.concatenate([[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]])
-        poses = torch.cat([before[None], poses, after[None]])
-    return Trajectory(torch.from_numpy(times_us), poses)
 
 
 def _pickle(folder: Path, index: int) -> Path | None:
@@ -153,11 +136,6 @@ def _geodetic(path: Path) -> dict:
         raise ValueError(f"{path} is not as PandaSet writes it ({problem!r})") from None
 
 
-def label_slug(label: str) -> str:
-    """A class as a slug: `Medium-sized Truck` is truck, `Cones` cone; unknown classes in lower case with dashes."""
-    return LABELS.get(label) or re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "object"
-
-
 def _observations(path: Path, count: int) -> dict[str, list[dict]]:
     """Every cuboid by its track's uuid, in time order: frame index and the row."""
     found: dict[str, list[dict]] = {}
@@ -178,7 +156,7 @@ def _observations(path: Path, count: int) -> dict[str, list[dict]]:
     return found
 
 
-def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, bodies: torch.Tensor) -> tuple[Track, ...]:
+def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, ego: Trajectory) -> tuple[Track, ...]:
     observed = _observations(path, len(times_us))
     made = []
     for sources in _families(observed):
@@ -198,19 +176,12 @@ def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, bodies: torch.
         poses = pose_from(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), base)
         if not torch.isfinite(poses).all():
             raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} stands at a place that is not finite")
-        label = label_slug(str(lead[0]["label"]))
+        label = slug(str(lead[0]["label"]), LABELS)
         moving = any(not bool(e["stationary"]) for u in sources for e in observed[u])
         times = np.array([times_us[e["frame"]] for e in entries])
         sensor = np.array([e["sensor"] for e in entries])
-        nearest = float((bodies[[e["frame"] for e in entries], :3, 3] - poses[:, :3, 3]).norm(dim=1).min())
-        made.append((nearest, Track("", label, moving, size, times, poses, sensor, tuple(sources))))
-    named: list[Track] = []
-    numbers: dict[str, int] = {}
-    for _, track in sorted(made, key=lambda item: (item[0], item[1].sources)):
-        kind = "veh" if track.label in VEHICLES else KINDS.get(track.label, "obj")
-        numbers[kind] = numbers.get(kind, 0) + 1
-        named.append(Track(**{**track.__dict__, "name": f"{kind}_{numbers[kind]}"}))
-    return tuple(named)
+        made.append(Track("", label, moving, size, times, poses, sensor, tuple(sources)))
+    return named(made, ego)
 
 
 def _families(observed: dict[str, list[dict]]) -> list[list[str]]:

@@ -8,7 +8,8 @@ from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
 from recon.actors import inside
-from recon.pandaset import label_slug
+from recon.pandaset import LABELS
+from recon.tracks import slug
 from scenes.poses import inverse
 
 
@@ -123,7 +124,7 @@ def test_a_folder_that_is_no_drive_is_refused_with_the_drive_inside(own_drive, t
 
 
 def test_labels_become_slugs():
-    assert [label_slug(x) for x in ("Car", "Pickup Truck", "Medium-sized Truck", "Pedestrian with Object", "Rolling Containers", "")] == [
+    assert [slug(x, LABELS) for x in ("Car", "Pickup Truck", "Medium-sized Truck", "Pedestrian with Object", "Rolling Containers", "")] == [
         "car", "pickup", "truck", "pedestrian", "rolling-containers", "object",
     ]  # fmt: skip
 

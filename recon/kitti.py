@@ -1,0 +1,285 @@
+"""Reads KITTI's raw drives and odometry sequences (Geiger et al. 2013; the layouts as in the devkits' readme.txt).
+
+Raw, synced and rectified: `<date>_drive_<n>_sync` with image_00 to image_03, oxts, velodyne_points, tracklet_labels.xml where there are
+any, and the three calibration files in the folder above. The body is the IMU: x forward, y left, z up; the world is a Mercator plane.
+The lidar turns counter-clockwise and looks ahead at its stamp: its points are untwisted by the body's motion.
+
+Odometry: `sequences/<n>` with image_0 to image_3, velodyne, calib.txt, times.txt and the poses in `../../poses/<n>.txt`. The body is the
+lidar; its points are published untwisted.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.spin import untwisted
+from recon.tracks import Boxes, slug, tracks_of
+from scenes.lenses import Pinhole
+from scenes.poses import inverse, translation, yaw
+from scenes.trajectory import Trajectory
+
+EARTH = 6378137.0
+"""Metres: the radius that the devkit's Mercator projection takes."""
+
+LABELS = {"Person_sitting": "pedestrian", "Misc": "object"}
+SHARE = {"licence": "CC BY-NC-SA 3.0", "attribution": "KITTI by Geiger, Lenz, Stiller and Urtasun"}
+FRONT = ("image_02", "image_2", "image_00", "image_0")
+
+
+def is_kitti_raw(path: Path) -> bool:
+    return (path / "oxts").is_dir() and any(path.glob("image_0[0-3]"))
+
+
+def is_kitti_odometry(path: Path) -> bool:
+    return (path / "calib.txt").is_file() and (path / "times.txt").is_file()
+
+
+def read_kitti_raw(path: Path) -> Log:
+    """The raw drive in folder `path`. FileNotFoundError and ValueError name the file that is missing or wrong."""
+    if path.resolve().name.endswith("_extract"):
+        raise ValueError(f"{path} is the unsynced drive, whose pictures are not rectified; fetch its _sync folder")
+    above = path.resolve().parent
+    cams = _numbers(above / "calib_cam_to_cam.txt")
+    rect_from_lidar = _padded(_named(cams, "R_rect_00", 9, above / "calib_cam_to_cam.txt")) @ _rigid(above / "calib_velo_to_cam.txt")
+    lidar_from_imu = _rigid(above / "calib_imu_to_velo.txt")
+
+    times = _stamps(path / "oxts" / "timestamps.txt")
+    poses = _mercator([_oxts(path / "oxts" / "data" / f"{i:010d}.txt") for i in range(len(times))])
+    origin = poses[0, :3, 3].clone()
+    poses[:, :3, 3] -= origin
+    ego = lengthened(times, poses)
+    cameras = {}
+    for folder in sorted(path.glob("image_0[0-3]")):
+        projection = _named(cams, f"P_rect_{folder.name[-2:]}", 12, above / "calib_cam_to_cam.txt")
+        body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
+        stamps = _stamps(folder / "timestamps.txt")
+        files = _files(folder / "data", ".png", len(stamps), 10)
+        world = torch.stack([ego.near(int(t)) @ body_from_cam for t in stamps])
+        cameras[folder.name] = _camera(folder.name, projection, files, stamps, world)
+    sweeps, lidar_times = _spinning(path / "velodyne_points", inverse(lidar_from_imu), ego)
+    first = _oxts(path / "oxts" / "data" / f"{0:010d}.txt")
+    meta = {
+        "name": f"kitti-{path.resolve().name}", "source": f"KITTI raw drive {path.resolve().name}", **SHARE,
+        "body": "IMU, x forward, y left, z up", "world_origin": origin.tolist(),
+        "geodetic_origin": dict(zip(("lat", "long", "height"), first[:3], strict=True)),
+    }  # fmt: skip
+    tracks = _tracklets(path / "tracklet_labels.xml", lidar_times, inverse(lidar_from_imu), ego)
+    return _log(meta, path, cameras, sweeps, tracks, ego)
+
+
+def read_kitti_odometry(path: Path) -> Log:
+    """The odometry sequence in folder `path`. FileNotFoundError and ValueError name the file that is missing or wrong."""
+    number = path.resolve().name
+    times = np.round(np.array(_rows(path / "times.txt", 1))[:, 0] * 1e6).astype(np.int64)
+    where = next((p for p in (path / "poses.txt", path.resolve().parents[1] / "poses" / f"{number}.txt") if p.is_file()), None)
+    if where is None:
+        missing = path.resolve().parents[1] / "poses" / f"{number}.txt"
+        raise FileNotFoundError(f"{missing} is missing; KITTI publishes poses of the sequences 00 to 10, for others write your own there")
+    rows = np.array(_rows(where, 12)).reshape(-1, 3, 4)
+    if len(rows) != len(times):
+        raise ValueError(f"{where} has {len(rows)} poses for the {len(times)} times of {path / 'times.txt'}; they must be as many")
+    camera_world = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+    camera_world[:, :3] = torch.from_numpy(rows)
+    calib = _numbers(path / "calib.txt")
+    cam_from_body = _padded(_named(calib, "Tr", 12, path / "calib.txt"))
+    # the poses' world is the first rectified camera; ours is the first lidar pose, whose z is up
+    poses = inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body
+    ego = lengthened(times, poses)
+    cameras = {}
+    for folder in sorted(path.glob("image_[0-3]")):
+        projection = _named(calib, f"P{folder.name[-1]}", 12, path / "calib.txt")
+        files = _files(folder, ".png", len(times), 6)
+        world = poses @ inverse(_beside(projection) @ cam_from_body)
+        cameras[folder.name] = _camera(folder.name, projection, files, times, world)
+    sweeps = tuple(
+        Sweep(i, int(t), partial(_scan, file, poses[i], int(t)))
+        for i, t in enumerate(times)
+        if (file := path / "velodyne" / f"{i:06d}.bin").is_file()
+    )
+    meta = {
+        "name": f"kitti-odometry-{number}", "source": f"KITTI odometry sequence {number}", **SHARE,
+        "body": "lidar, x forward, y left, z up",
+    }  # fmt: skip
+    return _log(meta, path, cameras, sweeps, (), ego)
+
+
+def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory) -> Log:
+    if not cameras:
+        raise ValueError(f"{path} holds no camera; KITTI's colour cameras are image_02 and image_03 (odometry: image_2 and image_3)")
+    front = next((n for n in FRONT if n in cameras), next(iter(cameras)))
+    cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != front, item[0])))
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, (front,))
+
+
+def _camera(name: str, projection: torch.Tensor, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:
+    p = projection.reshape(3, 4)
+    lens = Pinhole(float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
+    # the devkit counts pixel centres from 0, we from 0.5
+    lens = Pinhole(lens.fx, lens.fy, lens.cx + 0.5, lens.cy + 0.5)
+    return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times), world)
+
+
+def _beside(projection: torch.Tensor) -> torch.Tensor:
+    """`cam_from_rect` `[4, 4]` of a camera's projection K [I | t]: t is its place beside the reference camera."""
+    p = projection.reshape(3, 4)
+    return translation(*torch.linalg.solve(p[:, :3], p[:, 3]).tolist())
+
+
+def _numbers(path: Path) -> dict[str, list[float]]:
+    """The numbers of a calibration file by name; lines that hold something else (calib_time) are left out."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing; KITTI's calibration comes as a download of its own: unpack it there")
+    found = {}
+    for line in path.read_text(errors="replace").splitlines():
+        name, _, rest = line.partition(":")
+        try:
+            found[name.strip()] = [float(word) for word in rest.split()]
+        except ValueError:
+            continue
+    return found
+
+
+def _named(found: dict[str, list[float]], name: str, count: int, path: Path) -> torch.Tensor:
+    values = found.get(name, [])
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"{path} must give {count} numbers as {name}, got {len(values)}; fetch the file again")
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _padded(values: torch.Tensor) -> torch.Tensor:
+    out = torch.eye(4, dtype=torch.float64)
+    out[:3, : len(values) // 3] = values.reshape(3, -1)
+    return out
+
+
+def _rigid(path: Path) -> torch.Tensor:
+    """The pose `[4, 4]` that a file gives as R and T."""
+    found = _numbers(path)
+    out = _padded(_named(found, "R", 9, path))
+    out[:3, 3] = _named(found, "T", 3, path)
+    return out
+
+
+def _rows(path: Path, count: int) -> list[list[float]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing; KITTI's layout has it")
+    try:
+        rows = [[float(word) for word in line.split()] for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    except ValueError as problem:
+        raise ValueError(f"{path} holds something that is no number ({problem})") from None
+    if not rows or any(len(row) < count for row in rows) or not all(np.isfinite(row).all() for row in rows):
+        raise ValueError(f"{path} must have {count} finite numbers in every row")
+    return rows
+
+
+def _stamps(path: Path) -> np.ndarray:
+    """Microseconds int64 of lines as `2011-09-26 13:02:25.964389445`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing; KITTI's layout has it")
+    times = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        whole, _, part = line.strip().partition(".")
+        try:
+            second = int(datetime.strptime(whole + " +0000", "%Y-%m-%d %H:%M:%S %z").timestamp())
+            times.append(second * 1_000_000 + int(round(float("0." + (part or "0")) * 1e6)))
+        except ValueError:
+            raise ValueError(f"{path}, line {number}: {line[:40]!r} is not a time as 2011-09-26 13:02:25.964389445") from None
+    if not times or not (np.diff(times) > 0).all():
+        raise ValueError(f"{path} must have times that rise strictly, and not none")
+    return np.array(times, dtype=np.int64)
+
+
+def _files(folder: Path, end: str, count: int, digits: int) -> tuple[Path, ...]:
+    files = tuple(folder / f"{i:0{digits}d}{end}" for i in range(count))
+    lost = next((f for f in files if not f.is_file()), None)
+    if lost is not None:
+        raise FileNotFoundError(f"{lost} is missing; the time stamps name {count} frames")
+    return files
+
+
+def _oxts(path: Path) -> list[float]:
+    """lat, lon (degrees), alt (metres), roll, pitch, yaw (radians) and 24 more values."""
+    return _rows(path, 6)[0]
+
+
+def _mercator(packets: list[list[float]]) -> torch.Tensor:
+    """`world_from_imu` `[F, 4, 4]` as the devkit's convertOxtsToPose.m has it: Mercator at the first latitude, R = Rz Ry Rx."""
+    lat, lon, alt, roll, pitch, heading = torch.tensor([p[:6] for p in packets], dtype=torch.float64).T
+    scale = torch.cos(torch.deg2rad(lat[0]))
+    out = torch.stack([yaw(float(h)) for h in heading])
+    x, y = (torch.eye(3, dtype=torch.float64).repeat(len(lat), 1, 1) for _ in range(2))
+    x[:, 1, 1] = x[:, 2, 2] = roll.cos()
+    x[:, 2, 1], x[:, 1, 2] = roll.sin(), -roll.sin()
+    y[:, 0, 0] = y[:, 2, 2] = pitch.cos()
+    y[:, 0, 2], y[:, 2, 0] = pitch.sin(), -pitch.sin()
+    out[:, :3, :3] = out[:, :3, :3] @ y @ x
+    out[:, 0, 3] = scale * EARTH * torch.deg2rad(lon)
+    out[:, 1, 3] = scale * EARTH * torch.log(torch.tan(torch.pi * (90 + lat) / 360))
+    out[:, 2, 3] = alt
+    return out
+
+
+def _spinning(folder: Path, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[tuple[Sweep, ...], np.ndarray]:
+    """The sweeps of a raw drive, some of which may be missing, and all their stamps."""
+    if not folder.is_dir():
+        return (), np.zeros(0, np.int64)
+    times = _stamps(folder / "timestamps.txt")
+    turn = int(np.median(np.diff(times))) if len(times) > 1 else 100_000
+    sweeps = tuple(
+        Sweep(i, int(t), partial(_turn, file, int(t), turn, body_from_lidar, ego))
+        for i, t in enumerate(times)
+        if (file := folder / "data" / f"{i:010d}.bin").is_file()
+    )
+    return sweeps, times
+
+
+def _read_scan(file: Path) -> np.ndarray:
+    """Points `[N, 3]` in the lidar's frame, of float32 x, y, z, reflectance."""
+    values = np.fromfile(file, dtype="<f4")
+    if len(values) % 4:
+        raise ValueError(f"{file} is cut off: {len(values)} numbers are no rows of four; fetch it again")
+    xyz = values.reshape(-1, 4)[:, :3].astype(np.float64)
+    return xyz[np.isfinite(xyz).all(1)]
+
+
+def _turn(file: Path, stamp: int, turn: int, body_from_lidar: torch.Tensor, ego: Trajectory) -> LidarPoints:
+    xyz = _read_scan(file)
+    times = stamp + np.round(np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) * turn).astype(np.int64)
+    return LidarPoints(untwisted(xyz, times, body_from_lidar, ego), times, np.zeros(len(xyz), np.int64))
+
+
+def _scan(file: Path, world_from_lidar: torch.Tensor, stamp: int) -> LidarPoints:
+    xyz = _read_scan(file) @ world_from_lidar[:3, :3].numpy().T + world_from_lidar[:3, 3].numpy()
+    return LidarPoints(xyz, np.full(len(xyz), stamp), np.zeros(len(xyz), np.int64))
+
+
+def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[Track, ...]:
+    """Tracks of tracklet_labels.xml: h, w, l, and from first_frame on base centres and rz in the lidar's frame."""
+    if not path.is_file():
+        return ()
+    try:
+        items = ElementTree.parse(path).getroot().findall("./tracklets/item")
+        found = []
+        for number, item in enumerate(items):
+            size = [float(item.findtext(k, "")) for k in ("l", "w", "h")]
+            first = int(item.findtext("first_frame", ""))
+            rows = [[float(p.findtext(k, "")) for k in ("tx", "ty", "tz", "rz")] for p in item.findall("./poses/item")]
+            count = min(len(rows), len(times) - first)
+            stamps = times[first : first + count]
+            placed = [translation(*row[:3]) @ yaw(row[3]) for row in rows[:count]]
+            if count > 0:
+                poses = torch.stack([ego.near(int(t)) @ body_from_lidar @ p for t, p in zip(stamps, placed, strict=True)])
+                label = slug(item.findtext("objectType", ""), LABELS)
+                found.append(Boxes(str(number), label, stamps, poses, np.tile(size, (count, 1))))
+    except (ElementTree.ParseError, ValueError) as problem:
+        raise ValueError(f"{path} is not as KITTI writes it ({problem}); fetch it again") from None
+    return tracks_of(found, ego, str(path))

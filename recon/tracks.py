@@ -1,0 +1,72 @@
+"""What the readers of boxes share: classes as slugs, names by nearness, and what counts as moving."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from recon.log import Track
+from scenes.poses import inverse
+from scenes.trajectory import Trajectory
+
+KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": "cyc", "cyclist": "cyc"}
+VEHICLES = {
+    "car", "pickup", "truck", "bus", "van", "vehicle", "construction-vehicle", "emergency-vehicle", "trailer", "pedicab", "train", "tram",
+}  # fmt: skip
+
+MOVED = 1.0
+"""Metres that a box's middle goes before it counts as moving, where the log does not say: annotators' boxes wander by half of that."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """One object as a log annotates it: its identifier, class, times int64 us `[T]`, `world_from_box` `[T, 4, 4]` and sizes `[T, 3]`
+    (length, width, height). The box frame has its origin at the base centre, x forward, z up."""
+
+    source: str
+    label: str
+    times_us: np.ndarray
+    world_from_box: torch.Tensor
+    sizes: np.ndarray
+
+
+def slug(label: str, known: dict[str, str]) -> str:
+    """A class as a slug, by the log's own table first; unknown ones in lower case with dashes."""
+    return known.get(label) or re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "object"
+
+
+def tracks_of(found: list[Boxes], ego: Trajectory, where: str) -> tuple[Track, ...]:
+    """Tracks of annotated boxes, named. What goes less than `MOVED` stands. ValueError naming a box with an impossible size or place."""
+    made = []
+    for boxes in found:
+        order = np.argsort(boxes.times_us, kind="stable")
+        times, poses = boxes.times_us[order], boxes.world_from_box[torch.from_numpy(order)]
+        size = np.median(boxes.sizes, axis=0)
+        if not (np.isfinite(size).all() and (size > 0).all() and torch.isfinite(poses).all()):
+            raise ValueError(f"{where}: box {boxes.source} must have positive sizes and finite places, got {size.tolist()} m")
+        if not (np.diff(times) > 0).all():
+            raise ValueError(f"{where}: box {boxes.source} stands twice at one time")
+        middle = poses[:, :3, 3]
+        moving = bool((middle - middle.median(0).values).norm(dim=1).max() > MOVED)
+        made.append(Track("", boxes.label, moving, size, times, poses, np.full(len(times), -1), (boxes.source,)))
+    return named(made, ego)
+
+
+def named(tracks: list[Track], ego: Trajectory) -> tuple[Track, ...]:
+    """The tracks as `veh_1`, `ped_1`, `cyc_1`, `obj_1`, ..., each kind numbered by how near it came to the body."""
+    numbers: dict[str, int] = {}
+    out = []
+    for _, track in sorted(((nearness(t, ego), t) for t in tracks), key=lambda pair: (pair[0], pair[1].sources)):
+        kind = "veh" if track.label in VEHICLES else KINDS.get(track.label, "obj")
+        numbers[kind] = numbers.get(kind, 0) + 1
+        out.append(replace(track, name=f"{kind}_{numbers[kind]}"))
+    return tuple(out)
+
+
+def nearness(track: Track, ego: Trajectory) -> float:
+    """Metres between the body and the box where they were nearest; inf where they share no time."""
+    pairs = zip(track.times_us.tolist(), track.world_from_box, strict=True)
+    return min((float((inverse(ego.at(t)) @ pose)[:3, 3].norm()) for t, pose in pairs if ego.covers(t)), default=float("inf"))

@@ -1,0 +1,126 @@
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from made_kitti import write_kitti_odometry, write_kitti_raw
+from made_tape import STAMPS, check, tape
+
+from recon import open_log
+
+
+@pytest.fixture(scope="module")
+def recorded(street):
+    return tape(street)
+
+
+@pytest.fixture(scope="module")
+def raw(recorded, tmp_path_factory):
+    return write_kitti_raw(tmp_path_factory.mktemp("raw"), recorded)
+
+
+@pytest.fixture(scope="module")
+def odometry(recorded, tmp_path_factory):
+    return write_kitti_odometry(tmp_path_factory.mktemp("odometry"), recorded)
+
+
+@pytest.fixture
+def own(raw, tmp_path):
+    return shutil.copytree(raw.parent, tmp_path / raw.parent.name) / raw.name
+
+
+@pytest.fixture
+def own_sequence(odometry, tmp_path):
+    shutil.copytree(odometry.parents[1], tmp_path / "dataset")
+    return tmp_path / "dataset/sequences/04"
+
+
+def test_a_raw_drive_reads_as_it_was_recorded(raw, recorded):
+    log = open_log(raw)
+    check(log, recorded, {"front": "image_02", "right": "image_03"}, atol=1e-5)
+    assert log.front == ("image_02",) and len(log.tracks) == 2 and log.sweeps[0].time_us == STAMPS[0]
+    assert log.meta["geodetic_origin"]["lat"] == pytest.approx(49.0) and "CC BY-NC-SA" in log.meta["licence"]
+
+
+def test_a_sequence_reads_as_it_was_recorded(odometry, recorded):
+    """Its clock starts at 0, and it has no boxes."""
+    log = open_log(odometry)
+    late = replace(recorded, ego=replace(recorded.ego, times_us=recorded.ego.times_us - int(STAMPS[0])))
+    actor = recorded.street.actors[0]
+    early = replace(actor, trajectory=replace(actor.trajectory, times_us=actor.trajectory.times_us - int(STAMPS[0])))
+    late = replace(late, street=replace(recorded.street, actors=(early,), ego=late.ego))
+    lead = log.camera("image_2")
+    assert lead.times_us.tolist() == [100_000 * i for i in range(6)] and log.tracks == () and len(log.sweeps) == 5
+    for name in ("image_2", "image_3"):
+        assert torch.isfinite(log.camera(name).world_from_cam).all()
+    for i, t in enumerate(lead.times_us.tolist()):
+        a = torch.linalg.inv(lead.world_from_cam[0]) @ log.camera("image_3").world_from_cam[i]
+        b = torch.linalg.inv(late.camera("front", 0).world_from_cam) @ late.camera("right", t).world_from_cam
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
+    sweep = log.sweeps[-1].read()
+    away = torch.linalg.inv(late.camera("front", 0).world_from_cam).numpy()
+    home = torch.linalg.inv(lead.world_from_cam[0]).numpy()
+    ours = sweep.xyz @ home[:3, :3].T + home[:3, 3]
+    assert abs(ours - (late.points @ away[:3, :3].T + away[:3, 3])).max() < 1e-3
+
+
+def test_a_spinning_lidars_points_stand_still_though_the_car_moves(raw, recorded):
+    """Taken as one moment, the same sweep would smear by what the car drives in half a turn."""
+    log = open_log(raw)
+    first, last = log.sweeps[0].read(), log.sweeps[-1].read()
+    assert abs(first.xyz - last.xyz).max() < 0.02 and first.times_us.std() > 10_000
+
+
+@pytest.mark.parametrize(
+    "file", ["../calib_cam_to_cam.txt", "../calib_velo_to_cam.txt", "../calib_imu_to_velo.txt", "oxts/data/0000000003.txt",
+             "image_02/timestamps.txt", "image_03/data/0000000004.png", "velodyne_points/timestamps.txt"],
+)  # fmt: skip
+def test_a_missing_file_of_a_raw_drive_is_named(own, file):
+    (own / file).unlink()
+    with pytest.raises(FileNotFoundError, match=f"{(own / file).name} is missing"):
+        open_log(own)
+
+
+def test_wrong_numbers_of_a_raw_drive_are_named(own):
+    calib = own.parent / "calib_cam_to_cam.txt"
+    text = calib.read_text()
+    calib.write_text(text.replace("R_rect_00: ", "R_rect_00: 1 "))
+    with pytest.raises(ValueError, match="calib_cam_to_cam.txt must give 9 numbers as R_rect_00, got 10"):
+        open_log(own)
+    calib.write_text(text)
+    (own / "oxts/timestamps.txt").write_text("yesterday\n")
+    with pytest.raises(ValueError, match="timestamps.txt, line 1: 'yesterday' is not a time"):
+        open_log(own)
+
+
+def test_a_cut_sweep_is_named_when_read(own):
+    file = own / "velodyne_points/data/0000000000.bin"
+    file.write_bytes(file.read_bytes()[:-4])
+    with pytest.raises(ValueError, match="0000000000.bin is cut off"):
+        open_log(own).sweeps[0].read()
+
+
+def test_a_drive_without_tracklets_or_lidar_is_a_drive(own):
+    (own / "tracklet_labels.xml").write_text("<boost_serialization>")
+    with pytest.raises(ValueError, match="tracklet_labels.xml is not as KITTI writes it"):
+        open_log(own)
+    (own / "tracklet_labels.xml").unlink()
+    shutil.rmtree(own / "velodyne_points")
+    log = open_log(own)
+    assert log.tracks == () and log.sweeps == ()
+
+
+def test_an_unsynced_drive_is_refused_with_the_fix(own):
+    extract = own.rename(own.with_name("2011_09_26_drive_0001_extract"))
+    with pytest.raises(ValueError, match="fetch its _sync folder"):
+        open_log(extract)
+
+
+def test_a_sequence_without_poses_is_refused_with_the_fix(own_sequence):
+    poses = own_sequence.parents[1] / "poses/04.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[:3]) + "\n")
+    with pytest.raises(ValueError, match="3 poses for the 6 times"):
+        open_log(own_sequence)
+    poses.unlink()
+    with pytest.raises(FileNotFoundError, match="poses/04.txt is missing; KITTI publishes poses of the sequences 00 to 10"):
+        open_log(own_sequence)
