@@ -21,7 +21,7 @@ from enhance.commands import Enhance, Pairs, Train
 from enhance.demo import Demo
 from recon.commands import Assets, Recon
 from render.outputs import check_outputs
-from scenes.commands import Info, Validate
+from scenes.commands import Edit, Info, Validate
 from scenes.names import unknown
 from scenes.opening import UsageError, fresh, open_scene, warn
 from scenes.options import (
@@ -84,8 +84,8 @@ class Insert:
         about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed}
         add_edit(self.scene, result.actor.track, [result.actor], about)
         warn(result.warnings)
-        layer = self.scene / "edits" / f"{result.actor.track}.usda"
-        print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit, and deleting it undoes it")
+        layer, fix = self.scene / "edits" / f"{result.actor.track}.usda", f"sidestep edit {self.scene} --undo {result.actor.track}"
+        print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit: delete it, or {fix}, to undo it")
 
 
 @dataclass
@@ -172,7 +172,7 @@ def check_device(device: str) -> None:
 
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
 COMMANDS = {
-    "recon": Recon, "assets": Assets, "insert": Insert, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
+    "recon": Recon, "assets": Assets, "insert": Insert, "edit": Edit, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
     "info": Info, "validate": Validate, "demo": Demo,
 }  # fmt: skip
 

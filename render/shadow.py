@@ -4,7 +4,7 @@ No light is traced. What a rough sky does under a car is near enough a function 
 dark underneath, fading over about the height of the body's underside above the ground (an ambient-occlusion look).
 Where a pixel's ray meets the plane that the asset stands on says how dark; the rendered depth only says whether that
 plane is what the pixel sees, with much tolerance, since the depth of splatted asphalt is rough.
-Inserted assets are those with `inserted` in their meta; recorded actors keep the shadows of their photos.
+Inserted assets are those with `inserted` in their meta, or `edited`; other recorded actors keep the shadows of their photos.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import torch
 
 from render.frame_types import Frame
 from render.rays import camera_rays
+from scenes.asset import Actor
 from scenes.camera import Camera
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -42,7 +43,7 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     """The inserted assets whose shadow can fall into the view."""
     found = []
     for i, actor in enumerate(scene.actors):
-        if not actor.asset.meta.get("inserted") or not actor.trajectory.covers(camera.time_us):
+        if not _placed_anew(actor) or not actor.trajectory.covers(camera.time_us):
             continue
         asset_from_cam = inverse(actor.trajectory.at(camera.time_us)) @ camera.world_from_cam.detach()
         half = (float(actor.asset.size[0]) / 2, float(actor.asset.size[1]) / 2)
@@ -50,6 +51,11 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
         if window is not None:
             found.append(Caster(i + 1, asset_from_cam, half, window))
     return found
+
+
+def _placed_anew(actor: Actor) -> bool:
+    """Whether it stands where no photo shows its shadow."""
+    return bool(actor.asset.meta.get("inserted") or actor.asset.meta.get("edited"))
 
 
 def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:

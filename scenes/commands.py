@@ -1,11 +1,18 @@
-"""`sidestep info` and `sidestep validate`."""
+"""`sidestep info`, `sidestep validate` and `sidestep edit`."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
 
-from scenes.opening import dropped
-from scenes.options import AnyPath, Flag
+from tyro.conf import UseAppendAction
+
+from scenes.opening import UsageError, dropped, open_scene
+from scenes.options import AnyPath, Flag, Name, Replacement, Retiming, ScenePath, Shift, Track
+
+Value = TypeVar("Value")
 
 
 @dataclass
@@ -51,3 +58,59 @@ class Validate:
         if problems:
             raise ValueError(f"{self.path} has {len(problems)} problem{'s' * (len(problems) > 1)}")
         print(f"{self.path} is valid")
+
+
+@dataclass
+class Edit:
+    """Remove, shift, replace or retime actors of a scene, as a layer that leaves the rest of the scene untouched."""
+
+    scene: ScenePath
+    """Scene folder."""
+    remove: UseAppendAction[tuple[Track, ...]] = ()
+    """An actor to remove, as veh_12."""
+    shift: UseAppendAction[tuple[Shift, ...]] = ()
+    """An actor and the metres forward and left, along its own body, that it moves by, as veh_3=0m,1.5m."""
+    replace: UseAppendAction[tuple[Replacement, ...]] = ()
+    """An actor and the asset that takes its place and path, as veh_4=car/0003."""
+    retime: UseAppendAction[tuple[Retiming, ...]] = ()
+    """An actor and how much later it does everything, as veh_5=+0.5s."""
+    undo: UseAppendAction[tuple[Track, ...]] = ()
+    """An edit to take back, with all its files; those of sidestep insert too."""
+    name: Name = None
+    """Name of the edit's layer."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        asked = bool(self.remove or self.shift or self.replace or self.retime)
+        if not asked and not self.undo:
+            raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
+        from scenes import Databank
+        from scenes import edit as edits
+        from scenes.usd_edit import add_change, free_name, undo
+
+        for name in self.undo:
+            undo(self.scene, name)
+            print(f"{self.scene} is again as it was without {name}")
+        if not asked:
+            return
+        scene, _ = open_scene(self.scene)
+        wanted = _once(self.replace, "--replace")
+        bank = Databank(self.databank)
+        assets = {track: bank.load(asset) for track, asset in wanted.items()}
+        edit = edits.Edit(self.remove, _once(self.shift, "--shift"), assets, _once(self.retime, "--retime"))
+        told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
+        name = self.name or free_name(self.scene, "edit")
+        add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
+        layer = self.scene / "edits" / f"{name}.usda"
+        print(f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it")
+
+
+def _once(pairs: Iterable[tuple[str, Value]], option: str) -> dict[str, Value]:
+    """Pairs as a dict; UsageError where a track is given twice."""
+    out: dict[str, Value] = {}
+    for track, value in pairs:
+        if track in out:
+            raise UsageError(f"{option} names {track} twice; give it once")
+        out[track] = value
+    return out

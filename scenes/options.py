@@ -51,6 +51,13 @@ def _ratio(text: str) -> float:
     return ratio
 
 
+def _of_track(text: str, parse: Callable[[str], Any], example: str) -> tuple[str, Any]:
+    track, equals, value = text.partition("=")
+    if not (track and equals and value):
+        raise ValueError(f'"{text}" does not say which actor gets what; write ACTOR=VALUE, as {example}')
+    return track, parse(value)
+
+
 def names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
@@ -69,6 +76,13 @@ Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
 Csv = Annotated[Path | None, written(Path, "FILE", "none")]
 Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V]", "none")]
+Shift = Annotated[
+    tuple[str, tuple[float, float]], written(lambda text: _of_track(text, parse_at, "veh_3=0m,1.5m"), "ACTOR=FORWARD,LEFT", "none")
+]
+Replacement = Annotated[tuple[str, str], written(lambda text: _of_track(text, str, "veh_4=car/0003"), "ACTOR=ID", "none")]
+Retiming = Annotated[tuple[str, int], written(lambda text: _of_track(text, units.duration_us, "veh_5=+0.5s"), "ACTOR=TIME", "none")]
+Track = Annotated[str, written(str, "NAME", "none")]
+Name = Annotated[str | None, written(str, "NAME", "edit, edit_2, ...")]
 Output = Annotated[Path, arg(aliases=("-o",))]
 Overwrite = FlagCreatePairsOff[Annotated[bool, arg(aliases=("-w",))]]
 Flag = FlagCreatePairsOff[bool]

@@ -104,6 +104,7 @@ def _about_scene(scene: Scene) -> dict:
             "poses": len(a.trajectory),
             "seconds": [_seconds(t, times[0]) for t in a.trajectory.times_us[[0, -1]]],
             "inserted": bool(a.asset.meta.get("inserted", False)),
+            "edited": bool(a.asset.meta.get("edited", False)),
         }
         for a in scene.actors
     ]
@@ -122,7 +123,7 @@ def _about_scene(scene: Scene) -> dict:
         "actors": actors,
         "sky": None if scene.sky is None else f"{scene.sky.linear.shape[1]}x{scene.sky.linear.shape[0]}",
         "ground": None if ground is None else f"{ground.heights.shape[1]}x{ground.heights.shape[0]} cells of {ground.cell:g} m",
-        "edits": [e["name"] for e in edits],
+        "edits": [{"name": e["name"], **e} for e in edits],
         "warnings": [f"edit {e['name']} is missing: its file was deleted" for e in edits if e.get("missing")],
         "meta": {k: v for k, v in scene.meta.items() if k not in ("name", "licence", "attribution", "source", "edits")},
     }
@@ -210,7 +211,9 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
         yield f"{where}: the ground has heights that are not finite"
     for edit in scene.meta.get("edits", []):
         if edit.get("missing"):
-            yield f"{where}: edit {edit['name']} is missing: edits/{edit['name']}.usda was deleted"
+            name = edit["name"]
+            fix = f"sidestep edit {where} --undo {name}"
+            yield f"{where}: edit {name} is undone, but not tidied up: edits/{name}.usda was deleted; {fix} takes away the rest"
 
 
 def _databank_problems(path: Path, clean: Callable[[Gaussians, str], Gaussians]) -> Iterator[str]:

@@ -51,9 +51,12 @@ def open_stage(path: Path) -> Iterator[Usd.Stage]:
             root = Sdf.Layer.FindOrOpen(str(path))
             root.Reload()
             stage = Usd.Stage.Open(root)
-            for layer in stage.GetUsedLayers():
-                if os.path.exists(layer.realPath):
-                    layer.Reload()
+            fresh = {root.identifier}
+            # one by one, since what a reloaded layer no longer names is gone, and what it newly names may be stale
+            while stale := next((layer for layer in stage.GetUsedLayers() if layer.identifier not in fresh), None):
+                fresh.add(stale.identifier)
+                if os.path.exists(stale.realPath):
+                    stale.Reload()
             yield stage
         except Tf.ErrorException as error:
             raise ValueError(f"{path} is not a whole USD file: {first_line(error)}") from error
@@ -110,14 +113,18 @@ def set_own_data(prim: Usd.Prim, **data) -> None:
 
 
 def author_pose(prim: Usd.Prim, poses: torch.Tensor, times: list[int] | None = None) -> None:
-    """Give a prim a translate and an orient op in double precision: one rigid pose `[4, 4]`, or `[T, 4, 4]` at time codes."""
+    """Give a prim a translate and an orient op in double precision: one rigid pose `[4, 4]`, or `[T, 4, 4]` at time codes.
+
+    A prim that only overrides gets the ops' values: their order is its definition's, of the same kind.
+    """
     for pose in poses.reshape(-1, 4, 4):
         _check_rigid(str(prim.GetPath()), pose)
     if max(map(abs, times or [0])) > 2**53:
         raise ValueError(f"{prim.GetPath()} has a time {max(map(abs, times or [0]))} us from the drive's first, which USD cannot hold")
-    xform = UsdGeom.Xformable(prim)
-    translate = xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
-    orient = xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    translate = prim.CreateAttribute("xformOp:translate", Sdf.ValueTypeNames.Double3, False)
+    orient = prim.CreateAttribute("xformOp:orient", Sdf.ValueTypeNames.Quatd, False)
+    if prim.IsDefined():
+        UsdGeom.Xformable(prim).SetXformOpOrder([UsdGeom.XformOp(translate), UsdGeom.XformOp(orient)])
     codes = [Usd.TimeCode.Default()] if times is None else times
     poses = poses.detach().cpu().reshape(-1, 4, 4)
     moves, turns = poses[:, :3, 3].tolist(), quat_from_matrix(poses[:, :3, :3]).tolist()

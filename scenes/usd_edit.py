@@ -1,18 +1,27 @@
-"""Edits of a scene folder: layers that add actors and leave everything else as it was."""
+"""Edits of a scene folder: layers that add, change and remove actors, and leave the files of everything else as they were.
+
+edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings. Deleting the layer undoes it; `undo` tidies up too.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pxr import Sdf
+import numpy as np
+from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
-from scenes.atomic import atomic_file
-from scenes.usd import new_stage, open_stage, own_data, valid_names
-from scenes.usd_scene import author_actor, read_metadata
-from scenes.usd_splats import save_asset, to_json
+from scenes.atomic import atomic_folder
+from scenes.edit import Edit, check_edit, ghosts
+from scenes.names import unknown
+from scenes.scene import Scene
+from scenes.usd import new_stage, open_stage, own_data, set_own_data, valid_names
+from scenes.usd_root import add_sublayer, drop_sublayer
+from scenes.usd_scene import author_actor, author_path, read_edits, read_metadata
+from scenes.usd_splats import only_splats, save_asset, to_json
 
 
 def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, half: bool = False) -> None:
@@ -24,46 +33,128 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     """
     scene = Path(scene)
     origin = int(read_metadata(scene)["origin_us"])
-    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name, flags=re.ASCII):
-        raise ValueError(f'"{name}" cannot name an edit; use letters, digits, - and _')
-    layer = scene / "edits" / f"{name}.usda"
-    if layer.exists():
-        raise FileExistsError(f"{scene} already has an edit {name}; choose another name")
-    with open_stage(scene / "scene.usda") as stage:
-        standing = {own_data(p).get("track", p.GetName()) for p in stage.GetPrimAtPath("/World/Actors").GetChildren()}
+    standing = _prims(scene)
     for actor in actors:
         if actor.track in standing:
             raise ValueError(f'{scene} already has an actor "{actor.track}"; give the new one another track name')
-        standing.add(actor.track)
-    names = valid_names((a.track for a in actors), [p.stem for p in scene.glob("actors/*")])  # also those of deleted edits
-    files = [scene / "actors" / f"{names[a.track]}.usdc" for a in actors]
-    written: list[Path] = []
+        standing[actor.track] = ""
+    names = valid_names((a.track for a in actors), [Path(p).name for p in standing.values() if p])
+
+    def files(folder: Path) -> None:
+        for actor in actors:
+            save_asset(folder / f"{names[actor.track]}.usdc", actor.asset, half)
+
+    def author(layer: Usd.Stage) -> None:
+        for actor in actors:
+            author_actor(layer, names[actor.track], actor, f"./{name}/{names[actor.track]}.usdc", origin, inserted=True, edit=name)
+        for where in ("/World", "/World/Actors"):  # the recorded layer defines these
+            layer.GetRootLayer().GetPrimAtPath(where).specifier = Sdf.SpecifierOver
+
+    _write(scene, name, meta, files, author)
+
+
+def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool = False) -> None:
+    """Keep an edit of the actors of `scene`, as loaded from the folder `path`, as the layer edits/<name>.usda.
+
+    A removed actor becomes inactive; another one's path and asset are outweighed; `edited` in their asset's meta names the edit.
+    An edit stands on what it found: of two that change the same actor, the later one counts. Raises as `add_edit` and `check_edit`.
+    """
+    path = Path(path)
+    check_edit(edit, scene)
+    origin, prims = int(read_metadata(path)["origin_us"]), _prims(path)
+    changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
+    hidden = ghosts(scene, edit.tracks()).numpy()
+
+    def files(folder: Path) -> None:
+        for track, asset in edit.replace.items():
+            save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
+        if hidden.any():
+            _save_hidden(path, folder / "hidden.usdc", hidden)
+
+    def author(layer: Usd.Stage) -> None:
+        layer.OverridePrim("/World")
+        for track in edit.remove:
+            layer.OverridePrim(prims[track]).SetActive(False)
+        for actor in changed:
+            prim = layer.OverridePrim(prims[actor.track])
+            set_own_data(prim, edited=name)
+            if actor.track in edit.shift or actor.track in edit.retime:
+                author_path(prim, actor.trajectory, origin)
+            if actor.track in edit.replace:
+                prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
+        if hidden.any():
+            layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usdc"]
+
+    _write(path, name, meta, files, author)
+
+
+def undo(scene: str | Path, name: str) -> None:
+    """Take an edit out of a scene folder, with all its files; also one whose layer was deleted by hand. ValueError for no such edit."""
+    scene = Path(scene)
+    read_metadata(scene)
+    with open_stage(scene / "scene.usda") as stage:
+        have = [e["name"] for e in read_edits(stage)]
+    layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
+    if name not in have and not (_is_name(name) and (layer.exists() or folder.exists())):
+        raise ValueError(unknown("edit", name, str(scene), have))
+    drop_sublayer(scene, f"./edits/{name}.usda")
+    layer.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def free_name(scene: Path, wish: str) -> str:
+    """The wish, or the wish and a number, that names no edit yet."""
+    taken = {p.stem for p in (scene / "edits").glob("*")}
+    number = 2
+    while (name := wish if wish not in taken else f"{wish}_{number}") in taken:
+        number += 1
+    return name
+
+
+def _is_name(name: str) -> bool:
+    return re.fullmatch(r"[A-Za-z0-9][\w-]*", name, flags=re.ASCII) is not None
+
+
+def _prims(scene: Path) -> dict[str, str]:
+    """Prim path of every actor of a scene folder, by track."""
+    with open_stage(scene / "scene.usda") as stage:
+        group = stage.GetPrimAtPath("/World/Actors")
+        return {own_data(p).get("track", p.GetName()): str(p.GetPath()) for p in (group.GetChildren() if group else [])}
+
+
+def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], author: Callable[[Usd.Stage], None]) -> None:
+    """The files of an edit, its layer, and last its place in the scene: all or nothing."""
+    if not _is_name(name):
+        raise ValueError(f'"{name}" cannot name an edit; use letters, digits, - and _')
+    layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
+    if layer.exists():
+        raise FileExistsError(f"{scene} already has an edit {name}; choose another name")
+    layer.parent.mkdir(exist_ok=True)
     try:
-        for actor, file in zip(actors, files, strict=True):
-            file.parent.mkdir(exist_ok=True)
-            save_asset(file, actor.asset, half)
-            written.append(file)
-        layer.parent.mkdir(exist_ok=True)
-        with new_stage(layer, "World") as edit:
-            for actor in actors:
-                author_actor(edit, names[actor.track], actor, f"../actors/{names[actor.track]}.usdc", origin, inserted=True, edit=name)
-            for where in ("/World", "/World/Actors"):  # the scene defines these
-                edit.GetRootLayer().GetPrimAtPath(where).specifier = Sdf.SpecifierOver
-            edit.GetRootLayer().customLayerData = {"sidestep_edit": to_json(meta, "the edit's meta")}
-        written.append(layer)
-        _sublayer(scene / "scene.usda", f"./edits/{name}.usda")
+        with atomic_folder(folder, replace=True) as partial:  # what stands there is left of an edit whose layer was deleted
+            files(partial)
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        with new_stage(layer, "World") as stage:
+            author(stage)
+            stage.GetRootLayer().customLayerData = {"sidestep_edit": to_json(meta, "the edit's meta")}
+        add_sublayer(scene, f"./edits/{name}.usda")
     except BaseException:
-        for file in written:
-            file.unlink(missing_ok=True)
+        layer.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
-def _sublayer(root: Path, sub: str) -> None:
-    """Make `sub` the strongest sublayer of a layer file."""
-    layer = Sdf.Layer.OpenAsAnonymous(str(root))
-    paths = list(layer.subLayerPaths)
-    if sub not in paths:
-        layer.subLayerPaths = [sub, *paths]
-        with atomic_file(root) as partial:
-            if not layer.Export(str(partial)):
-                raise OSError(f"cannot write {root}")
+def _save_hidden(scene: Path, file: Path, hidden: np.ndarray) -> None:
+    """A layer in which the background's opacities `[N]` are 0 where `hidden`, in the precision that the background has."""
+    with open_stage(scene / "scene.usda") as stage:
+        splats = UsdVol.ParticleField3DGaussianSplat(only_splats(stage.GetPrimAtPath("/World/Background"), scene))
+        full = splats.GetOpacitiesAttr()
+        attribute = full if full.HasAuthoredValue() else splats.GetOpacitieshAttr()
+        values = np.array(attribute.Get(Usd.TimeCode.EarliestTime()))
+        where, name, kind = splats.GetPath(), attribute.GetName(), attribute.GetTypeName()
+    values[hidden] = 0
+    make = Vt.FloatArray if values.dtype == np.float32 else Vt.HalfArray
+    with new_stage(file, "World") as layer:
+        layer.OverridePrim("/World")
+        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(make.FromNumpy(values))

@@ -1,9 +1,10 @@
 """A scene as a folder that opens in usdview.
 
-scene.usda        Z up, metres, one time code a microsecond counted from the first body pose; lays out /World
+scene.usda        the order in which the layers below count, nothing else (scenes/usd_root.py)
+recorded.usda     Z up, metres, one time code a microsecond counted from the first body pose; lays out /World
 background.usdc   the background's splats, a payload of /World/Background
 actors/*.usdc     one asset each, referenced by /World/Actors/<track>, whose translate and orient samples are its trajectory
-edits/*.usda      sublayers that add actors without touching the rest (scenes/usd_edit.py)
+edits/*.usda      sublayers that add, change and remove actors without touching the rest (scenes/usd_edit.py)
 ground.usdc       the height field as a mesh, referenced by /World/Ground; a guide: not rendered
 sky_linear.hdr    the texture of /World/Lights/Sky
 metadata.json     what USD cannot carry exactly: lenses, image sizes, exposures, capture times, the splat model, metadata
@@ -32,6 +33,7 @@ from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
 from scenes.usd import array, author_pose, local_pose, new_stage, open_stage, own_data, set_own_data, valid_names, world_poses
+from scenes.usd_root import RECORDED, write_root
 from scenes.usd_splats import Clean, only_splats, read_asset, read_splats, save_asset, save_gaussians, to_json
 
 FORMAT = "sidestep scene"
@@ -60,14 +62,17 @@ def save_scene(path: Path, scene: Scene, replace: bool = False, half: bool = Fal
         if scene.sky is not None:
             save_hdr(folder / "sky_linear.hdr", scene.sky.linear)
         (folder / "metadata.json").write_text(_metadata(scene, cameras, origin), encoding="utf-8")
-        with new_stage(folder / "scene.usda", "World") as stage:
+        with new_stage(folder / "recorded.usda", "World") as stage:
             _author_world(stage, scene, cameras, tracks, origin)
+        write_root(folder)
 
 
 def load_scene(path: Path, clean: Clean = Gaussians.checked) -> Scene:
-    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta."""
+    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta, changed ones `edited`."""
     meta = read_metadata(path)
     with open_stage(path / "scene.usda") as stage:
+        if RECORDED in list(stage.GetRootLayer().subLayerPaths) and not (path / RECORDED).is_file():
+            raise FileNotFoundError(f"{path} lacks what was recorded: {path / RECORDED} is missing")
         return _read_scene(stage, path, meta, clean)
 
 
@@ -122,7 +127,7 @@ def read_metadata(path: Path) -> dict:
 def read_edits(stage: Usd.Stage) -> list[dict]:
     """Name and metadata of the edit layers that a scene's stage has, the oldest first; `missing` where the file is gone."""
     root, out = stage.GetRootLayer(), []
-    for sub in reversed(list(root.subLayerPaths)):
+    for sub in (s for s in reversed(list(root.subLayerPaths)) if s != RECORDED):
         layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
         data = dict(layer.customLayerData) if layer else {}
         told = json.loads(data.get("sidestep_edit", "{}")) if layer else {"missing": True}
@@ -132,15 +137,18 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
 
 def author_actor(stage: Usd.Stage, name: str, actor: Actor, asset_file: str, origin: int, **data) -> None:
     """Define /World/Actors/<name>: a reference to an asset file, moving along the actor's trajectory while it covers the time."""
-    xform = UsdGeom.Xform.Define(stage, f"/World/Actors/{name}")
-    prim = xform.GetPrim()
+    prim = UsdGeom.Xform.Define(stage, f"/World/Actors/{name}").GetPrim()
     prim.GetReferences().AddReference(asset_file)
     set_own_data(prim, track=actor.track, **data)
-    path = actor.trajectory
+    author_path(prim, actor.trajectory, origin)
+
+
+def author_path(prim: Usd.Prim, path: Trajectory, origin: int) -> None:
+    """Give a prim the poses of a trajectory, and let it be seen only while that covers the time."""
     author_pose(prim, path.world_from_body, (path.times_us - origin).tolist())
     if len(path) > 1:
         first, last = (t - origin for t in path.span_us())
-        visibility = xform.CreateVisibilityAttr()
+        visibility = prim.CreateAttribute("visibility", Sdf.ValueTypeNames.Token, False)
         for time, token in ((first - 1, "invisible"), (first, "inherited"), (last + 1, "invisible")):
             visibility.Set(token, time)
 
@@ -224,7 +232,7 @@ def _metadata(scene: Scene, cameras: dict[str, str], origin: int) -> str:
 
 
 def _actor_prims(stage: Usd.Stage, edits: list[str]) -> list[Usd.Prim]:
-    """The scene's own actors, then each edit's, the oldest first: so an edit changes no earlier actor's instance id."""
+    """The scene's own actors, then those each edit adds, the oldest first: so no insertion changes an earlier actor's instance id."""
     group = stage.GetPrimAtPath("/World/Actors")
     order = {name: i for i, name in enumerate(edits)}
     return sorted(group.GetChildren() if group else [], key=lambda p: order.get(own_data(p).get("edit", ""), -1))
@@ -234,6 +242,8 @@ def _load_actor(prim: Usd.Prim, path: Path, origin: int, clean: Clean) -> Actor:
     asset, data = read_asset(prim, path, clean), own_data(prim)
     if data.get("inserted"):
         asset = replace(asset, meta={**asset.meta, "inserted": True, "edit": data.get("edit", "")})
+    if data.get("edited"):
+        asset = replace(asset, meta={**asset.meta, "edited": data["edited"]})
     return Actor(asset, _trajectory(prim, origin), data.get("track", prim.GetName()))
 
 

@@ -106,6 +106,21 @@ def test_an_inserted_asset_stays_in_the_scene_until_its_layer_goes(desk, tmp_pat
     assert len(load(tmp_path / "street").actors) == 1
 
 
+def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    street = str(tmp_path / "street")
+    changes = ["--shift", "veh_1=-1m,0.5m", "--retime", "veh_1=+0.1s", "--replace", "veh_1=van/0001"]
+    out, _ = door(["edit", street, *changes, "--databank", "bank"])
+    assert "edits/edit.usda" in out and "--undo edit" in out
+    (actor,) = load(street).actors
+    assert actor.asset.label == "van" and int(actor.trajectory.times_us[0]) == made.START_US + 100_000
+    assert "edit  kind edit  shift_m {'veh_1': [-1.0, 0.5]}" in door(["info", street])[0]
+    door(["edit", street, "--remove", "veh_1", "--name", "gone"])
+    assert load(street).actors == ()
+    assert "again as it was" in door(["edit", street, "--undo", "gone", "--undo", "edit"])[0]
+    assert load(street).actors[0].asset.label == "car"
+
+
 def test_an_asset_can_follow_a_csv(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.5,15,0\n")
@@ -147,6 +162,9 @@ USAGE = [
     ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
     ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
     (["assets", "lst"], "lst", "list"),
+    (["edit", "street"], "say what to change", "--remove veh_12"),
+    (["edit", "street", "--shift", "veh_1"], "--shift", "as veh_3=0m,1.5m"),
+    (["edit", "street", "--retime", "veh_1=2"], "--retime", "write 2s (seconds) or 2000ms"),
 ]
 
 
@@ -171,6 +189,8 @@ DATA = [
     ([*SHOOT, "--insert", "car/0001@5m,0m"], "databank is not a databank"),
     ([*SHOOT, "--insert", "car/0001@trajectory=t.csv", "--databank", "bank"], "t.csv"),
     ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
+    (["edit", "street", "--remove", "veh_2"], 'actor "veh_2" is not in street; it has veh_1. Did you mean veh_1?'),
+    (["edit", "street", "--undo", "edit"], 'edit "edit" is not in street'),
     (["assets", "show", "cra/0001", "--databank", "bank"], "Did you mean car/0001?"),
     (["enhance", "street/metadata.json", "-o", "x.mp4"], "street/metadata.json cannot be decoded as video"),
     (["enhance", "gone.mp4", "-o", "x.mp4"], "gone.mp4"),

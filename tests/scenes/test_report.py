@@ -34,7 +34,7 @@ def test_a_scene_is_described(saved):
     assert told["bytes"] == sum(p.stat().st_size for p in saved.rglob("*") if p.is_file())
     assert (told["splats"], told["sh_degree"], told["sky"], told["ground"]) == (40, 2, "32x16", "7x5 cells of 0.3 m")
     assert [c["name"] for c in told["cameras"]] == ["front camera", "left"] and told["cameras"][0]["frames"] == 12
-    assert [a["track"] for a in told["actors"] if a["inserted"]] == ["bus"] and told["edits"] == ["first"]
+    assert [a["track"] for a in told["actors"] if a["inserted"]] == ["bus"] and told["edits"] == [{"name": "first"}]
     assert told["licence"] == "CC BY 4.0" and told["attribution"] == "Hesai and Scale AI"
     json.dumps(told)
     lines = text(saved)
@@ -82,7 +82,7 @@ def test_a_deleted_edit_is_a_warning_and_a_problem(saved):
     add_edit(saved, "first", [Actor(asset(), trajectory(3), "bus")], {})
     (saved / "edits" / "first.usda").unlink()
     assert describe(saved)["warnings"] == ["edit first is missing: its file was deleted"]
-    assert any("edit first is missing" in p for p in validate(saved))
+    assert any(f"sidestep edit {saved} --undo first" in p for p in validate(saved))
 
 
 def test_bad_splats_are_problems_and_counted(tmp_path, monkeypatch):

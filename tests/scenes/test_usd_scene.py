@@ -75,7 +75,7 @@ def test_a_scene_with_nothing_but_a_body_returns(tmp_path):
 
 def test_the_folder_is_laid_out_as_designed(saved):
     assert {p.name for p in saved.iterdir()} == {
-        "scene.usda", "background.usdc", "actors", "edits", "ground.usdc", "sky_linear.hdr", "metadata.json",
+        "scene.usda", "recorded.usda", "background.usdc", "actors", "edits", "ground.usdc", "sky_linear.hdr", "metadata.json",
     }  # fmt: skip
     stage = Usd.Stage.Open(str(saved / "scene.usda"))
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
@@ -164,7 +164,10 @@ def test_a_write_that_breaks_off_leaves_the_old_scene(saved, monkeypatch, broken
     assert [p.name for p in saved.parent.iterdir()] == ["s1"]
 
 
-@pytest.mark.parametrize("lost", ["background.usdc", "actors/veh_12.usdc", "ground.usdc", "sky_linear.hdr", "metadata.json", "scene.usda"])
+FILES = ["background.usdc", "actors/veh_12.usdc", "ground.usdc", "sky_linear.hdr", "metadata.json", "scene.usda", "recorded.usda"]
+
+
+@pytest.mark.parametrize("lost", FILES)
 def test_a_missing_file_is_named(saved, lost, capfd):
     (saved / lost).unlink()
     with pytest.raises((FileNotFoundError, ValueError), match=Path(lost).name):
@@ -260,7 +263,7 @@ def test_an_edit_adds_actors_after_the_others_and_changes_nothing_else(saved):
     same(replace(after, actors=after.actors[:4], meta=scene().meta), scene())
     assert largest(after.actors[4].trajectory.world_from_body, inserted("x").trajectory.world_from_body) < 1e-12
     assert all(p.read_bytes() == data for p, data in untouched.items())
-    for file in (saved / "scene.usda", *saved.glob("edits/*")):
+    for file in (saved / "scene.usda", *saved.glob("edits/*.usda")):
         assert usd_problems(file) == []
 
 
@@ -304,7 +307,7 @@ def test_an_edit_that_breaks_off_leaves_the_scene_as_it_was(saved, monkeypatch):
         raise KeyboardInterrupt
 
     before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    monkeypatch.setattr("scenes.usd_edit._sublayer", fail)
+    monkeypatch.setattr("scenes.usd_edit.add_sublayer", fail)
     with pytest.raises(KeyboardInterrupt):
         add_edit(saved, "first", [inserted("bus")], {})
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before

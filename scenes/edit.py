@@ -1,0 +1,117 @@
+"""What an edit does to a scene: actors are removed, shifted, replaced, retimed. In memory; scenes/usd_edit.py keeps it as a layer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from scenes.asset import Actor, Asset
+from scenes.gaussians import Gaussians
+from scenes.names import unknown
+from scenes.poses import inverse
+from scenes.scene import Scene
+from scenes.trajectory import Trajectory
+
+HIDDEN = -15.0
+"""Logit opacity of splats that an edit hides: the least that a scene's files hold, far below what is drawn."""
+
+GHOST_FLOOR = 0.2
+"""Metres above the base of an actor's box under which splats are street."""
+
+GHOST_MARGIN = 0.1
+"""Metres around an actor's box within which the fit left traces of it."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Changes of actors by track name: tracks to remove; metres forward and left along the actor's own body; another asset on
+    the same path; microseconds by which everything happens later."""
+
+    remove: tuple[str, ...] = ()
+    shift: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    replace: Mapping[str, Asset] = field(default_factory=dict)
+    retime: Mapping[str, int] = field(default_factory=dict)
+
+    def tracks(self) -> list[str]:
+        """Every track that it names, once."""
+        return list(dict.fromkeys([*self.remove, *self.shift, *self.replace, *self.retime]))
+
+    def apply(self, actor: Actor, scene: Scene) -> Actor:
+        """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were."""
+        asset, path = self.replace.get(actor.track, actor.asset), actor.trajectory
+        if actor.track in self.shift:
+            path = shifted(path, self.shift[actor.track], scene)
+        if actor.track in self.retime:
+            path = replace(path, times_us=path.times_us + self.retime[actor.track])
+        return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path)
+
+
+def check_edit(edit: Edit, scene: Scene) -> None:
+    """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing."""
+    have = {a.track: a for a in scene.actors}
+    for track in edit.tracks():
+        if track not in have:
+            raise ValueError(unknown("actor", track, str(scene.meta.get("path", scene.meta.get("name", "the scene"))), have))
+        if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):
+            raise ValueError(f"{track} is removed and changed at once; say one of the two")
+        if track in edit.retime and len(have[track].trajectory) == 1:
+            raise ValueError(f"{track} stands still for all times, so it cannot be retimed; shift or remove it")
+
+
+def edited(scene: Scene, edit: Edit) -> Scene:
+    """The scene after an edit. Traces that the background holds of the actors where they were are hidden."""
+    check_edit(edit, scene)
+    tracks = edit.tracks()
+    actors = tuple(edit.apply(a, scene) if a.track in tracks else a for a in scene.actors if a.track not in edit.remove)
+    splats = scene.background.gaussians
+    logits = torch.where(ghosts(scene, tracks), splats.logit_opacities.new_tensor(HIDDEN), splats.logit_opacities)
+    return replace(scene, actors=actors, background=replace(scene.background, gaussians=replace(splats, logit_opacities=logits)))
+
+
+def ghosts(scene: Scene, tracks: Iterable[str]) -> torch.Tensor:
+    """Mask `[N]` of background splats inside a box that these actors moved through: nothing else can have stood there.
+
+    What a fit paints into the background of a mover that its box did not quite explain; seen once the actor has gone.
+    """
+    splats, world_from_local = scene.background.gaussians, scene.background.world_from_local
+    found = torch.zeros(len(splats), dtype=torch.bool)
+    tracks = set(tracks)
+    for actor in (a for a in scene.actors if a.track in tracks):
+        found |= _swept(splats, world_from_local, actor)
+    return found
+
+
+def _swept(splats: Gaussians, world_from_local: torch.Tensor, actor: Actor) -> torch.Tensor:
+    half = actor.asset.size[:2].float() / 2 + GHOST_MARGIN
+    top = float(actor.asset.size[2]) + GHOST_MARGIN
+    inside = torch.zeros(len(splats), dtype=torch.bool)
+    for pose in _dense(actor.trajectory, float(actor.asset.size[0]) / 2):
+        box_from_local = (inverse(pose) @ world_from_local).float()
+        centre = inverse(box_from_local)[:3, 3]
+        near = ((splats.means - centre).abs().amax(1) < float(actor.asset.size.norm())).nonzero()[:, 0]
+        at = splats.means[near] @ box_from_local[:3, :3].T + box_from_local[:3, 3]
+        inside[near] |= (at[:, :2].abs() <= half).all(1) & (at[:, 2] > GHOST_FLOOR) & (at[:, 2] < top)
+    return inside
+
+
+def _dense(path: Trajectory, step: float) -> torch.Tensor:
+    """Poses `[T, 4, 4]` of a path no further apart than `step` metres, as far as one between each two can do."""
+    poses = path.world_from_body
+    if len(path) == 1 or float(poses[:, :3, 3].diff(dim=0).norm(dim=1).max()) <= step:
+        return poses
+    middles = (path.times_us[:-1] + path.times_us[1:]) // 2
+    return torch.cat([poses, torch.stack([path.at(int(t)) for t in middles])])
+
+
+def shifted(path: Trajectory, by: tuple[float, float], scene: Scene) -> Trajectory:
+    """A path moved by metres forward and left along its own body, as high above the ground as before where the ground is known."""
+    there = path.shifted(forward=by[0], lateral=by[1])
+    if scene.ground is None:
+        return there
+    poses = there.world_from_body.clone()
+    poses[:, 2, 3] += scene.ground.height(poses[:, :2, 3]) - scene.ground.height(path.world_from_body[:, :2, 3])
+    # the shift along a tilted body already climbs with it; the ground alone decides how high the wheels are
+    poses[:, 2, 3] += path.world_from_body[:, 2, 3] - there.world_from_body[:, 2, 3]
+    return replace(there, world_from_body=poses)

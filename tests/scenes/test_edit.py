@@ -1,0 +1,159 @@
+"""Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from pxr import Usd, UsdGeom, UsdVol
+from street import START_US, STEP_US, box, car, street
+
+from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
+from scenes.edit import HIDDEN, Edit, edited
+from scenes.poses import translation
+from scenes.usd import usd_problems
+from scenes.usd_edit import add_change, add_edit, undo
+from scenes.usd_root import RECORDED
+
+
+def busy() -> Scene:
+    """The street with three more cars: one goes along x, one stands, and one has left a ghost in the background."""
+    times = START_US + STEP_US * torch.arange(9)
+    along = Trajectory(times, torch.stack([translation(8 + 0.5 * i, -3.0, 0.0) for i in range(9)]))
+    still = Trajectory(times[:1], translation(15.0, 5.0, 0.0)[None])
+    scene = street()
+    ghost = box((3.0, 1.0, 1.0), (0.9, 0.9, 0.9))
+    ghost = replace(ghost, means=ghost.means + torch.tensor([10.0, -3.0, 0.25]))
+    background = replace(scene.background, gaussians=Gaussians.cat([scene.background.gaussians, ghost]))
+    more = (Actor(car(), along, "veh_2"), Actor(car("van"), still, "veh_3"))
+    return replace(scene, actors=(*scene.actors, *more), background=background)
+
+
+VAN = car("van", (0.9, 0.9, 0.1))
+ALL = Edit(remove=("veh_1",), shift={"veh_2": (1.0, 1.5)}, replace={"veh_3": VAN}, retime={"veh_2": 300_000})
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save(busy(), tmp_path / "s1")
+    return tmp_path / "s1"
+
+
+def same(a: Scene, b: Scene) -> None:
+    assert [x.track for x in a.actors] == [x.track for x in b.actors]
+    for x, y in zip(a.actors, b.actors, strict=True):
+        assert torch.equal(x.trajectory.times_us, y.trajectory.times_us)
+        torch.testing.assert_close(x.trajectory.world_from_body, y.trajectory.world_from_body, atol=1e-12, rtol=0)
+        assert x.asset.label == y.asset.label and torch.equal(x.asset.gaussians.means, y.asset.gaussians.means)
+    before, after = (s.background.gaussians.logit_opacities for s in (a, b))
+    torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
+
+
+def test_an_edit_on_disk_does_what_it_does_in_memory(saved):
+    add_change(saved, "mine", load(saved), ALL, {"kind": "edit"})
+    after = load(saved)
+    same(after, edited(busy(), ALL))
+    assert [a.asset.meta.get("edited") for a in after.actors] == ["mine", "mine"]
+    assert after.meta["edits"] == [{"kind": "edit", "name": "mine"}]
+
+
+def test_an_edit_is_undone_by_deleting_its_layer_and_tidied_up_by_undo(saved):
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    add_change(saved, "mine", load(saved), ALL, {})
+    assert {p for p, data in before.items() if p.read_bytes() != data} == {saved / "scene.usda"}
+    (saved / "edits" / "mine.usda").unlink()
+    same(load(saved), busy())
+    (problem,) = [p for p in validate(saved) if "not tidied up" in p]
+    assert f"sidestep edit {saved} --undo mine" in problem
+    undo(saved, "mine")
+    assert validate(saved) == []
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+    with pytest.raises(ValueError, match='edit "mine" is not in'):
+        undo(saved, "mine")
+
+
+def test_usds_validators_find_nothing_in_an_edited_scene(saved):
+    add_change(saved, "mine", load(saved), ALL, {})
+    add_edit(saved, "more", [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), "new")], {})
+    assert validate(saved) == []
+    for file in [*saved.rglob("*.usda"), *saved.rglob("*.usdc")]:
+        assert usd_problems(file) == [], file
+
+
+def test_usd_sees_what_sidestep_sees(saved):
+    add_change(saved, "mine", load(saved), ALL, {})
+    stage = Usd.Stage.Open(str(saved / "scene.usda"))
+    assert not stage.GetPrimAtPath("/World/Actors/veh_1").IsActive()
+    moved, retimed = stage.GetPrimAtPath("/World/Actors/veh_2"), 400_000 + 300_000
+    assert list(UsdGeom.XformCache(retimed).GetLocalToWorldTransform(moved).ExtractTranslation()) == pytest.approx([11.0, -1.5, 0.0])
+    assert UsdGeom.Imageable(moved).ComputeVisibility(0) == "invisible"
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Background/Gaussians"))
+    assert sum(v == 0 for v in splats.GetOpacitiesAttr().Get()) > 100
+
+
+def test_removing_an_actor_leaves_no_ghost_and_harms_nothing_else():
+    scene = busy()
+    logits = edited(scene, Edit(remove=("veh_2",))).background.gaussians.logit_opacities
+    hidden, means = logits == HIDDEN, scene.background.gaussians.means
+    ghost = torch.arange(len(means)) >= len(street().background.gaussians)
+    assert hidden[ghost].all() and not hidden[~ghost].any()
+    assert (means[hidden][:, 2] > 0.2).all()
+
+
+def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
+    add_change(saved, "first", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
+    add_change(saved, "second", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
+    place = lambda: float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3])  # noqa: E731
+    assert place() == pytest.approx(-1.0)
+    undo(saved, "second")
+    assert place() == pytest.approx(-2.0)
+    undo(saved, "first")
+    assert place() == pytest.approx(-3.0)
+
+
+def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
+    for track in ("a", "b"):
+        add_edit(saved, track, [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), track)], {})
+    add_change(saved, "shift", load(saved), Edit(shift={"a": (2.0, 0.0)}), {})
+    after = load(saved)
+    assert [a.track for a in after.actors][-2:] == ["a", "b"]
+    assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
+
+
+def test_a_shifted_actor_stays_on_the_ground():
+    slope = Ground((0.1 * torch.arange(-20.0, 20.0))[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
+    scene = replace(busy(), ground=slope)
+    after = edited(scene, Edit(shift={"veh_2": (0.0, 2.0)})).actors[1].trajectory
+    torch.testing.assert_close(after.world_from_body[:, 2, 3], torch.full((9,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_a_scene_whose_root_held_the_recording_can_be_edited(saved):
+    """As Sidestep wrote scenes before edits could outweigh them."""
+    (saved / RECORDED).replace(saved / "scene.usda")
+    same(load(saved), busy())
+    add_change(saved, "mine", load(saved), ALL, {})
+    same(load(saved), edited(busy(), ALL))
+    undo(saved, "mine")
+    same(load(saved), busy())
+    assert validate(saved) == []
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (Edit(remove=("veh_9",)), 'actor "veh_9" is not in .* it has veh_1, veh_2, veh_3. Did you mean'),
+        (Edit(remove=("veh_1",), shift={"veh_1": (1, 0)}), "removed and changed at once"),
+        (Edit(retime={"veh_3": 1000}), "veh_3 stands still"),
+    ],
+)
+def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match=said):
+        add_change(saved, "mine", load(saved), edit, {})
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+
+
+def test_an_edited_scene_moved_elsewhere_keeps_its_edits(saved, tmp_path):
+    add_change(saved, "mine", load(saved), ALL, {})
+    shutil.move(saved, tmp_path / "elsewhere")
+    same(load(tmp_path / "elsewhere"), edited(busy(), ALL))
