@@ -12,14 +12,12 @@ from render.chunks import Sums, room_in, windows
 from render.frame_types import RenderConfig
 from render.kernels.composite import composite, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
-from render.kernels.project import project, project_backward
-from render.kernels.types import GRADIENTS, RECORD, TILE, UNIFORM_GRADIENTS, Pose, View, Window, lanes
+from render.kernels.types import GRADIENTS, RECORD, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, stage, view
 from render.order import TileLists, depth_order, tile_lists
+from render.projection import projection, uniforms
 from scenes.gaussians import SplatModel
-
-NEAR = 0.1
-"""Metres in front of the camera within which a splat's centre is not drawn."""
+from scenes.lenses import Lens, Pinhole
 
 POSE_CHUNK = 64
 """Splats whose pose gradient one CPU thread item sums before it writes."""
@@ -30,7 +28,7 @@ FIELDS = 5
 
 @dataclass(frozen=True)
 class Settings:
-    """What stays the same during one call: image size, model, config, outputs, instance ids."""
+    """What stays the same during one call: image size, model, config, outputs, instance ids, lens type, and what the shutter does."""
 
     width: int
     height: int
@@ -39,6 +37,9 @@ class Settings:
     depth: bool
     instance: bool
     instances: tuple[int, ...]
+    lens: type[Lens] = Pinhole
+    shutter: str = "global"
+    rolling: bool = False
 
     @property
     def tiles_x(self) -> int:
@@ -101,32 +102,6 @@ def _inside(planes: torch.Tensor, window: Window) -> torch.Tensor:
     return planes[..., top : top + window.tiles_y * TILE, left : left + window.tiles_x * TILE]
 
 
-def _view(settings: Settings, lens: torch.Tensor, sh_count: int) -> View:
-    v = View()
-    v.fx, v.fy, v.cx, v.cy = (float(x) for x in lens)
-    half_x, half_y = 0.15 * settings.width / v.fx, 0.15 * settings.height / v.fy  # the 0.3 of 1.3 tan, on either side
-    v.clamp_left, v.clamp_right = -v.cx / v.fx - half_x, (settings.width - v.cx) / v.fx + half_x
-    v.clamp_top, v.clamp_bottom = -v.cy / v.fy - half_y, (settings.height - v.cy) / v.fy + half_y
-    margin = 4 * math.sqrt(settings.model.dilation) + 1
-    v.left, v.right = -(v.cx + margin) / v.fx, (settings.width - v.cx + margin) / v.fx
-    v.top, v.bottom = -(v.cy + margin) / v.fy, (settings.height - v.cy + margin) / v.fy
-    v.tiles_x, v.tiles_y = settings.tiles_x, settings.tiles_y
-    v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
-    v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
-    v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
-    return v
-
-
-def _pose(cam_from_local: torch.Tensor, eye: torch.Tensor, instance: int) -> Pose:
-    p = Pose()
-    rows = cam_from_local.tolist()
-    p.rotation = wp.mat33(*(x for row in rows for x in row[:3]))
-    p.translation = wp.vec3(*(row[3] for row in rows))
-    p.eye = wp.vec3(*eye.tolist())
-    p.instance = float(instance)
-    return p
-
-
 def _arrays(fields) -> list:
     means, quats, log_scales, logits, sh = fields
     return [view(means, wp.vec3), view(quats, wp.vec4), view(log_scales, wp.vec3), view(logits, float), view(sh, wp.vec3)]
@@ -135,28 +110,30 @@ def _arrays(fields) -> list:
 class Rasterize(torch.autograd.Function):
     """The kernels behind `rasterize`, which calls this inside a `stage`.
 
-    (settings, cam_from_local [P, 4, 4] f64, lens [4] f64, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w,
-    instance.
+    (settings, poses [P, C, 4, 4] f64 as `projection.poses`, lens parameters f64, 5 fields of P instances) -> rgb [3, H, W], alpha,
+    sum of w z, sum of w, instance.
 
     The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
     """
 
     @staticmethod
-    def forward(ctx, settings: Settings, cam_from_local, lens, *fields):
+    def forward(ctx, settings: Settings, poses, lens, *fields):
+        ways = projection(settings.lens, settings.rolling)
         groups = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
+        draws = [(p, copy) for p in range(len(groups)) for copy in range(ways.copies)]
+        groups = [groups[p] for p, _ in draws]
         sizes = [g[0].shape[0] for g in groups]
         bases = [sum(sizes[:i]) for i in range(len(sizes))]
         device = fields[0].device
         n = sum(sizes)
         records = torch.empty(n, RECORD, device=device)
         keys, counts = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
-        poses = cam_from_local.detach().cpu()
-        eyes = -(poses[:, :3, :3].transpose(1, 2) @ poses[:, :3, 3:])[..., 0]
-        uniforms = []
-        for p, group in enumerate(groups):
-            uniform = [_view(settings, lens, group[4].shape[1]), _pose(poses[p, :3], eyes[p], settings.instances[p]), bases[p]]
-            uniforms.append(uniform)
-            run(project, sizes[p], [*_arrays(group), *uniform, view(records, float), view(keys, int), view(counts, int)], device)
+        told = []
+        still, lens_now = poses.detach().cpu(), settings.lens(*lens.tolist())
+        for (p, copy), group, base in zip(draws, groups, bases, strict=True):
+            told.append([*uniforms(settings, lens_now, still[p], settings.instances[p], group[4].shape[1], copy), base])
+            args = [*_arrays(group), *told[-1], view(records, float), view(keys, int), view(counts, int)]
+            run(ways.forward, len(group[0]), args, device)
         order = depth_order(keys)
         parts = [Part(w) for w in windows(records, counts, settings.tiles_x, settings.tiles_y, settings.config.most_entries)]
         planes = records
@@ -171,9 +148,9 @@ class Rasterize(torch.autograd.Function):
                 if part is parts[0]:
                     planes = drawn.new_empty(len(drawn), settings.tiles_y * TILE, settings.tiles_x * TILE)
                 _inside(planes, part.window).copy_(drawn[..., : part.window.tiles_x * TILE])
-        ctx.settings, ctx.groups, ctx.uniforms, ctx.sizes, ctx.parts = settings, groups, uniforms, sizes, parts
+        ctx.settings, ctx.groups, ctx.told, ctx.draws, ctx.parts = settings, groups, told, draws, parts
         ctx.records, ctx.counts, ctx.order = records, counts, order
-        ctx.like_pose, ctx.like_lens = cam_from_local.new_empty(0), lens.new_empty(0)
+        ctx.like_pose, ctx.like_lens = poses.new_empty(0), lens.new_empty(lens.shape)
         rgb = settings.crop(planes[1:4])
         alpha = 1 - settings.crop(planes[0])
         z, weights = settings.crop(planes[4:6]) if settings.depth else (None, None)
@@ -201,22 +178,27 @@ class Rasterize(torch.autograd.Function):
                 if sums is not None:
                     sums.add(counts, lists, slots)
                     counts, starts, slots = sums.counts, sums.starts, sums.slots
-            for group, uniform, size in zip(ctx.groups, ctx.uniforms, ctx.sizes, strict=True):
+            ways = projection(settings.lens, settings.rolling)
+            for (_, copy), group, told in zip(ctx.draws, ctx.groups, ctx.told, strict=True):
+                size = len(group[0])
                 out = [torch.empty_like(f) for f in group]
                 chunk = POSE_CHUNK if device.type == "cpu" else 1
                 items = -(-size // chunk)
-                shared = torch.empty(items, UNIFORM_GRADIENTS, device=device)
-                args = [*_arrays(group), *uniform, size, chunk, view(counts, int), view(starts, int), view(slots, float)]
-                run(project_backward, items, [*args, *_arrays(out), view(shared, float)], device)
-                outputs += out
-                g_uniform.append(shared)
+                shared = torch.empty(items, ways.uniforms, device=device)
+                args = [*_arrays(group), *told, size, chunk, view(counts, int), view(starts, int), view(slots, float)]
+                run(ways.backward, items, [*args, *_arrays(out), view(shared, float)], device)
+                if copy:  # the other side of a seam: the same splats and the same pose once more
+                    for first, second in zip(outputs[-FIELDS:], out, strict=True):
+                        first += second
+                    g_uniform[-1] = torch.cat([g_uniform[-1], shared])
+                else:
+                    outputs += out
+                    g_uniform.append(shared)
         if not any(ctx.needs_input_grad[1:3]):
             return None, None, None, *outputs
         shared = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
-        g_pose = shared.new_zeros(len(shared), 4, 4)
-        g_pose[:, :3, :3] = shared[:, :9].reshape(-1, 3, 3)
-        g_pose[:, :3, 3] = shared[:, 9:12]
-        return None, g_pose.to(ctx.like_pose), shared[:, 12:].sum(0).to(ctx.like_lens), *outputs
+        g_lens = ways.lens_gradient(shared, len(ctx.like_lens))
+        return None, ways.pose_gradient(shared).to(ctx.like_pose), g_lens.to(ctx.like_lens), *outputs
 
 
 def _part_gradients(settings: Settings, part: Part, g_rgb, g_alpha, g_z, g_weights) -> torch.Tensor:

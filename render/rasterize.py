@@ -12,10 +12,10 @@ from render.flow import image_flow
 from render.frame_types import Frame, RenderConfig
 from render.launch import stage
 from render.outputs import check_outputs
+from render.projection import check_projection, moves, poses
 from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
-from scenes.poses import inverse
 
 
 @overload
@@ -74,16 +74,17 @@ def rasterize(
         depth="depth" in outputs or flows,
         instance="instance" in outputs or flows,
         instances=tuple(p.instance for p in placed),
+        lens=type(camera.lens),
+        shutter=camera.shutter,
+        rolling=moves(camera, placed),
     )
     with stage(placed[0].gaussians.device):
         return _draw(settings, placed, camera, outputs, background, flow_to)
 
 
 def _draw(settings: Settings, placed: list[Placed], camera: Camera, outputs, background, flow_to) -> Frame:
-    cam_from_world = inverse(camera.world_from_cam)
-    cam_from_local = torch.stack([cam_from_world @ p.world_from_local for p in placed])
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
-    rgb, alpha, z, weights, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), *fields)
+    rgb, alpha, z, weights, instance = Rasterize.apply(settings, poses(camera, placed), camera.lens.params(), *fields)
 
     frame: dict[str, torch.Tensor] = {}
     if "rgb" in outputs:
@@ -120,8 +121,9 @@ def _check(placed, camera, outputs, flow_to, model) -> None:
             raise ValueError(f'output "{name}" needs flow_to={{"{name.removeprefix("flow_")}": (placed, camera)}}')
     if model.response != "conic":
         raise ValueError(f'response "{model.response}" is not drawn yet; use SplatModel(response="conic")')
-    if camera.world_from_cam_end is not None or camera.shutter != "global" or any(p.world_from_local_end is not None for p in placed):
-        raise ValueError('rolling shutter is not drawn yet; use shutter="global" and no end poses')
+    check_projection(camera, placed, model)
+    if flow_to and moves(camera, placed):
+        raise ValueError('flow is not drawn while a shutter moves; use shutter="global" and no end poses')
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")

@@ -15,7 +15,9 @@ import torch
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.harmonics import evaluate
+from scenes.lenses import Lens, Pinhole
 from scenes.poses import inverse, matrix_from_quat
+from tests import oracle_lens
 
 NEAR = 0.1
 NEAREST = 0.5
@@ -95,30 +97,30 @@ def render(
     alpha_max: float = 1.0,
     order: str = "tile",
     jumps: bool = False,
+    world_from_cam_end: torch.Tensor | None = None,
+    ends: list[torch.Tensor | None] | None = None,
 ):
     """rgb `[H, W, 3]`, alpha, depth, instance `[H, W]`, and `unsure` `[H, W]`: where the picture jumps within float32's rounding,
     since a splat is within 1e-4 of the cutoff, or since two that show change places; with jumps, by how much instead.
 
     placed: (fields, world_from_local, instance id). order: "tile", by depth of the centres, or "pixel", by `ray_depths`, which is
-    exact; no termination.
+    exact; no termination. world_from_cam_end, ends: what the camera and each of `placed` move to while the image is read out.
     """
     world_from_cam = camera.world_from_cam if world_from_cam is None else world_from_cam
     lens = camera.lens.params() if lens is None else lens
-    cam_from_world = inverse(world_from_cam)
+    optics = type(camera.lens)(*lens.unbind())
+    ends = [None] * len(placed) if ends is None else ends
+    moving = camera.shutter != "global" and any(end is not None for end in (world_from_cam_end, *ends))
     parts = []
-    for g, world_from_local, instance in placed:
-        cam_from_local = cam_from_world @ world_from_local
-        points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
-        colour = _colours(g["sh"], g["means"] - inverse(cam_from_local)[:3, 3])
-        axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
-        parts.append((points, axes, colour, torch.sigmoid(g["logit_opacities"]), torch.full((len(points),), instance)))
-    points, axes, colour, opacity, instances = (torch.cat(p) for p in zip(*parts, strict=True))
-    keep = in_view(points, axes, lens, camera.width, camera.height, model.dilation)
-    points, axes, colour, opacity, instances = (t[keep] for t in (points, axes, colour, opacity, instances))
-    if model.projection == "ewa":
-        mean, covariance = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
-    else:
-        mean, covariance = project_ut(points, axes, lens, camera.width, camera.height)
+    for (g, world_from_local, instance), end in zip(placed, ends, strict=True):
+        if isinstance(optics, Pinhole) and not moving:
+            part = _pinhole(g, inverse(world_from_cam) @ world_from_local, camera, model, lens)
+        else:
+            pose = oracle_lens.pose_at((world_from_cam, world_from_cam_end), (world_from_local, end))
+            rows, points, axes, sight, mean, covariance = oracle_lens.project(optics, camera, model, pose, g, moving)
+            part = points, axes, _colours(g["sh"][rows], sight), torch.sigmoid(g["logit_opacities"])[rows], mean, covariance
+        parts.append((*part, torch.full((len(part[0]),), instance)))
+    points, axes, colour, opacity, mean, covariance, instances = (torch.cat(p) for p in zip(*parts, strict=True))
     dilated = covariance + model.dilation * torch.eye(2, dtype=torch.float64)
     if model.antialias:
         opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
@@ -131,10 +133,24 @@ def render(
         for pixels in strip:
             # of a part of a large picture only the splats that a float64 could see there
             near = ((mean.detach() - pixels.mean((0, 1))).abs() < reach + 0.5 * pixels.shape[0]).all(1) if len(strip) > 1 else slice(None)
-            shown.append(_composite(pixels, lens, *(t[near] for t in drawn), order, cutoff, alpha_max))
+            shown.append(_composite(pixels, optics, *(t[near] for t in drawn), order, cutoff, alpha_max))
         rows.append([torch.cat(part, 1) for part in zip(*shown, strict=True)])
     rgb, alpha, depth, instance, jump = (torch.cat(part) for part in zip(*rows, strict=True))
     return rgb, alpha, depth, instance, jump if jumps else jump > SEEN
+
+
+def _pinhole(g, cam_from_local: torch.Tensor, camera: Camera, model: SplatModel, lens: torch.Tensor):
+    """Points, axes, colours, opacities, means and covariances of the splats that a pinhole shows."""
+    points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
+    axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
+    keep = in_view(points, axes, lens, camera.width, camera.height, model.dilation)
+    colour = _colours(g["sh"][keep], g["means"][keep] - inverse(cam_from_local)[:3, 3])
+    points, axes = points[keep], axes[keep]
+    if model.projection == "ewa":
+        mean, covariance = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
+    else:
+        mean, covariance = project_ut(points, axes, lens, camera.width, camera.height)
+    return points, axes, colour, torch.sigmoid(g["logit_opacities"][keep]), mean, covariance
 
 
 def _colours(sh: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
@@ -154,14 +170,16 @@ def truth(placed: list[Placed], camera: Camera, model: SplatModel, order: str = 
     return rgb, jump
 
 
-def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
-    """`[P, N]`: where along each ray `[P, 3]`, in its own lengths, each 3D Gaussian is greatest; with z = 1, a depth in metres.
+def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, origins: torch.Tensor) -> torch.Tensor:
+    """`[P, N]`: where along each ray `[P, 3]` from its origin `[P, 3]`, in its own lengths, each 3D Gaussian is greatest; with z = 1, a
+    depth in metres.
 
     With A the Gaussian's scaled axes as columns, t = (A^-1 d) . (A^-1 p) / |A^-1 d|^2 (the order of StopThePop, Radl et al. 2024).
     """
     inverse_axes = (axes / axes.square().sum(1, keepdim=True)).transpose(1, 2)
     d = torch.einsum("nij,pj->pni", inverse_axes, rays)
-    return (d * (inverse_axes @ points[..., None])[..., 0]).sum(-1) / d.square().sum(-1)
+    away = torch.einsum("nij,pnj->pni", inverse_axes, points - origins[:, None])
+    return (d * away).sum(-1) / d.square().sum(-1)
 
 
 def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[torch.Tensor, ...]]:
@@ -171,7 +189,7 @@ def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[
     return [strip.split(PART, 1) for strip in pixels.split(PART, 0)]
 
 
-def _composite(pixels, lens, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
+def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
     """rgb, alpha, depth, instance and jump of some pixels `[h, w, 2]`."""
     shape, pixels = pixels.shape[:2], pixels.reshape(-1, 2)
     d = pixels[:, None] - mean
@@ -183,9 +201,11 @@ def _composite(pixels, lens, points, axes, mean, conic, opacity, colour, instanc
         jump = (margin.abs() < 1e-4 * (1 + s)).any(1).double()
         alpha = torch.where(margin > 0, alpha, torch.zeros_like(alpha))
     alpha = alpha.clamp_max(alpha_max)
-    fx, fy, cx, cy = lens.detach()
-    rays = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones(len(pixels), dtype=torch.float64)], -1)
-    keys = ray_depths(points, axes, rays) if order == "pixel" else points[:, 2].expand_as(alpha)
+    depths = lens.depth(points)
+    if order == "pixel":
+        keys = ray_depths(points, axes, lens.unproject(pixels).detach(), lens.origins(pixels).detach())
+    else:
+        keys = depths.expand_as(alpha)
     first = keys.detach().argsort(dim=1, stable=True)
     sorted_alpha = alpha.gather(1, first)
     passing = torch.cumprod(1 - sorted_alpha, 1)
@@ -193,11 +213,11 @@ def _composite(pixels, lens, points, axes, mean, conic, opacity, colour, instanc
     if order == "pixel":
         depth_step = keys.detach().gather(1, first).diff(dim=1)
         swap = (before * sorted_alpha)[:, :-1] * sorted_alpha[:, 1:] * (colour[first[:, 1:]] - colour[first[:, :-1]]).abs().amax(-1)
-        jump = jump + torch.where(depth_step < TIE * points[first[:, 1:], 2], swap, torch.zeros_like(swap)).sum(1)
+        jump = jump + torch.where(depth_step < TIE * depths[first[:, 1:]], swap, torch.zeros_like(swap)).sum(1)
     weight = alpha * before.gather(1, first.argsort(dim=1))
     total = 1 - passing[:, -1] if len(points) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
-    depth = torch.where(drawn, weight @ points[:, 2] / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
+    depth = torch.where(drawn, weight @ depths / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
     who = instances[weight.detach().argmax(1)] if len(points) else torch.full((len(pixels),), -1)
     out = (weight @ colour, total, depth, torch.where(total < 0.5, -1, who), jump)
     return tuple(t.reshape(*shape, *t.shape[1:]) for t in out)

@@ -14,6 +14,8 @@ from render.frame_types import RenderConfig
 from render.kernels import bin as bin_kernels
 from render.kernels import project as project_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
+from render.kernels.lenses import LENS_FUNCTIONS
+from render.kernels.project_lens import lens_kernels
 from render.kernels.types import GRADIENTS, TILE
 from render.launch import run, run_blocks, view
 from render.order import depth_order, tile_lists
@@ -24,6 +26,9 @@ from tests.bench.presets import random_splats
 WIDTH, HEIGHT = 37, 29
 KERNELS = {
     "project": lambda: project_kernels.project,
+    "opencv": lambda: lens_kernels(LENS_FUNCTIONS["opencv"], False).forward,
+    "moving fisheye": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).forward,
+    "moving fisheye backward": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).backward,
     "bin": lambda: bin_kernels.emit_pairs,
     "composite": lambda: composite_blocks(True, True, TILE),
     "composite backward": lambda: composite_blocks_gradient(True, TILE),
@@ -55,7 +60,7 @@ def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhol
     """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
     kept.needs_input_grad = (False,) * 8
-    return kept, Rasterize.forward(kept, settings, pose[None], lens.params(), *gaussians.tensors().values())
+    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), *gaussians.tensors().values())
 
 
 def whole(settings: Settings):
@@ -76,7 +81,7 @@ def test_block_kernels_agree_with_lane_kernels():
     gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:4]]
     expected = Rasterize.backward(kept, *gradients, None)
 
-    records, (group,), (uniform,) = kept.records, kept.groups, kept.uniforms
+    records, (group,), (uniform,) = kept.records, kept.groups, kept.told
     visible = torch.where(kept.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     pixels = WIDTH * HEIGHT
     everywhere = torch.where(kept.counts > 0, pixels, 0).to(torch.int32)  # every pixel lists every splat: more than the exact lists

@@ -1,0 +1,144 @@
+"""How far a sigma point may go, and the covariance of what the sigma points give, for any lens; in float64.
+
+A sigma point at +-sqrt(3) along an axis that would come nearer than half the centre's depth, or leave the lens's domain, is pulled
+back to where it would, at tau < sqrt(3), and what it moves the pixel by is stretched by sqrt(3) / tau. So nothing behind the camera
+or past the fold-over enters the moments, and they stay continuous: as tau goes to 0 they become EWA's. For a pinhole this is the
+clamp of moments.py.
+"""
+
+import warp as wp
+
+from render.kernels.lenses import PLANAR, ROUND
+from render.kernels.lenses.optics import Optics
+
+ROOT3 = wp.constant(wp.float64(1.7320508075688772))
+ROOT6 = wp.constant(wp.float64(2.449489742783178))
+LEAST = wp.constant(wp.float64(1.0e-6))
+FULL, AT_HALF_DEPTH, AT_EDGE = (wp.constant(i) for i in range(3))
+_PLANAR, _ROUND = wp.constant(PLANAR), wp.constant(ROUND)
+
+mat72d = wp.types.matrix(shape=(7, 2), dtype=wp.float64)
+
+
+@wp.struct
+class Reach:
+    """tau, and what set it."""
+
+    tau: wp.float64
+    rule: int
+
+
+@wp.struct
+class ReachGradient:
+    centre: wp.vec3d
+    offset: wp.vec3d
+
+
+@wp.func
+def inside(o: Optics, v: wp.vec3d):
+    return v[2] > o.cos_limit * wp.length(v)
+
+
+@wp.func
+def at_edge(o: Optics, centre: wp.vec3d, offset: wp.vec3d, tau: wp.float64):
+    """The least share of `offset` at which it crosses the domain's cone; `tau` where it does not."""
+    cc = o.cos_limit * o.cos_limit
+    ss = o.sin_limit * o.sin_limit
+    a = cc * (offset[0] * offset[0] + offset[1] * offset[1]) - ss * offset[2] * offset[2]
+    b = cc * (centre[0] * offset[0] + centre[1] * offset[1]) - ss * centre[2] * offset[2]
+    c = cc * (centre[0] * centre[0] + centre[1] * centre[1]) - ss * centre[2] * centre[2]
+    zero = wp.float64(0.0)
+    root = wp.sqrt(wp.max(b * b - a * c, zero))
+    w = -(b + root)
+    if b < zero:
+        w = -(b - root)
+    first = w / a
+    second = c / w
+    out = wp.float64(tau)
+    # written so that a NaN changes nothing
+    if first > zero and first < out and (centre[2] + first * offset[2]) * o.cos_limit >= zero:
+        out = wp.float64(first)
+    if second > zero and second < out and (centre[2] + second * offset[2]) * o.cos_limit >= zero:
+        out = wp.float64(second)
+    return out
+
+
+@wp.func
+def reach(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int):
+    """How far a sigma point goes from `centre` along `offset` (one sigma); depth: which depth the lens has."""
+    half = wp.float64(0.5)
+    out = Reach()
+    out.tau = ROOT3
+    out.rule = FULL
+    room = wp.float64(0.0)
+    rate = wp.float64(-1.0)
+    if depth == _PLANAR:
+        room = half * centre[2]
+        rate = -offset[2]
+    if depth == _ROUND:
+        room = half * wp.dot(centre, centre)
+        rate = -wp.dot(centre, offset)
+    if rate * ROOT3 > room:
+        out.tau = room / rate
+        out.rule = AT_HALF_DEPTH
+    if not inside(o, centre + out.tau * offset) and inside(o, centre):
+        tau = at_edge(o, centre, offset, out.tau)
+        if tau < out.tau:
+            out.tau = wp.max(tau, LEAST)
+            out.rule = AT_EDGE
+    return out
+
+
+@wp.func
+def reach_backward(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int, r: Reach, g: wp.float64):
+    out = ReachGradient()
+    two = wp.float64(2.0)
+    zero = wp.float64(0.0)
+    if r.rule == AT_HALF_DEPTH:
+        if depth == _PLANAR:
+            out.centre = wp.vec3d(zero, zero, g * r.tau / centre[2])
+            out.offset = wp.vec3d(zero, zero, -g * r.tau / offset[2])
+        else:
+            along = wp.dot(centre, offset)
+            out.centre = (g * r.tau) * (two * centre / wp.dot(centre, centre) - offset / along)
+            out.offset = (-g * r.tau / along) * centre
+    if r.rule == AT_EDGE:
+        edge = centre + r.tau * offset
+        cc = o.cos_limit * o.cos_limit
+        n = wp.vec3d(cc * edge[0], cc * edge[1], -o.sin_limit * o.sin_limit * edge[2])
+        out.centre = (-g / wp.dot(n, offset)) * n
+        out.offset = r.tau * out.centre
+    return out
+
+
+@wp.func
+def crossed(v: mat72d, i: int, j: int):
+    return v[i, 0] * v[j, 1] - v[i, 1] * v[j, 0]
+
+
+@wp.func
+def determinant(v: mat72d):
+    """det of the sum of v_i v_i', by Cauchy-Binet a sum of squares, which does not cancel."""
+    out = wp.float64(0.0)
+    for i in range(7):
+        for j in range(i):
+            c = crossed(v, i, j)
+            out += c * c
+    return out
+
+
+@wp.func
+def covariance_backward(v: mat72d, g_xx: wp.float64, g_xy: wp.float64, g_yy: wp.float64, g_det: wp.float64):
+    """d loss / d v from that by covariance and determinant."""
+    two = wp.float64(2.0)
+    out = mat72d()
+    for i in range(7):
+        gx = two * g_xx * v[i, 0] + g_xy * v[i, 1]
+        gy = two * g_yy * v[i, 1] + g_xy * v[i, 0]
+        for j in range(7):
+            c = two * g_det * crossed(v, i, j)
+            gx += c * v[j, 1]
+            gy -= c * v[j, 0]
+        out[i, 0] = gx
+        out[i, 1] = gy
+    return out

@@ -1,0 +1,167 @@
+"""Which kernels project for a camera, and what they are told of it: the only place beside the kernels that knows lenses and shutters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+import warp as wp
+
+from render.kernels.lenses import LENS_FUNCTIONS
+from render.kernels.lenses.optics import PARAMS, Optics
+from render.kernels.lenses.optics import params as vec_params
+from render.kernels.motion import Motion
+from render.kernels.project import project, project_backward
+from render.kernels.project_lens import POSE, lens_kernels
+from render.kernels.types import Pose, View
+from scenes.camera import Camera
+from scenes.gaussians import Placed, SplatModel
+from scenes.lenses import Equirectangular, Lens, OpenCV, Pinhole
+from scenes.lenses.box import view_box
+from scenes.poses import interpolate, inverse
+
+if TYPE_CHECKING:
+    from render.bridge import Settings
+
+NEAR = 0.1
+"""Metres in front of the camera within which a splat's centre is not drawn; around it, for a lens that sees all around."""
+
+LARGEST_TURN = math.radians(60)
+"""How far a pose may turn while the image is read out: beyond, its cubic (`kernels/motion.py`) is off by more than 6e-4 of a radian."""
+
+_NODES = torch.linspace(0, 1, 4, dtype=torch.float64)
+_CUBIC = torch.linalg.inv(_NODES[:, None] ** torch.arange(4))
+"""Coefficients of the cubic through values at the nodes."""
+
+
+def moves(camera: Camera, placed: Sequence[Placed]) -> bool:
+    """Whether anything moves while the image is read out."""
+    ends = [camera.world_from_cam_end, *(p.world_from_local_end for p in placed)]
+    return camera.shutter != "global" and any(end is not None for end in ends)
+
+
+def poses(camera: Camera, placed: Sequence[Placed]) -> torch.Tensor:
+    """float64 `[P, C, 4, 4]`: cam_from_local of each instance as coefficients of the powers of the readout's share, C = 1 where nothing
+    moves. Composed in float64, differentiable in every pose; all on the cameras' device."""
+    if not moves(camera, placed):
+        cam_from_world = inverse(camera.world_from_cam)
+        return torch.stack([cam_from_world @ p.world_from_local for p in placed])[:, None]
+    cam_from_world = inverse(_along(camera.world_from_cam, camera.world_from_cam_end))
+    nodes = torch.stack([cam_from_world @ _along(p.world_from_local, p.world_from_local_end) for p in placed])
+    return torch.einsum("kn,pnij->pkij", _CUBIC.to(nodes.device), nodes)
+
+
+def _along(start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:
+    """The pose `[4, 4, 4]` at the cubic's nodes."""
+    if end is None:
+        return start.expand(4, 4, 4)
+    return interpolate(start.expand(4, 4, 4), end.expand(4, 4, 4), _NODES.to(start.device))
+
+
+def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel) -> None:
+    """ValueError naming what this camera cannot draw, and the way out."""
+    ends = [("the camera", camera.world_from_cam, camera.world_from_cam_end)]
+    ends += [(f"instance {p.instance}", p.world_from_local, p.world_from_local_end) for p in placed]
+    for name, start, end in ends:
+        if end is None:
+            continue
+        if camera.shutter == "global":
+            raise ValueError(f'{name} has an end pose, which a global shutter never sees; use shutter="rows" or "columns", or no end pose')
+        if not torch.isfinite(end).all():
+            raise ValueError(f"the end pose of {name} is not finite: {end.tolist()}")
+        turn = math.acos(min(1.0, max(-1.0, (float((start[:3, :3] * end[:3, :3]).sum()) - 1) / 2)))
+        if turn > LARGEST_TURN:
+            raise ValueError(f"{name} turns by {math.degrees(turn):.0f} degrees while the image is read out; at most 60 can be drawn")
+    if not moves(camera, placed):
+        return
+    if model.projection != "ut":
+        raise ValueError(
+            f'a shutter that moves is drawn with projection "ut" only, not "{model.projection}"; retrain with it, or use shutter="global"'
+        )
+    if isinstance(camera.lens, Equirectangular) and camera.shutter == "columns":
+        raise ValueError('an equirectangular image read out by columns has no time at its seam; use shutter="rows" or "global"')
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The kernels for a lens under a shutter, and how often each instance is drawn (twice where the image closes on itself)."""
+
+    forward: wp.Kernel
+    backward: wp.Kernel
+    powers: int
+    params: int
+    copies: int = 1
+
+    @property
+    def uniforms(self) -> int:
+        """Numbers of one row of the gradient that all splats share."""
+        return POSE * self.powers + self.params
+
+    def pose_gradient(self, shared: torch.Tensor) -> torch.Tensor:
+        """`[P, C, 4, 4]`, as `poses`, from rows `[P, uniforms]`."""
+        parts = shared[:, : POSE * self.powers].reshape(-1, self.powers, POSE)
+        g = shared.new_zeros(len(shared), self.powers, 4, 4)
+        g[..., :3, :3] = parts[..., :9].reshape(-1, self.powers, 3, 3)
+        g[..., :3, 3] = parts[..., 9:]
+        return g
+
+    def lens_gradient(self, shared: torch.Tensor, count: int) -> torch.Tensor:
+        """`[count]`: of the lens's parameters."""
+        return shared[:, POSE * self.powers :].sum(0)[:count]
+
+
+def projection(lens: type[Lens], rolling: bool) -> Projection:
+    """The projection of a lens type; the pinhole with a global shutter has kernels of its own."""
+    if lens is Pinhole and not rolling:
+        return Projection(project, project_backward, 1, 4)
+    kernels = lens_kernels(LENS_FUNCTIONS[lens.kind], rolling)
+    return Projection(kernels.forward, kernels.backward, 4 if rolling else 1, PARAMS, 2 if lens is Equirectangular else 1)
+
+
+def uniforms(settings: Settings, lens: Lens, pose: torch.Tensor, instance: int, sh_count: int, copy: int) -> list:
+    """What the kernels of `projection` are told of one instance with `pose` `[C, 4, 4]`."""
+    view = _view(settings, lens, sh_count)
+    if isinstance(lens, Pinhole) and not settings.rolling:
+        return [view, _pose(pose[0], instance)]
+    optics = Optics()
+    optics.p = vec_params(*lens.params().tolist(), *([0.0] * (PARAMS - len(lens.params()))))
+    optics.cos_limit, optics.sin_limit = math.cos(lens.limit()), math.sin(lens.limit())
+    optics.period = float(lens.period()) if isinstance(lens, Equirectangular) else 0.0
+    motion = Motion()
+    for k, p in enumerate(pose):
+        setattr(motion, f"r{k}", wp.mat33d(*p[:3, :3].flatten().tolist()))
+        setattr(motion, f"t{k}", wp.vec3d(*p[:3, 3].tolist()))
+    motion.axis = 0 if settings.shutter == "columns" else 1
+    motion.extent = float(settings.width if settings.shutter == "columns" else settings.height)
+    motion.instance, motion.copy = float(instance), copy
+    return [view, optics, motion]
+
+
+def _view(settings: Settings, lens: Lens, sh_count: int) -> View:
+    v = View()
+    if isinstance(lens, Pinhole):
+        v.fx, v.fy, v.cx, v.cy = lens.params().tolist()
+    if isinstance(lens, Pinhole | OpenCV):
+        left, right, top, bottom = view_box(lens, settings.width, settings.height)
+        half_x, half_y = 0.15 * (right - left), 0.15 * (bottom - top)  # the 0.3 of 1.3 tan, on either side
+        v.clamp_left, v.clamp_right, v.clamp_top, v.clamp_bottom = left - half_x, right + half_x, top - half_y, bottom + half_y
+        margin = 4 * math.sqrt(settings.model.dilation) + 1
+        v.left, v.right, v.top, v.bottom = view_box(lens, settings.width, settings.height, margin)
+    v.tiles_x, v.tiles_y = settings.tiles_x, settings.tiles_y
+    v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
+    v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
+    v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
+    return v
+
+
+def _pose(cam_from_local: torch.Tensor, instance: int) -> Pose:
+    p = Pose()
+    rows = cam_from_local[:3].tolist()
+    p.rotation = wp.mat33(*(x for row in rows for x in row[:3]))
+    p.translation = wp.vec3(*(row[3] for row in rows))
+    p.eye = wp.vec3(*(-(cam_from_local[:3, :3].T @ cam_from_local[:3, 3])).tolist())
+    p.instance = float(instance)
+    return p

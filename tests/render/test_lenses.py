@@ -1,0 +1,131 @@
+"""Every lens and moving shutters, drawn and differentiated, against the float64 oracle."""
+
+from dataclasses import fields as fields_of
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import RenderConfig, rasterize
+from scenes import Camera, Equirectangular, Fisheye, FTheta, OpenCV, Orthographic, Placed, SplatModel
+from scenes.poses import pose_from, translation
+from tests import oracle
+from tests.bench.presets import random_splats
+
+WIDTH, HEIGHT = 56, 40
+START = pose_from([1, 0.02, 0.01, -0.03], [0.1, 0.2, -0.3])
+LENSES = {
+    "opencv": OpenCV(48.0, 50.0, 27.0, 18.0, -0.28, 0.07, 0.002, -0.003, 0.004, 0.02, 0.01, 0.003, 0.002, -0.001, 0.001, 0.002),
+    "fisheye": Fisheye(17.0, 17.5, 28.0, 20.0, -0.01, 0.004, -0.0005, 0.0001),
+    "ftheta": FTheta(28.0, 20.0, 17.0, 0.2, -0.3, 0.05, 0.01, 1.02, 0.003, -0.002),
+    "equirectangular": Equirectangular.whole(WIDTH, HEIGHT),
+    "orthographic": Orthographic(9.0, 9.5, 27.0, 19.0),
+}
+UT, EWA, SMOOTH = SplatModel(), SplatModel(projection="ewa"), SplatModel(antialias=True)
+MODELS = [UT, replace(EWA, antialias=True)]
+EXACT = RenderConfig(alpha_cutoff=1e-8, termination=0)
+
+
+def camera_of(lens) -> Camera:
+    return Camera(lens, WIDTH, HEIGHT, START)
+
+
+def around(seed: int, count: int = 130) -> list[Placed]:
+    """Two clouds, one ahead and one that surrounds the camera, splats of all shapes."""
+    g = random_splats(count, seed)
+    wide = random_splats(count // 2, seed + 1, sh_count=4)
+    wide = replace(wide, means=wide.means * 2.5 + 0.8 * torch.nn.functional.normalize(wide.means, dim=1))
+    return [
+        Placed(g, pose_from([1, 0.1, 0.2, 0.05], [0.1, 0.2, 5.0])),
+        Placed(wide, pose_from([0.9, -0.1, 0.2, 0.05], [0.2, -0.1, 0.1]), instance=3),
+    ]
+
+
+def stretched(seed: int) -> list[Placed]:
+    """Needles and pancakes, some of which reach past the camera and past the lens's edge."""
+    g = random_splats(50, seed)
+    shape = torch.tensor([[0.7, -3.5, -3.5], [0.3, 0.3, -6.0]]).repeat(25, 1)
+    return [Placed(replace(g, means=1.5 * g.means, log_scales=shape + 0.2 * g.log_scales), translation(0, 0, 2.5))]
+
+
+def largest(mine: torch.Tensor, reference: torch.Tensor, where: torch.Tensor) -> float:
+    return float((mine.detach().double() - reference.detach()).abs()[where].max())
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("make", [around, stretched])
+def test_every_lens_draws_what_the_oracle_draws(make, name, model):
+    placed, camera = make(1), camera_of(LENSES[name])
+    rgb, alpha, depth, instance, unsure = oracle.render(oracle.as_oracle(placed), camera, model, cutoff=1 / 255, alpha_max=0.999)
+    frame = rasterize(placed, camera, ("rgb", "alpha", "depth", "instance"), model=model, config=RenderConfig(termination=0))
+    sure = ~unsure
+    assert sure.float().mean() > 0.9 and alpha.mean() > 0.05
+    assert largest(frame.rgb, rgb, sure) < 2e-5 * max(1.0, float(rgb.detach().max()))
+    assert largest(frame.alpha, alpha, sure) < 2e-5
+    solid = sure & (alpha > 0.01)
+    assert largest(frame.depth / depth, torch.ones_like(depth), solid) < 1e-4
+    assert (frame.instance != instance)[sure & ((alpha - 0.5).abs() > 1e-4)].float().mean() < 0.002
+
+
+def assert_gradient(name: str, mine: torch.Tensor, reference: torch.Tensor) -> None:
+    error = (mine.double() - reference).abs()
+    allowed = 1e-3 * reference.abs() + 1e-6 * reference.abs().max()
+    off = f"{name}: {int((error > allowed).sum())} of {error.numel()} off, worst {float((error / allowed).max()):.1f}x"
+    assert (error <= allowed).all(), off
+
+
+def gradients(placed: list[Placed], camera: Camera, model: SplatModel):
+    """(name, ours, the oracle's) for every field, start and end pose, and lens parameter, of a random loss on rgb, alpha, depth."""
+    truth = oracle.as_oracle(placed)
+    leaf = lambda t: None if t is None else t.clone().requires_grad_()  # noqa: E731
+    ends = [leaf(p.world_from_local_end) for p in placed]
+    start, end, lens = leaf(camera.world_from_cam), leaf(camera.world_from_cam_end), leaf(camera.lens.params())
+    rgb, alpha, depth, _, _ = oracle.render(
+        truth, camera, model, start, lens, cutoff=1e-8, alpha_max=0.999, world_from_cam_end=end, ends=ends
+    )
+    dice = torch.Generator().manual_seed(5)
+    weights = [torch.randn(*t.shape, generator=dice).double() for t in (rgb, alpha, depth)]
+    seen = alpha > 1e-3
+
+    def loss(rgb, alpha, depth):
+        return (rgb * weights[0]).sum() + (alpha * weights[1]).sum() + 0.1 * (depth[seen] * weights[2][seen]).sum()
+
+    loss(rgb, alpha, depth).backward()
+    mine = [
+        replace(
+            p,
+            gaussians=p.gaussians.map(lambda t: t.clone().requires_grad_()),
+            world_from_local=leaf(p.world_from_local),
+            world_from_local_end=leaf(p.world_from_local_end),
+        )
+        for p in placed
+    ]
+    my_lens = leaf(camera.lens.params())
+    my_camera = replace(
+        camera,
+        lens=type(camera.lens)(*my_lens),
+        world_from_cam=leaf(camera.world_from_cam),
+        world_from_cam_end=leaf(camera.world_from_cam_end),
+    )
+    frame = rasterize(mine, my_camera, ("rgb", "alpha", "depth"), model=model, config=EXACT)
+    loss(frame.rgb, frame.alpha, frame.depth).backward()
+    for i, (p, (fields, world_from_local, _)) in enumerate(zip(mine, truth, strict=True)):
+        for name, tensor in p.gaussians.tensors().items():
+            yield f"{name} of {i}", tensor.grad, fields[name].grad
+        yield f"pose of {i}", p.world_from_local.grad[:3], world_from_local.grad[:3]
+        if p.world_from_local_end is not None:
+            yield f"end pose of {i}", p.world_from_local_end.grad[:3], ends[i].grad[:3]
+    yield "camera pose", my_camera.world_from_cam.grad[:3], start.grad[:3]
+    if end is not None:
+        yield "camera's end pose", my_camera.world_from_cam_end.grad[:3], end.grad[:3]
+    for name, mine_of, reference in zip((f.name for f in fields_of(camera.lens)), my_lens.grad, lens.grad, strict=True):
+        yield f"lens {name}", mine_of, reference
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("make", [around, stretched])
+def test_every_lens_has_the_oracles_gradients(make, name, model):
+    for what, mine, reference in gradients(make(2), camera_of(LENSES[name]), model):
+        assert_gradient(what, mine, reference)
