@@ -5,17 +5,105 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from scenes.camera import Camera
-from scenes.gaussians import Gaussians, SplatModel
+from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Pinhole
+from scenes.poses import pose_from, translation
 
-SHARED = Path(os.environ.get("SIDESTEP_SHARED", Path(__file__).resolve().parents[3] / "shared"))
+REPOSITORY = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("SIDESTEP_SHARED", REPOSITORY.parent / "shared"))
+DRIVE = REPOSITORY / "examples" / "data" / "drive002"
+STILL = torch.eye(4, dtype=torch.float64)
+
+
+class Missing(Exception):
+    """A preset whose data is not here; says what to do."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What to draw, from where, and by which model."""
+
+    placed: list[Placed]
+    camera: Camera
+    model: SplatModel
+
+    def __len__(self) -> int:
+        return sum(len(p.gaussians) for p in self.placed)
+
+
+def drive(width: int, height: int, folder: Path | None = None) -> Preset:
+    """A scene folder's front camera amid its drive, the actors of that moment included; the bundled demo's scene by default."""
+    from scenes import load
+
+    scene = load(folder or DRIVE)
+    rig = scene.rig["front_camera"] if "front_camera" in scene.rig else next(iter(scene.rig.values()))
+    times = rig.times_us if len(rig.times_us) else scene.ego.times_us
+    when = int(times[len(times) // 2])
+    camera = Camera(rig.lens, rig.width, rig.height, scene.ego.at(when) @ rig.body_from_cam, time_us=when)
+    return Preset(scene.placed(when), camera.resized(width, height), scene.model)
+
+
+def street(count: int, folder: Path | None = None) -> Preset:
+    """The drive's background laid side by side, at most 8 abreast, until there are `count` splats: a city of which a camera sees little."""
+    first = drive(960, 540, folder)
+    g = first.placed[0].gaussians
+    copies = -(-count // len(g))
+    tiles = []
+    for i in range(copies):
+        shift = torch.tensor([150.0 * (i // 8), 150.0 * (i % 8), 0.0])
+        tiles.append(Gaussians(g.means + shift, g.quats, g.log_scales, g.logit_opacities, g.sh))
+    whole = Gaussians.cat(tiles).select(torch.arange(count))
+    return Preset([Placed(whole, first.placed[0].world_from_local)], first.camera, first.model)
+
+
+def biker() -> Preset:
+    """A person on a bicycle from the shared data, seen from 3 m."""
+    from scenes import load
+
+    path = SHARED / "data" / "splats" / "biker.compressed.ply"
+    if not path.exists():
+        raise Missing(f"{path} is missing; set SIDESTEP_SHARED to the folder that holds data/")
+    try:
+        found = load(path)
+    except ValueError as error:
+        raise Missing(f"{path.name} cannot be read yet: {error}") from error
+    g = found if isinstance(found, Gaussians) else found.gaussians
+    centre, spread = g.means.median(0).values.double(), float((g.means - g.means.median(0).values).norm(dim=1).quantile(0.9))
+    pose = translation(*centre.tolist()) @ pose_from([1.0, 0, 0, 0], [0, 0, -3 * spread])
+    return Preset([Placed(g, STILL)], Camera(Pinhole(960.0, 960.0, 480.0, 270.0), 960, 540, pose), SplatModel(projection="ewa"))
+
+
+def presets(drive_folder: Path | None = None, lund_folder: Path | None = None) -> dict[str, Callable[[], Preset]]:
+    """All presets by name, made when called; `Missing` where their data is not here."""
+
+    def lund() -> Preset:
+        if lund_folder is None:
+            raise Missing("no scene: reconstruct ../shared/data/lund, then pass --lund FOLDER")
+        return drive(960, 540, lund_folder)
+
+    def uniform_of(n: int) -> Preset:
+        g, camera, model = uniform(n)
+        return Preset([Placed(g, STILL)], camera, model)
+
+    sizes = [(480, 270), (960, 540), (1920, 1080)]
+    return {
+        "uniform-100k": lambda: uniform_of(100_000),
+        "uniform-500k": lambda: uniform_of(500_000),
+        **{f"drive-{w}x{h}": lambda w=w, h=h: drive(w, h, drive_folder) for w, h in sizes},  # type: ignore[misc]
+        "lund": lund,
+        "biker": biker,
+        "street-1M": lambda: street(1_000_000, drive_folder),
+        "street-3M": lambda: street(3_000_000, drive_folder),
+    }
 
 
 def load_prototype():
