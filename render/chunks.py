@@ -22,9 +22,8 @@ def window(left: int, top: int, tiles_x: int, tiles_y: int) -> Window:
     return w
 
 
-def windows(records: torch.Tensor, counts: torch.Tensor, tiles_x: int, tiles_y: int, most: int) -> list[Window]:
-    """The whole image, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in the whole image."""
-    whole = window(0, 0, tiles_x, tiles_y)
+def windows(records: torch.Tensor, counts: torch.Tensor, whole: Window, most: int) -> list[Window]:
+    """The whole, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in the image at least."""
     return [whole] if int(counts.sum(dtype=torch.int64)) <= most else _halved(records, counts, whole, most)
 
 
@@ -56,5 +55,9 @@ class Sums:
         self.slots = torch.zeros(len(counts), GRADIENTS, device=counts.device)
 
     def add(self, counts: torch.Tensor, lists: TileLists, slots: torch.Tensor) -> None:
-        args = [view(counts, int), view(lists.first_slot, int), view(slots, float), view(self.slots, float)]
-        run(add_slots, len(counts), args, counts.device)
+        add_to(self.slots, counts, lists, slots)
+
+
+def add_to(sums: torch.Tensor, counts: torch.Tensor, lists: TileLists, slots: torch.Tensor) -> None:
+    """Add each record's slots `[I, C]` to its row of `sums` `[N, C]`, in their order."""
+    run(add_slots, len(counts), [view(counts, int), view(lists.first_slot, int), view(slots, float), view(sums, float)], counts.device)

@@ -1,8 +1,9 @@
-"""Optical flow from depth: where the surface seen by a pixel stands in the other frame."""
+"""Optical flow from depth: where the surface seen by a pixel stands in the other frame, and whether that frame sees it too."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
@@ -11,21 +12,52 @@ from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
 
+HIDES = 0.05
+"""What lies nearer by this share of the depth hides a point; less is the roughness of splatted surfaces."""
 
-def image_flow(
-    placed: Sequence[Placed], camera: Camera, depth: torch.Tensor, instance: torch.Tensor, there: Sequence[Placed], other: Camera
-) -> torch.Tensor:
-    """Flow `[H, W, 2]` in pixels: position in `other` minus position here, of each pixel's surface point.
 
-    The point lies at the pixel's depth and moves rigidly with its instance. Where nothing is drawn (instance -1) the pixel is
-    sky and moves by the cameras' rotation only. Points that the other lens does not see have flow nan.
+@dataclass(frozen=True)
+class Correspondence:
+    """Each pixel's surface point in the other frame: points `[H, W, 3]` in that camera, flow `[H, W, 2]` in pixels, nan where the other
+    lens does not see, pixels `[H, W, 2]` there."""
+
+    other: Camera
+    points: torch.Tensor
+    flow: torch.Tensor
+    pixels: torch.Tensor
+
+    def visible(self, depth: torch.Tensor) -> torch.Tensor:
+        """bool `[H, W]`: the point falls into the other image, and there `depth` `[H', W']` shows nothing nearer in all four pixels
+        around it. Sky hides nothing and is hidden by all."""
+        height, width = depth.shape
+        corner = torch.floor(torch.nan_to_num(self.pixels, nan=-9.0).clamp(-9, 1e6) - 0.5).long()
+        around = [
+            depth[(corner[..., 1] + dy).clamp(0, height - 1), (corner[..., 0] + dx).clamp(0, width - 1)] for dx in (0, 1) for dy in (0, 1)
+        ]
+        farthest = torch.stack(around).amax(0)
+        size = torch.tensor([width, height], device=depth.device)
+        inside = ((self.pixels >= 0) & (self.pixels <= size)).all(-1)
+        return inside & (farthest >= (1 - HIDES) * self.other.lens.depth(self.points))
+
+
+def correspond(
+    placed: Sequence[Placed], camera: Camera, depth: torch.Tensor, instance: torch.Tensor, there: Sequence[Placed], other: Camera,
+    corner: tuple[int, int] = (0, 0),
+) -> Correspondence:  # fmt: skip
+    """Where the surface points of `depth` and `instance` `[h, w]` stand in `other`. corner: x, y of the first pixel in `camera`'s image.
+
+    A point lies at the pixel's depth and moves rigidly with its instance. Where nothing is drawn (instance -1) the pixel is
+    sky and moves by the cameras' rotation only: its point is infinitely far.
     """
     device = depth.device
+    height, width = depth.shape
+    part = (slice(corner[1], corner[1] + height), slice(corner[0], corner[0] + width))
     other_from_world = inverse(other.world_from_cam)
     moved = {p.instance: p.world_from_local for p in there}
-    rays = camera_rays(camera).to(device)
+    origins = camera_origins(camera)
     sky = depth.isinf() | (instance < 0)
-    points = camera_origins(camera).to(device) + rays * torch.where(sky, torch.ones_like(depth), depth)[..., None]
+    rays = camera_rays(camera)[part].to(device) * torch.where(sky, torch.ones_like(depth), depth)[..., None]
+    points = (origins[part] if origins.ndim == 3 else origins).to(device) + rays
     turn = (other_from_world @ camera.world_from_cam)[:3, :3].to(device, torch.float32)
     out = points @ turn.T
     seen = set(instance.unique().tolist())
@@ -36,5 +68,7 @@ def image_flow(
         motion = (other_from_world @ end @ inverse(p.world_from_local) @ camera.world_from_cam).to(device, torch.float32)
         mine = (instance == p.instance) & ~sky
         out[mine] = points[mine] @ motion[:3, :3].T + motion[:3, 3]
-    flow = other.lens.project(out) - camera.lens.project(points)
-    return torch.where(other.lens.valid(out)[..., None], flow, torch.nan).to(torch.float32)
+    pixels = other.lens.project(out)
+    flow = torch.where(other.lens.valid(out)[..., None], pixels - camera.lens.project(points), torch.nan).to(torch.float32)
+    pixels = torch.where(flow.isnan(), torch.nan, pixels)
+    return Correspondence(other, torch.where(sky[..., None], out * torch.inf, out), flow, pixels)

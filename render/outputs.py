@@ -4,7 +4,20 @@ from collections.abc import Iterable
 
 from scenes.names import nearest
 
-OUTPUTS = ("rgb", "alpha", "depth", "flow_prev", "flow_next", "instance")
+OUTPUTS = (
+    "rgb",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "features",
+    "flow_prev",
+    "flow_next",
+    "visible_prev",
+    "visible_next",
+    "instance",
+    "instance_alpha",
+)
 
 
 def check_outputs(outputs: Iterable[str]) -> tuple[str, ...]:

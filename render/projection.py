@@ -24,7 +24,7 @@ from scenes.lenses.box import view_box
 from scenes.poses import interpolate, inverse
 
 if TYPE_CHECKING:
-    from render.bridge import Settings
+    from render.settings import Settings
 
 NEAR = 0.1
 """Metres in front of the camera within which a splat's centre is not drawn; around it, for a lens that sees all around."""

@@ -7,12 +7,15 @@ from typing import overload
 
 import torch
 
-from render.bridge import Rasterize, Settings
-from render.flow import image_flow
+from render.bridge import Rasterize
+from render.channels import Features, channel_fields, unit
+from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
+from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
+from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
@@ -27,6 +30,7 @@ def rasterize(
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] | None = ...,
     model: SplatModel = ...,
     config: RenderConfig = ...,
+    features: Features | None = ...,
 ) -> Frame: ...
 @overload
 def rasterize(
@@ -37,6 +41,7 @@ def rasterize(
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] | None = ...,
     model: SplatModel = ...,
     config: RenderConfig = ...,
+    features: Features | None = ...,
 ) -> list[Frame]: ...
 def rasterize(
     splats: Gaussians | Placed | Sequence[Placed],
@@ -46,66 +51,73 @@ def rasterize(
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] | None = None,
     model: SplatModel = SplatModel(),  # noqa: B008 - frozen
     config: RenderConfig = RenderConfig(),  # noqa: B008 - frozen
+    features: Features | None = None,
 ) -> Frame | list[Frame]:
     """Draw Gaussian splats (Kerbl et al. 2023) as `camera` sees them; one Frame a camera.
 
-    splats: in the world, or placed in it; quaternions of any length; nothing is changed. outputs: any of rgb, alpha, depth,
-    instance, flow_prev, flow_next; what is not asked for is None and costs nothing. background: `[3]` or `[H, W, 3]`; black
-    otherwise, with rgb premultiplied. flow_to: the placed splats and camera at the other time for "prev" and "next"; an
-    instance that is missing there keeps its pose.
+    splats: in the world, or placed in it; quaternions of any length; nothing is changed. outputs: names of the fields of `Frame`; what is
+    not asked for is None and costs nothing. background: `[3]` or `[H, W, 3]`; black otherwise, with rgb premultiplied. flow_to: the
+    placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose. features: a further
+    field of the splats, `[N, C]` with C to 128, or one for each of the placed.
 
-    rgb, alpha and depth are differentiable in every field of the splats, every pose (camera and instance), the lens and the
-    background. Splats whose centre is nearer than 0.1 m are not drawn. ValueError for what cannot be drawn.
+    rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
+    instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. ValueError for what
+    cannot be drawn.
     """
     if not isinstance(camera, Camera):
-        return [rasterize(splats, c, outputs, background, flow_to, model, config) for c in camera]
+        return [rasterize(splats, c, outputs, background, flow_to, model, config, features) for c in camera]
     outputs = check_outputs(outputs)
     placed = _as_placed(splats)
     _check(placed, camera, outputs, flow_to, model)
     if background is not None:
         check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
+    with stage(placed[0].gaussians.device):
+        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features)
 
-    flows = any(o.startswith("flow_") for o in outputs)
+
+def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features) -> Frame:
+    cam_from_local = poses(camera, placed)
+    summed = channel_fields(outputs, placed, cam_from_local[:, 0], features)
+    flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
     settings = Settings(
         width=camera.width,
         height=camera.height,
         model=model,
         config=config,
-        depth="depth" in outputs or flows,
-        instance="instance" in outputs or flows,
+        wanted=Wanted("depth" in outputs or flows, "median_depth" in outputs, "instance" in outputs or flows, bool(summed)),
         instances=tuple(p.instance for p in placed),
         lens=type(camera.lens),
         shutter=camera.shutter,
         rolling=moves(camera, placed),
     )
-    with stage(placed[0].gaussians.device):
-        return _draw(settings, placed, camera, outputs, background, flow_to)
-
-
-def _draw(settings: Settings, placed: list[Placed], camera: Camera, outputs, background, flow_to) -> Frame:
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
-    rgb, alpha, z, weights, instance = Rasterize.apply(settings, poses(camera, placed), camera.lens.params(), *fields)
+    channels = torch.cat(list(summed.values()), 1) if summed else None
+    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), channels, *fields)
 
-    frame: dict[str, torch.Tensor] = {}
-    if "rgb" in outputs:
-        frame["rgb"] = rgb.permute(1, 2, 0)
-        if background is not None:
-            frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * background
-    if "alpha" in outputs:
-        frame["alpha"] = alpha
-    if settings.depth:
+    frame: dict[str, torch.Tensor] = {"alpha": alpha, "instance": instance}
+    frame["rgb"] = rgb.permute(1, 2, 0)
+    if background is not None and "rgb" in outputs:
+        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * background
+    if settings.wanted.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
         drawn = weights > 0
-        depth = torch.where(drawn, z / torch.where(drawn, weights, torch.ones_like(weights)), torch.inf)
-        if "depth" in outputs:
-            frame["depth"] = depth
-    if "instance" in outputs:
-        frame["instance"] = instance
-    for name in (o for o in outputs if o.startswith("flow_")):
-        assert flow_to is not None
-        there, other = flow_to[name.removeprefix("flow_")]
-        frame[name] = image_flow(placed, camera, depth.detach(), instance, there, other)
-    return Frame(camera=camera, **frame)
+        frame["depth"] = torch.where(drawn, z / torch.where(drawn, weights, torch.ones_like(weights)), torch.inf)
+    if settings.wanted.median:
+        frame["median_depth"] = torch.where(median > 0, median, torch.inf)
+    if settings.wanted.channels:
+        parts = sums.permute(1, 2, 0).split([field.shape[1] for field in summed.values()], -1)
+        frame |= dict(zip(summed, parts, strict=True))
+    if "normal" in outputs:
+        frame["normal"] = unit(frame["normal"])
+    for way in {o.split("_")[1] for o in outputs if o.startswith(("flow_", "visible_"))}:
+        there, other = flow_to[way]
+        same = correspond(placed, camera, frame["depth"].detach(), instance, there, other)
+        frame[f"flow_{way}"] = same.flow
+        if f"visible_{way}" in outputs:
+            shown = _draw(_as_placed(there), other, ("depth",), None, {}, model, config, None).depth
+            assert shown is not None
+            frame[f"visible_{way}"] = same.visible(shown.detach())
+    return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
 def _as_placed(splats) -> list[Placed]:
@@ -117,8 +129,9 @@ def _as_placed(splats) -> list[Placed]:
 
 def _check(placed, camera, outputs, flow_to, model) -> None:
     for name in outputs:
-        if name.startswith("flow_") and name.removeprefix("flow_") not in (flow_to or {}):
-            raise ValueError(f'output "{name}" needs flow_to={{"{name.removeprefix("flow_")}": (placed, camera)}}')
+        what, _, way = name.partition("_")
+        if what in ("flow", "visible") and way not in (flow_to or {}):
+            raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
     if model.response != "conic":
         raise ValueError(f'response "{model.response}" is not drawn yet; use SplatModel(response="conic")')
     check_projection(camera, placed, model)

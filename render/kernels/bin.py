@@ -7,7 +7,7 @@ rounding alone could ask for, are not written.
 
 import warp as wp
 
-from render.kernels.types import GRADIENTS, INV_C, INV_K, OPTIONS, S_MAX, SLACK, TILE, Y_AT_EXT, Y_EXT, H, M, Window, X, Y
+from render.kernels.types import INV_C, INV_K, OPTIONS, S_MAX, SLACK, TILE, Y_AT_EXT, Y_EXT, H, M, Window, X, Y
 
 wp.set_module_options(OPTIONS)
 
@@ -71,7 +71,7 @@ def add_slots(
     """Add each record's gradient slots to its sum, in order."""
     j = first + wp.tid()
     for slot in range(starts[j], starts[j] + counts[j]):
-        for c in range(GRADIENTS):
+        for c in range(sums.shape[1]):
             sums[j, c] = sums[j, c] + slots[slot, c]
 
 

@@ -1,8 +1,8 @@
 """Front-to-back compositing on lane vectors, and its backward, for the CPU: a thread takes a band of tiles, a lane vector one row of one.
 
-Planes are `[rows, tiles_x]` lane vectors of one window: row-major images whose width is padded to the tile. While a tile is worked on, its
-rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every row would
-be another page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to
+Planes (`types.Wanted`) are `[rows, tiles_x]` lane vectors of one window: row-major images whose width is padded to the tile. While a
+tile is worked on, its rows stand side by side in `state`, a few KiB a band that stay in the first cache: straight from the planes, every
+row would be another page. Kernels are made per set of outputs, so that what was not asked for is not compiled in. Backward runs back to
 front from a stored last entry per row: the front-to-back form (total minus prefix) cancels in float32.
 
 Backward finds each transmittance by dividing the final one, so none may underflow. A lane whose neighbours see far may meet any
@@ -14,6 +14,7 @@ from functools import cache
 
 import warp as wp
 
+from render.kernels.rows import ROLLED, before, below, exp_series, lesser, row_range
 from render.kernels.types import (
     BLUE,
     G_BLUE,
@@ -29,17 +30,16 @@ from render.kernels.types import (
     GRADIENTS,
     GREEN,
     INSTANCE,
-    INV_C,
+    MEDIAN,
     OPACITY,
-    OPTIONS,
     RED,
     S_MAX,
-    SLACK,
     TILE,
-    Y_EXT,
+    WHO,
     H,
     K,
     M,
+    Wanted,
     Window,
     X,
     Y,
@@ -47,88 +47,30 @@ from render.kernels.types import (
     lanes,
 )
 
-LAST = wp.constant(TILE - 1)
-WIDTH = wp.constant(float(TILE - 1))
-ROLLED = OPTIONS | {"max_unroll": 8}  # loops over a tile's 16 rows stay loops: unrolled they compile ten times as long and run no faster
 LOOK = wp.constant(32)
 FAINTEST = wp.constant(1.0e-20)  # times termination, and once more 1 - alpha_max, is a float yet
 vec_rows = wp.types.vector(length=TILE, dtype=wp.int32)
+HELD = wp.constant(11)  # rows of working state a tile before its channels
 NEVER = wp.constant(16777216.0)  # the place in a tile's list of a lane that never went dark; floats count exactly up to it
 
 
-@wp.func
-def below(limit: float, z: lanes):
-    """1 where z < limit, else 0 (limit of ordinary size, z of any)."""
-    return wp.min(wp.max(lanes(limit * 1.0e30) - z * 1.0e30, lanes(0.0)), lanes(1.0))
-
-
-@wp.func
-def before(place: float, places: lanes):
-    """Those of `places`, whole numbers, that are less than `place`; -1 for the others."""
-    less = wp.min(wp.max(lanes(place) - places, lanes(0.0)), lanes(1.0))
-    return wp.cw_mul(less, places + lanes(1.0)) - lanes(1.0)
-
-
-@wp.func
-def exp_series(z: lanes):
-    """exp(-z) for z in [0, 0.75]: Taylor to degree 6, relative error 2e-5 at the end."""
-    tail = lanes(0.041666668) - wp.cw_mul(z, lanes(0.008333334) - z * 0.00138889)
-    return lanes(1.0) - z + wp.cw_mul(wp.cw_mul(z, z), lanes(0.5) - wp.cw_mul(z, lanes(0.16666667) - wp.cw_mul(z, tail)))
-
-
-@wp.func
-def lesser(a: float, b: float):
-    """Half the instructions of `wp.min`, which minds NaN."""
-    return wp.where(a < b, a, b)
-
-
-@wp.func
-def greater(a: float, b: float):
-    return wp.where(a > b, a, b)
-
-
-@wp.func
-def row_range(record: lanes, x0: float, y0: float):
-    """First and last row that the ellipse reaches within the columns of the tile whose first pixel centre is x0, y0."""
-    px = record[X] - x0
-    py = record[Y] - y0
-    k = record[K]
-    m = record[M]
-    h = record[H]
-    inv_c = record[INV_C]
-    k2 = k * k
-    cs = (k2 * m * m + h) * record[S_MAX]
-    k2h = k2 * h
-    slope = k2 * m * inv_c
-    x_at_ext = m * record[Y_EXT]
-    left = -px - SLACK
-    right = WIDTH - px + SLACK
-    dx_low = lesser(greater(x_at_ext, left), right)
-    dx_high = lesser(greater(-x_at_ext, left), right)
-    low = slope * dx_low + wp.sqrt(greater(cs - k2h * dx_low * dx_low, 0.0)) * inv_c + SLACK
-    high = slope * dx_high - wp.sqrt(greater(cs - k2h * dx_high * dx_high, 0.0)) * inv_c - SLACK
-    return wp.vec2i(wp.max(0, int(wp.ceil(py + high))), wp.min(LAST, int(wp.floor(py + low))))
-
-
 @cache
-def composite(depth: bool, instance: bool, squarings: int):
+def composite(wanted: Wanted, squarings: int):
     """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10."""
     scale = 0.5**squarings
     root = scale**0.5
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], features: wp.array2d[float], channels: int,
         window: Window, bands: int, alpha_max: float, termination: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
-        out_t: wp.array2d[lanes], out_r: wp.array2d[lanes], out_g: wp.array2d[lanes], out_b: wp.array2d[lanes],
-        out_z: wp.array2d[lanes], out_w: wp.array2d[lanes], out_instance: wp.array2d[lanes], last: wp.array2d[int],
-        dark_at: wp.array2d[lanes],
+        planes: wp.array3d[lanes], picks: wp.array3d[lanes], last: wp.array2d[int], dark_at: wp.array2d[lanes],
         first: int,
     ):  # fmt: skip
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
-        state `[bands, 10, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight, where in the tile's list
-        the lane went dark, its transmittance then.
+        state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight, where in the
+        tile's list the lane went dark, its transmittance then, median depth, channels.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -142,9 +84,14 @@ def composite(depth: bool, instance: bool, squarings: int):
             start = tile_starts[tile]
             for r in range(TILE):
                 state[band, 0, r] = lanes(1.0)
-                for p in range(1, wp.static(8 if instance else 6 if depth else 4)):
+                for p in range(1, wp.static(8 if wanted.instance else 6 if wanted.depth else 4)):
                     state[band, p, r] = lanes(0.0)
-                if wp.static(instance):
+                if wp.static(wanted.median):
+                    state[band, 10, r] = lanes(0.0)
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        state[band, HELD + c, r] = lanes(0.0)
+                if wp.static(wanted.instance):
                     state[band, 6, r] = lanes(-1.0)
                 state[band, 8, r] = lanes(NEVER)
                 state[band, 9, r] = lanes(0.0)
@@ -175,7 +122,8 @@ def composite(depth: bool, instance: bool, squarings: int):
                             row_max[r] = wp.max(seen - kept)
                         if wp.max(row_max) <= 0.0:
                             break
-                record = records[ids[n]]
+                i = ids[n]
+                record = records[i]
                 px = record[X] - x0
                 py = record[Y] - y0
                 k = record[K] * wp.static(root)
@@ -204,10 +152,16 @@ def composite(depth: bool, instance: bool, squarings: int):
                         state[band, 1, r] = state[band, 1, r] + w * red
                         state[band, 2, r] = state[band, 2, r] + w * green
                         state[band, 3, r] = state[band, 3, r] + w * blue
-                        if wp.static(depth):
+                        if wp.static(wanted.depth):
                             state[band, 4, r] = state[band, 4, r] + w * record[Z]
                             state[band, 5, r] = state[band, 5, r] + w
-                        if wp.static(instance):
+                        if wp.static(wanted.channels):
+                            for c in range(channels):
+                                state[band, HELD + c, r] = state[band, HELD + c, r] + w * features[i, c]
+                        if wp.static(wanted.median):
+                            here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
+                            state[band, 10, r] = state[band, 10, r] + here * record[Z]
+                        if wp.static(wanted.instance):
                             most = state[band, 7, r]
                             leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
                             state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(record[INSTANCE]) - state[band, 6, r])
@@ -215,41 +169,43 @@ def composite(depth: bool, instance: bool, squarings: int):
                         state[band, 0, r] = t - w
                         row_last[r] = n + 1
             for r in range(TILE):
-                out_t[row0 + r, tx] = state[band, 0, r] + state[band, 9, r]
                 last[row0 + r, tx] = row_last[r]
                 dark_at[row0 + r, tx] = state[band, 8, r]
-                out_r[row0 + r, tx] = state[band, 1, r]
-                out_g[row0 + r, tx] = state[band, 2, r]
-                out_b[row0 + r, tx] = state[band, 3, r]
-                if wp.static(depth):
-                    out_z[row0 + r, tx] = state[band, 4, r]
-                    out_w[row0 + r, tx] = state[band, 5, r]
-                if wp.static(instance):
-                    out_instance[row0 + r, tx] = state[band, 6, r]
+                planes[0, row0 + r, tx] = state[band, 0, r] + state[band, 9, r]
+                for p in range(1, wp.static(wanted.first_channel)):
+                    planes[p, row0 + r, tx] = state[band, p, r]
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        planes[wp.static(wanted.first_channel) + c, row0 + r, tx] = state[band, HELD + c, r]
+                if wp.static(wanted.median):
+                    picks[MEDIAN, row0 + r, tx] = state[band, 10, r]
+                if wp.static(wanted.instance):
+                    picks[WHO, row0 + r, tx] = state[band, 6, r]
 
     return composite_forward
 
 
 @cache
-def composite_gradient(depth: bool, squarings: int):
-    """The backward kernel: writes one gradient slot for every entry of every tile, on every path."""
+def composite_gradient(wanted: Wanted, squarings: int):
+    """The backward kernel: writes one gradient slot for every entry of every tile, on every path, and one of its channels."""
     scale = 0.5**squarings
     root = scale**0.5
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes],
-        window: Window, bands: int, alpha_max: float,
+        features: wp.array2d[float], channels: int, window: Window, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes],
-        g_r: wp.array2d[lanes], g_g: wp.array2d[lanes], g_b: wp.array2d[lanes], g_z: wp.array2d[lanes], g_w: wp.array2d[lanes],
-        last: wp.array2d[int], dark_at: wp.array2d[lanes], final_t: wp.array2d[lanes], t_gradient: wp.array2d[lanes],
-        slots: wp.array2d[float],
+        planes: wp.array3d[lanes], grads: wp.array3d[lanes], last: wp.array2d[int], dark_at: wp.array2d[lanes],
+        slots: wp.array2d[float], channel_slots: wp.array2d[float], sums: wp.array2d[lanes],
         first: int,
     ):  # fmt: skip
         """With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j: dL/da_i = T_i d_i - rest_i / (1 - a_i).
 
-        state `[bands, 8, 16]`: transmittance so far, rest (both start from the end: final transmittance, and that times its own
-        gradient; both 0 where the lane was dark), then the gradients of red, green, blue, sum of w z, sum of w, where it went dark.
+        planes: as forward left them; grads: the same of the loss's derivatives, but T dL/dT for the first.
+        state `[bands, HELD + channels, 16]`: transmittance so far, rest (both start from the end: final transmittance, and that times
+        its own gradient; both 0 where the lane was dark), then the gradients of red, green, blue, sum of w z, sum of w, where it went
+        dark, from HELD on those of the channels. sums `[bands, channels]`, zeroed before: an entry's sums of w g of the channels.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -271,14 +227,13 @@ def composite_gradient(depth: bool, squarings: int):
             for r in range(TILE):
                 since = dark_at[row0 + r, tx]
                 lit = wp.min(wp.max(since - lanes(float(stop - start - 1)), lanes(0.0)), one)
-                state[band, 0, r] = wp.cw_mul(lit, final_t[row0 + r, tx])
-                state[band, 1, r] = wp.cw_mul(lit, t_gradient[row0 + r, tx])
-                state[band, 2, r] = g_r[row0 + r, tx]
-                state[band, 3, r] = g_g[row0 + r, tx]
-                state[band, 4, r] = g_b[row0 + r, tx]
-                if wp.static(depth):
-                    state[band, 5, r] = g_z[row0 + r, tx]
-                    state[band, 6, r] = g_w[row0 + r, tx]
+                state[band, 0, r] = wp.cw_mul(lit, planes[0, row0 + r, tx])
+                state[band, 1, r] = wp.cw_mul(lit, grads[0, row0 + r, tx])
+                for p in range(1, wp.static(wanted.first_channel)):
+                    state[band, 1 + p, r] = grads[p, row0 + r, tx]
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        state[band, HELD + c, r] = grads[wp.static(wanted.first_channel) + c, row0 + r, tx]
                 state[band, 7, r] = since
                 next_dark = wp.max(next_dark, before(float(stop - start), since))
             brighten = wp.max(next_dark)
@@ -286,6 +241,9 @@ def composite_gradient(depth: bool, squarings: int):
                 slot = slot_of[n]
                 for c in range(GRADIENTS):
                     slots[slot, c] = 0.0
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        channel_slots[slot, c] = 0.0
             next_rows = wp.vec2i(0, -1)
             if stop > start:
                 next_rows = row_range(records[ids[stop - 1]], x0, y0)
@@ -297,11 +255,12 @@ def composite_gradient(depth: bool, squarings: int):
                         since = state[band, 7, r]
                         off = since - lanes(brighten)
                         here = one - wp.min(wp.max(off, lanes(0.0) - off), one)
-                        state[band, 0, r] = state[band, 0, r] + wp.cw_mul(here, final_t[row0 + r, tx])
-                        state[band, 1, r] = state[band, 1, r] + wp.cw_mul(here, t_gradient[row0 + r, tx])
+                        state[band, 0, r] = state[band, 0, r] + wp.cw_mul(here, planes[0, row0 + r, tx])
+                        state[band, 1, r] = state[band, 1, r] + wp.cw_mul(here, grads[0, row0 + r, tx])
                         next_dark = wp.max(next_dark, before(brighten, since))
                     brighten = wp.max(next_dark)
-                record = records[ids[n]]
+                i = ids[n]
+                record = records[i]
                 px = record[X] - x0
                 py = record[Y] - y0
                 k = record[K] * wp.static(root)
@@ -342,7 +301,12 @@ def composite_gradient(depth: bool, squarings: int):
                         gg = state[band, 3, r]
                         gb = state[band, 4, r]
                         d = gr * red + gg * green + gb * blue
-                        if wp.static(depth):
+                        if wp.static(wanted.channels):
+                            for c in range(channels):
+                                gc = state[band, HELD + c, r]
+                                d = d + gc * features[i, c]
+                                sums[band, c] = sums[band, c] + wp.cw_mul(w, gc)
+                        if wp.static(wanted.depth):
                             gz = state[band, 5, r]
                             d = d + gz * record[Z] + state[band, 6, r]
                             sum_z = sum_z + wp.cw_mul(w, gz)
@@ -372,6 +336,10 @@ def composite_gradient(depth: bool, squarings: int):
                 k1 = record[K]
                 slope = 2.0 * k1 * k1 * opacity  # dL/ds = -opacity dL/da e throughout
                 slot = slot_of[n]
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        channel_slots[slot, c] = wp.dot(sums[band, c], one)
+                        sums[band, c] = lanes(0.0)
                 slots[slot, G_X] = slope * et
                 slots[slot, G_Y] = 2.0 * record[H] * opacity * edy - slope * m * et
                 slots[slot, G_K] = -2.0 * k1 * opacity * ett

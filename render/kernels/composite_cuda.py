@@ -23,12 +23,15 @@ from render.kernels.types import (
     G_Z,
     GREEN,
     INSTANCE,
+    MEDIAN,
     OPACITY,
     RED,
     S_MAX,
+    WHO,
     H,
     K,
     M,
+    Wanted,
     Window,
     X,
     Y,
@@ -39,15 +42,14 @@ OPTIONS = {"enable_backward": False}
 
 
 @cache
-def composite_blocks(depth: bool, instance: bool, tile_size: int):
+def composite_blocks(wanted: Wanted, tile_size: int):
     """The forward kernel for tiles of `tile_size` pixels square."""
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float], features: wp.array2d[float], channels: int,
         window: Window, alpha_max: float, termination: float,
-        out_t: wp.array2d[float], out_r: wp.array2d[float], out_g: wp.array2d[float], out_b: wp.array2d[float],
-        out_z: wp.array2d[float], out_w: wp.array2d[float], out_instance: wp.array2d[float], last: wp.array2d[int],
+        planes: wp.array3d[float], picks: wp.array3d[float], last: wp.array2d[int],
     ):  # fmt: skip
         tile, thread = wp.tid()
         px = (tile % window.tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
@@ -60,6 +62,10 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
         weights = float(0.0)
         most = float(0.0)
         who = float(-1.0)
+        median = float(0.0)
+        if wp.static(wanted.channels):
+            for c in range(channels):
+                planes[wp.static(wanted.first_channel) + c, py, px] = 0.0
         stop = tile_starts[tile]
         for n in range(tile_starts[tile], tile_starts[tile + 1]):
             if t < termination:
@@ -72,40 +78,48 @@ def composite_blocks(depth: bool, instance: bool, tile_size: int):
                 a = wp.min(records[i, OPACITY] * wp.exp(-s), alpha_max)
                 w = t * a
                 colour += w * wp.vec3(records[i, RED], records[i, GREEN], records[i, BLUE])
-                if wp.static(depth):
+                if wp.static(wanted.depth):
                     z += w * records[i, Z]
                     weights += w
-                if wp.static(instance):  # noqa: SIM102 - a static branch and a dynamic one
+                if wp.static(wanted.channels):  # any number of them: kept in the planes, where neighbours' lie side by side
+                    for c in range(channels):
+                        p = wp.static(wanted.first_channel) + c
+                        planes[p, py, px] = planes[p, py, px] + w * features[i, c]
+                if wp.static(wanted.median):  # noqa: SIM102 - a static branch and a dynamic one
+                    if t >= 0.5 and t - w < 0.5:
+                        median = records[i, Z]
+                if wp.static(wanted.instance):  # noqa: SIM102 - a static branch and a dynamic one
                     if w > most:
                         most = w
                         who = records[i, INSTANCE]
                 t -= w
                 stop = n + 1
-        out_t[py, px] = t
-        out_r[py, px] = colour[0]
-        out_g[py, px] = colour[1]
-        out_b[py, px] = colour[2]
+        planes[0, py, px] = t
+        planes[1, py, px] = colour[0]
+        planes[2, py, px] = colour[1]
+        planes[3, py, px] = colour[2]
         last[py, px] = stop
-        if wp.static(depth):
-            out_z[py, px] = z
-            out_w[py, px] = weights
-        if wp.static(instance):
-            out_instance[py, px] = who
+        if wp.static(wanted.depth):
+            planes[4, py, px] = z
+            planes[5, py, px] = weights
+        if wp.static(wanted.median):
+            picks[MEDIAN, py, px] = median
+        if wp.static(wanted.instance):
+            picks[WHO, py, px] = who
 
     return composite_blocks_forward
 
 
 @cache
-def composite_blocks_gradient(depth: bool, tile_size: int):
+def composite_blocks_gradient(wanted: Wanted, tile_size: int):
     """The backward kernel for tiles of `tile_size` pixels square; arguments as `composite_gradient`, per pixel instead of per row."""
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        window: Window, alpha_max: float,
-        g_r: wp.array2d[float], g_g: wp.array2d[float], g_b: wp.array2d[float], g_z: wp.array2d[float], g_w: wp.array2d[float],
-        last: wp.array2d[int],
-        final_t: wp.array2d[float], t_gradient: wp.array2d[float], slots: wp.array2d[float],
+        features: wp.array2d[float], channels: int, window: Window, alpha_max: float,
+        planes: wp.array3d[float], grads: wp.array3d[float], last: wp.array2d[int],
+        slots: wp.array2d[float], channel_slots: wp.array2d[float],
     ):  # fmt: skip
         tile, thread = wp.tid()
         px = (tile % window.tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
@@ -114,15 +128,15 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
         y = float(window.top * wp.static(tile_size) + py) + 0.5
         start = tile_starts[tile]
         count = tile_starts[tile + 1] - start
-        t = final_t[py, px]
-        rest = t_gradient[py, px]
+        t = planes[0, py, px]
+        rest = grads[0, py, px]
         stop = last[py, px]
-        g = wp.vec3(g_r[py, px], g_g[py, px], g_b[py, px])
+        g = wp.vec3(grads[1, py, px], grads[2, py, px], grads[3, py, px])
         gz = float(0.0)
         gw = float(0.0)
-        if wp.static(depth):
-            gz = g_z[py, px]
-            gw = g_w[py, px]
+        if wp.static(wanted.depth):
+            gz = grads[4, py, px]
+            gw = grads[5, py, px]
         for back in range(count):
             n = start + count - 1 - back
             i = ids[n]
@@ -143,7 +157,10 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
                 t = t * inverse
                 w = t * a
                 d = wp.dot(g, wp.vec3(records[i, RED], records[i, GREEN], records[i, BLUE]))
-                if wp.static(depth):
+                if wp.static(wanted.channels):
+                    for c in range(channels):
+                        d += grads[wp.static(wanted.first_channel) + c, py, px] * features[i, c]
+                if wp.static(wanted.depth):
                     d += gz * records[i, Z] + gw
                 if opacity * e < alpha_max:
                     de = (t * d - rest * inverse) * e
@@ -160,8 +177,13 @@ def composite_blocks_gradient(depth: bool, tile_size: int):
             sum_g = wp.tile_sum(wp.tile(w * g[1]))
             sum_b = wp.tile_sum(wp.tile(w * g[2]))
             sum_z = wp.tile_sum(wp.tile(w * gz))
+            slot = slot_of[n]
+            if wp.static(wanted.channels):
+                for c in range(channels):
+                    sum_c = wp.tile_sum(wp.tile(w * grads[wp.static(wanted.first_channel) + c, py, px]))
+                    if thread == 0:
+                        channel_slots[slot, c] = sum_c[0]
             if thread == 0:
-                slot = slot_of[n]
                 slots[slot, G_X] = sum_x[0]
                 slots[slot, G_Y] = sum_y[0]
                 slots[slot, G_K] = sum_k[0]

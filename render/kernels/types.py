@@ -1,5 +1,7 @@
 """Shared by all kernels: the tile, lane vectors, uniforms, and the layout of a projected splat."""
 
+from typing import NamedTuple
+
 import warp as wp
 
 # Warp's default limits SLP vectorisation to depth four, which costs 1.6x on the composite kernels; without SLP it is 3x.
@@ -21,6 +23,31 @@ X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, INV_K, Y_AT
 GRADIENTS = 10
 """Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
 G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i) for i in range(GRADIENTS))
+
+
+class Wanted(NamedTuple):
+    """What a composite kernel sums up. One is compiled for every combination that is asked for.
+
+    Its planes: T, red, green, blue[, sum of w z, sum of w][, channels ...]; beside them, without gradients, MEDIAN and WHO.
+    """
+
+    depth: bool = False
+    median: bool = False
+    instance: bool = False
+    channels: bool = False
+
+    @property
+    def first_channel(self) -> int:
+        return 6 if self.depth else 4
+
+    @property
+    def picks(self) -> bool:
+        return self.median or self.instance
+
+
+MEDIAN, WHO = 0, 1
+"""Planes that pick one splat a pixel: the depth of the one behind which less than half the light passes, the id of the one that
+weighs most."""
 
 UNIFORM_GRADIENTS = 16
 """Floats of the gradient shared by all splats of an instance: rotation (row major), translation, fx, fy, cx, cy."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from render import RenderConfig
-from render.bridge import Settings
-from render.kernels.types import INV_C, S_MAX, SLACK, TILE, Y_EXT, H, K, M, X, Y
+from render.kernels.types import INV_C, S_MAX, SLACK, TILE, Y_EXT, H, K, M, Wanted, X, Y
+from render.settings import Settings
 from tests.bench.presets import Preset
 from tests.render.test_cuda import keep_forward
 
@@ -17,13 +17,13 @@ OPERATIONS = 23
 def forward_limit(preset: Preset) -> float:
     """Lane operations of a forward composite of a preset of one instance, without termination."""
     (placed,), camera = preset.placed, preset.camera
-    settings = Settings(camera.width, camera.height, preset.model, RenderConfig(), False, False, (0,))
+    settings = Settings(camera.width, camera.height, preset.model, RenderConfig(), Wanted(), (0,))
     pose = torch.linalg.inv(camera.world_from_cam) @ placed.world_from_local
     kept, _ = keep_forward(settings, placed.gaussians, pose, camera.lens)
     lists = kept.parts[0].lists
     total = int(lists.starts[-1])
     tile = torch.repeat_interleave(torch.arange(len(lists.starts) - 1), lists.starts.diff().long())
-    return OPERATIONS * float(rows_of(kept.records[lists.ids[:total].long()].double(), tile, settings.tiles_x).sum())
+    return OPERATIONS * float(rows_of(kept.scene.records[lists.ids[:total].long()].double(), tile, settings.tiles_x).sum())
 
 
 def rows_of(r: torch.Tensor, tile: torch.Tensor, tiles_x: int) -> torch.Tensor:

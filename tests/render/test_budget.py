@@ -75,13 +75,14 @@ def test_a_budget_that_no_picture_can_keep_is_refused(e):
 
 def test_a_looser_budget_draws_less():
     """Entries of the tiles' lists, which is what time goes with: fewer for every step from strict to loose."""
-    from render.bridge import Settings
+    from render.kernels.types import Wanted
+    from render.settings import Settings
     from tests.render.test_cuda import keep_forward
 
     g, camera, model = uniform(3000, 192, 128)
     entries = []
     for e in BUDGETS:
-        settings = Settings(192, 128, model, RenderConfig(max_error=e), False, False, (0,))
+        settings = Settings(192, 128, model, RenderConfig(max_error=e), Wanted(), (0,))
         kept, _ = keep_forward(settings, g, torch.eye(4, dtype=torch.float64), camera.lens)
         entries.append(int(kept.parts[0].lists.starts[-1]))
     assert entries == sorted(entries) and entries[0] < 0.8 * entries[-1], entries

@@ -43,7 +43,7 @@ def walls(count: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_more_than_2_to_the_31_entries_are_counted_and_divided():
     records, counts = walls(5000)
     assert int(counts.sum(dtype=torch.int64)) > 2**32
-    parts = windows(records, counts, 1024, 1024, 1 << 25)
+    parts = windows(records, counts, window(0, 0, 1024, 1024), 1 << 25)
     covered = torch.zeros(1024, 1024, dtype=torch.int32)
     for w in parts:
         assert w.tiles_x * w.tiles_y * 5000 <= 1 << 25
@@ -53,6 +53,6 @@ def test_more_than_2_to_the_31_entries_are_counted_and_divided():
 
 def test_what_fits_is_not_divided():
     records, counts = walls(3)
-    (only,) = windows(records, counts, 1024, 1024, 1 << 25)
+    (only,) = windows(records, counts, window(0, 0, 1024, 1024), 1 << 25)
     whole = window(0, 0, 1024, 1024)
     assert (only.left, only.top, only.tiles_x, only.tiles_y) == (whole.left, whole.top, whole.tiles_x, whole.tiles_y)

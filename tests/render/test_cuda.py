@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from render import rasterize
-from render.bridge import Rasterize, Settings
+from render.bridge import Rasterize
 from render.chunks import window
 from render.frame_types import RenderConfig
 from render.kernels import bin as bin_kernels
@@ -16,22 +16,24 @@ from render.kernels import project as project_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.project_lens import lens_kernels
-from render.kernels.types import GRADIENTS, TILE
+from render.kernels.types import GRADIENTS, TILE, Wanted
 from render.launch import run, run_blocks, view
 from render.order import depth_order, tile_lists
+from render.settings import Settings
 from scenes import Pinhole, SplatModel
 from scenes.poses import translation
 from tests.bench.presets import random_splats
 
-WIDTH, HEIGHT = 37, 29
+WIDTH, HEIGHT, CHANNELS = 37, 29, 3
+EVERYTHING = Wanted(depth=True, median=True, instance=True, channels=True)
 KERNELS = {
     "project": lambda: project_kernels.project,
     "opencv": lambda: lens_kernels(LENS_FUNCTIONS["opencv"], False).forward,
     "moving fisheye": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).forward,
     "moving fisheye backward": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).backward,
     "bin": lambda: bin_kernels.emit_pairs,
-    "composite": lambda: composite_blocks(True, True, TILE),
-    "composite backward": lambda: composite_blocks_gradient(True, TILE),
+    "composite": lambda: composite_blocks(EVERYTHING, TILE),
+    "composite backward": lambda: composite_blocks_gradient(EVERYTHING, TILE),
 }
 
 
@@ -56,11 +58,11 @@ class Captured:
         pass
 
 
-def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole):
+def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole, features=None):
     """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
-    kept.needs_input_grad = (False,) * 8
-    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), *gaussians.tensors().values())
+    kept.needs_input_grad = (False,) * 9
+    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), features, *gaussians.tensors().values())
 
 
 def whole(settings: Settings):
@@ -68,24 +70,25 @@ def whole(settings: Settings):
 
 
 def lane_result():
-    """Forward of the lane kernels with depth and instance: settings, kept state, outputs."""
-    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), True, True, (5,))
-    kept, outputs = keep_forward(settings, random_splats(80, 1), translation(0, 0, 5), Pinhole(30.0, 30.0, 18.0, 14.0))
-    return settings, kept, outputs
+    """Forward of the lane kernels with everything: settings, kept state, outputs."""
+    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), EVERYTHING, (5,))
+    features = torch.randn(80, CHANNELS, generator=torch.Generator().manual_seed(2))
+    return settings, *keep_forward(settings, random_splats(80, 1), translation(0, 0, 5), Pinhole(30.0, 30.0, 18.0, 14.0), features)
 
 
 def test_block_kernels_agree_with_lane_kernels():
     """One pixel a tile and one thread a block: the CUDA kernels' own arithmetic, on the CPU."""
     settings, kept, outputs = lane_result()
     generator = torch.Generator().manual_seed(3)
-    gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:4]]
-    expected = Rasterize.backward(kept, *gradients, None)
+    gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:5]]
+    expected = Rasterize.backward(kept, *gradients, None, None)
 
-    records, (group,), (uniform,) = kept.records, kept.groups, kept.told
-    visible = torch.where(kept.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
+    records, features, (group,), (uniform,) = kept.scene.records, kept.scene.features, kept.groups, kept.told
+    visible = torch.where(kept.scene.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     pixels = WIDTH * HEIGHT
-    everywhere = torch.where(kept.counts > 0, pixels, 0).to(torch.int32)  # every pixel lists every splat: more than the exact lists
-    order = torch.argsort(visible, stable=True)[: int((kept.counts > 0).sum())].to(torch.int32)
+    # every pixel lists every splat: more than the exact lists
+    everywhere = torch.where(kept.scene.counts > 0, pixels, 0).to(torch.int32)
+    order = torch.argsort(visible, stable=True)[: int((kept.scene.counts > 0).sum())].to(torch.int32)
     n = len(order)
     starts = torch.arange(pixels + 1, dtype=torch.int32) * n
     ids = order.repeat(pixels)
@@ -93,31 +96,27 @@ def test_block_kernels_agree_with_lane_kernels():
     first_slot[order.long()] = torch.arange(n, dtype=torch.int32) * pixels
     slot_of = (torch.arange(n)[None] * pixels + torch.arange(pixels)[:, None]).reshape(-1).to(torch.int32)
 
-    planes = torch.empty(7, HEIGHT, WIDTH)
+    planes = torch.empty(EVERYTHING.first_channel + CHANNELS, HEIGHT, WIDTH)
+    picks = torch.empty(2, HEIGHT, WIDTH)
     last = torch.empty(HEIGHT, WIDTH, dtype=torch.int32)
     lists = [view(starts, int), view(ids, int)]
     limits = [settings.alpha_max, settings.config.termination]
-    args = [*lists, view(records, float), window(0, 0, WIDTH, HEIGHT), *limits, *(view(p, float) for p in planes), view(last, int)]
+    scene = [view(records, float), view(features, float), CHANNELS, window(0, 0, WIDTH, HEIGHT)]
     cpu = torch.device("cpu")
-    run_blocks(composite_blocks(True, True, 1), pixels, 1, args, cpu)
-    rgb, alpha, z, weights, instance = outputs
+    args = [*lists, *scene, *limits, view(planes, float), view(picks, float), view(last, int)]
+    run_blocks(composite_blocks(EVERYTHING, 1), pixels, 1, args, cpu)
+    rgb, alpha, z, weights, channels, median, instance = outputs
     assert torch.allclose(planes[1:4], rgb, atol=2e-5) and torch.allclose(1 - planes[0], alpha, atol=2e-5)
     assert torch.allclose(planes[4], z, atol=2e-4) and torch.allclose(planes[5], weights, atol=2e-5)
-    assert (torch.where(alpha < 0.5, -1, planes[6]).int() != instance).float().mean() < 0.002
+    assert torch.allclose(planes[6:], channels, atol=2e-5)
+    assert (picks[0] != median).float().mean() < 0.002
+    assert (torch.where(alpha < 0.5, -1, picks[1]).int() != instance).float().mean() < 0.002
 
-    g_rgb, g_alpha, g_z, g_w = gradients
-    slots = torch.empty(n * pixels, GRADIENTS)
-    backs = [*g_rgb, g_z, g_w]
-    t_gradient = -g_alpha * planes[0]
-    args = [*lists, view(slot_of, int), view(records, float), window(0, 0, WIDTH, HEIGHT), settings.alpha_max]
-    args += [
-        *(view(p.contiguous(), float) for p in backs),
-        view(last, int),
-        view(planes[0], float),
-        view(t_gradient, float),
-        view(slots, float),
-    ]
-    run_blocks(composite_blocks_gradient(True, 1), pixels, 1, args, cpu)
+    g_rgb, g_alpha, g_z, g_w, g_channels = gradients
+    slots, channel_slots = torch.empty(n * pixels, GRADIENTS), torch.empty(n * pixels, CHANNELS)
+    grads = torch.cat([-(g_alpha * planes[0])[None], g_rgb, g_z[None], g_w[None], g_channels])
+    args = [*lists, view(slot_of, int), *scene, settings.alpha_max, view(planes, float), view(grads, float), view(last, int)]
+    run_blocks(composite_blocks_gradient(EVERYTHING, 1), pixels, 1, [*args, view(slots, float), view(channel_slots, float)], cpu)
     out = [torch.empty_like(t) for t in group]
     shared = torch.empty(2, 16)
     types = [wp.vec3, wp.vec4, wp.vec3, float, wp.vec3]
@@ -125,22 +124,24 @@ def test_block_kernels_agree_with_lane_kernels():
     results = [view(t, d) for t, d in zip(out, types, strict=True)]
     tail = [view(everywhere, int), view(first_slot, int), view(slots, float), *results, view(shared, float)]
     run(project_kernels.project_backward, 2, [*fields, *uniform, len(records), 64, *tail], cpu)
-    for mine, reference in zip(out, expected[3:], strict=True):
+    g_features = torch.zeros_like(features)
+    g_features[order.long()] = channel_slots.reshape(n, pixels, CHANNELS).sum(1)
+    for mine, reference in zip([g_features, *out], expected[3:], strict=True):
         assert (mine - reference).abs().max() < 1e-3 * reference.abs().max()
 
 
 def test_sorted_pairs_make_the_same_lists_as_counting():
     """CUDA's way from depth order to tile lists (emit pairs, stable sort by tile), on the CPU, against the counting pass."""
     settings, kept, _ = lane_result()
-    keys = torch.where(kept.counts > 0, kept.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
-    box = kept.counts + (kept.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
+    keys = torch.where(kept.scene.counts > 0, kept.scene.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
+    box = kept.scene.counts + (kept.scene.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
     count, pair = box.clone(), box.clone()
-    counted = tile_lists(kept.records, depth_order(keys), count, whole(settings))
-    paired = tile_lists(kept.records, depth_order(keys), pair, whole(settings), counting=False)
-    assert torch.equal(count, kept.counts) and torch.equal(pair, kept.counts)
+    counted = tile_lists(kept.scene.records, depth_order(keys), count, whole(settings))
+    paired = tile_lists(kept.scene.records, depth_order(keys), pair, whole(settings), counting=False)
+    assert torch.equal(count, kept.scene.counts) and torch.equal(pair, kept.scene.counts)
     total = int(counted.starts[-1])
-    assert total == int(kept.counts.sum()) > 100
-    drawn = kept.counts > 0
+    assert total == int(kept.scene.counts.sum()) > 100
+    drawn = kept.scene.counts > 0
     assert torch.equal(counted.first_slot[drawn], paired.first_slot[drawn])
     assert torch.equal(counted.starts, paired.starts)
     for name in ("ids", "slot_of"):

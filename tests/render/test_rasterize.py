@@ -310,24 +310,24 @@ def test_two_threads_may_render_at_once():
 @pytest.mark.parametrize("seed", range(6))
 def test_a_tile_lists_a_splat_exactly_when_one_of_its_pixels_shows_it(seed):
     """Round splats, needles at all angles, giants and dots. A few tiles more are allowed: a needle passes between pixel centres."""
-    from render.bridge import Settings
-    from render.kernels.types import TILE
+    from render.kernels.types import TILE, Wanted
+    from render.settings import Settings
     from tests.render.test_cuda import keep_forward
 
     generator = torch.Generator().manual_seed(seed)
     g = random_splats(150, seed)
     shape = torch.tensor([0.0, -4.0, -4.0]) + 2.5 * torch.randn(150, 3, generator=generator)
-    settings = Settings(150, 100, SplatModel(projection="ewa"), RenderConfig(), False, False, (0,))
+    settings = Settings(150, 100, SplatModel(projection="ewa"), RenderConfig(), Wanted(), (0,))
     kept, _ = keep_forward(settings, replace(g, log_scales=shape), translation(0, 0, 6), Pinhole(120.0, 120.0, 75.0, 50.0))
-    x, y, k, m, h, _, s_max = kept.records[:, :7].double().unbind(1)
+    x, y, k, m, h, _, s_max = kept.scene.records[:, :7].double().unbind(1)
     rows, columns = torch.meshgrid(torch.arange(settings.tiles_y * TILE) + 0.5, torch.arange(settings.tiles_x * TILE) + 0.5, indexing="ij")
     listed = torch.zeros(len(g), settings.tiles_x * settings.tiles_y, dtype=torch.bool)
     total = int(kept.parts[0].lists.starts[-1])
     tile = torch.repeat_interleave(torch.arange(listed.shape[1]), kept.parts[0].lists.starts.diff().long())
     listed[kept.parts[0].lists.ids[:total].long(), tile] = True
-    assert total == int(listed.sum()) == int(kept.counts.sum()), "an entry twice, or a count that lies"
+    assert total == int(listed.sum()) == int(kept.scene.counts.sum()), "an entry twice, or a count that lies"
     reached = 0
-    for i in torch.nonzero(kept.counts > 0).flatten():
+    for i in torch.nonzero(kept.scene.counts > 0).flatten():
         dx, dy = columns.double() - x[i], rows.double() - y[i]
         s = (k[i] * (dx - m[i] * dy)).square() + h[i] * dy.square()
         by_tile = s.reshape(settings.tiles_y, TILE, settings.tiles_x, TILE).amin((1, 3)).flatten()

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import torch
 
-import render.bridge as bridge
-from render import RenderConfig, rasterize
+from render import RenderConfig, bridge, compositing, rasterize
 from scenes import Camera, Gaussians, Pinhole, Placed
 from scenes.poses import translation
 from tests.bench.presets import random_splats
@@ -59,16 +58,17 @@ def a_render_interrupted_at_any_stage(device: str) -> list[str]:
     def fail(*_arguments, **_more):
         raise KeyboardInterrupt
 
-    for stage in ("run", "depth_order", "tile_lists", "_composite", "_composite_backward", "_part_gradients"):
-        kept = getattr(bridge, stage)
-        setattr(bridge, stage, fail)
+    stages = [(bridge, "run"), (bridge, "depth_order"), (compositing, "tile_lists"), (compositing, "_composite")]
+    for room, stage in [*stages, (compositing, "_composite_backward"), (compositing, "_of_part")]:
+        kept = getattr(room, stage)
+        setattr(room, stage, fail)
         try:
             differentiate(placed)
             wrong.append(f"{stage} was not reached")
         except KeyboardInterrupt:
             pass
         finally:
-            setattr(bridge, stage, kept)
+            setattr(room, stage, kept)
         if torch.get_num_threads() != threads:
             wrong.append(f"after {stage}: {torch.get_num_threads()} threads, not {threads}")
         if not same(before, differentiate(placed)):

@@ -1,0 +1,199 @@
+"""From projected records to planes of the picture, and back to gradient slots: window by window, on the CPU's lanes or CUDA's blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from render.chunks import Sums, add_to, room_in, window, windows
+from render.kernels.composite import HELD, composite, composite_gradient
+from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
+from render.kernels.types import GRADIENTS, TILE, Window, lanes
+from render.launch import BANDS, run, run_blocks, view
+from render.order import TileLists, tile_lists
+from render.settings import Settings
+
+
+@dataclass(frozen=True)
+class Projected:
+    """All splats on the image: records `[N, RECORD]`, counts int32 `[N]` of tiles at most, the visible ones' order, features `[N, C]`."""
+
+    records: torch.Tensor
+    counts: torch.Tensor
+    order: torch.Tensor
+    features: torch.Tensor | None
+
+    @property
+    def channels(self) -> int:
+        return 0 if self.features is None else self.features.shape[1]
+
+
+@dataclass
+class Part:
+    """A window of the image, as drawn: its lists and their exact counts (None where backward shall make them again, to save memory),
+    where compositing ended, and its planes, of which backward reads the final transmittance."""
+
+    window: Window
+    lists: TileLists | None
+    counts: torch.Tensor | None
+    ends: tuple[torch.Tensor, ...]
+    planes: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Planes `[4.., h, w]` and picks `[0 or 2, h, w]` (`kernels.types.Wanted`), and what backward needs of each part."""
+
+    planes: torch.Tensor
+    picks: torch.Tensor
+    parts: list[Part]
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Gradients of the records: those of record j are values[starts[j] : starts[j] + counts[j]], to be summed; channels `[N, C]` are."""
+
+    counts: torch.Tensor
+    starts: torch.Tensor
+    values: torch.Tensor
+    channels: torch.Tensor | None
+
+
+def draw(settings: Settings, scene: Projected) -> Picture:
+    """The picture, or the crop of it that is wanted."""
+    x, y, width, height = settings.crop or (0, 0, settings.width, settings.height)
+    left, top = x // TILE, y // TILE
+    whole = window(left, top, -(-(x + width) // TILE) - left, -(-(y + height) // TILE) - top)
+    parts: list[Part] = []
+    divided = windows(scene.records, scene.counts, whole, settings.config.most_entries)
+    planes = picks = scene.records
+    for w in divided:
+        lists, counts = _lists(settings, scene, w, alone=len(divided) == 1)
+        drawn, picked, ends = _composite(settings, w, lists, scene)
+        if len(divided) == 1:
+            planes, picks = drawn, picked
+            parts.append(Part(w, lists, counts, ends, drawn))
+        else:
+            if not parts:
+                planes, picks = (p.new_empty(len(p), whole.tiles_y * TILE, whole.tiles_x * TILE) for p in (drawn, picked))
+            for all_of_it, part in ((planes, drawn), (picks, picked)):
+                _inside(all_of_it, w, whole).copy_(part[..., : w.tiles_x * TILE])
+            parts.append(Part(w, None, None, ends, drawn))
+    dx, dy = x - left * TILE, y - top * TILE
+    return Picture(planes[..., dy : dy + height, dx : dx + width], picks[..., dy : dy + height, dx : dx + width], parts)
+
+
+def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradients: Sequence[torch.Tensor | None]) -> Slots:
+    """gradients: dL/d planes in the planes' order `[.., h, w]`; None for those that are not wanted."""
+    device = scene.records.device
+    sums = Sums(scene.counts) if len(parts) > 1 else None
+    g_features = None if scene.features is None else torch.zeros_like(scene.features)
+    wanted = [g if g.ndim == 3 else g[None] for g in gradients if g is not None]
+    for part in parts:
+        lists, counts = part.lists, part.counts
+        if lists is None or counts is None:
+            lists, counts = _lists(settings, scene, part.window, alone=False)
+        slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
+        channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
+        _composite_backward(settings, part, lists, scene, _of_part(settings, part, wanted), slots, channel_slots)
+        if g_features is not None:
+            add_to(g_features, counts, lists, channel_slots)
+        if sums is None:
+            return Slots(counts, lists.first_slot, slots, g_features)
+        sums.add(counts, lists, slots)
+    assert sums is not None
+    return Slots(sums.counts, sums.starts, sums.slots, g_features)
+
+
+def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tuple[TileLists, torch.Tensor]:
+    """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up."""
+    counts = scene.counts if alone and settings.crop is None else room_in(scene.records, scene.counts, w)
+    return tile_lists(scene.records, scene.order, counts, w, counting=scene.records.device.type == "cpu"), counts
+
+
+def _planes(w: Window, count: int, device) -> torch.Tensor:
+    """Row-major planes `[count, rows, pitch * 16]` of a window, not initialised: the kernels write every pixel of every tile.
+
+    A stored row has an odd number of tiles, so that the 16 rows of a tile do not fall into one cache set on wide images.
+    """
+    return torch.empty(count, w.tiles_y * TILE, (w.tiles_x | 1) * TILE, device=device)
+
+
+def _inside(planes: torch.Tensor, w: Window, whole: Window) -> torch.Tensor:
+    """The window's pixels of planes of a whole."""
+    top, left = (w.top - whole.top) * TILE, (w.left - whole.left) * TILE
+    return planes[..., top : top + w.tiles_y * TILE, left : left + w.tiles_x * TILE]
+
+
+def _of_part(settings: Settings, part: Part, gradients: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The window's planes of dL/d plane, with T dL/dT for the first; 0 beyond the image."""
+    x, y, width, height = settings.crop or (0, 0, settings.width, settings.height)
+    w = part.window
+    left, top = w.left * TILE - x, w.top * TILE - y  # of the window in the picture; negative where it begins before
+    columns, rows = slice(max(left, 0), left + w.tiles_x * TILE), slice(max(top, 0), top + w.tiles_y * TILE)
+    planes = _planes(w, sum(len(g) for g in gradients), part.planes.device).zero_()
+    first = 0
+    for g in gradients:
+        inside = g[:, rows, columns]
+        down, right = max(-top, 0), max(-left, 0)
+        planes[first : first + len(g), down : down + inside.shape[1], right : right + inside.shape[2]] = inside
+        first += len(g)
+    planes[0].mul_(part.planes[0])
+    return planes
+
+
+def _lanes_of(planes: torch.Tensor):
+    """Planes `[.., rows, pitch * 16]` as lane vectors."""
+    return view(planes.view(*planes.shape[:-1], planes.shape[-1] // TILE, TILE), lanes)
+
+
+def _features(scene: Projected) -> list:
+    features = scene.records.new_empty(1, 1) if scene.features is None else scene.features
+    return [view(features, float), scene.channels]
+
+
+def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected):
+    """Planes, picks, and where compositing ended: one past the last entry of each row, and where in the tile's list each pixel went
+    dark (CPU); one past the last entry of each pixel (CUDA)."""
+    device = scene.records.device
+    planes = _planes(w, settings.wanted.first_channel + scene.channels, device)
+    picks = _planes(w, 2 if settings.wanted.picks else 0, device)
+    lists_of = [view(lists.starts, int), view(lists.ids, int)]
+    limits = [settings.alpha_max, settings.termination]
+    if device.type == "cuda":
+        last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
+        kernel = composite_blocks(settings.wanted, TILE)
+        args = [*lists_of, view(scene.records, float), *_features(scene), w, *limits, view(planes, float), view(picks, float)]
+        run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(last, int)], device)
+        return planes, picks, (last,)
+    last = torch.empty(planes.shape[1], planes.shape[2] // TILE, dtype=torch.int32)
+    dark_at = _planes(w, 1, device)[0]
+    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels)]
+    out = [_lanes_of(planes), _lanes_of(picks), view(last, int), _lanes_of(dark_at)]
+    run(composite(settings.wanted, settings.squarings), BANDS, [*args, *out], device)
+    return planes, picks, (last, dark_at)
+
+
+def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene: Projected, grads, slots, channel_slots) -> None:
+    """Fill the gradient slots of the window's entries; grads are planes as of `_of_part`."""
+    device, w = scene.records.device, part.window
+    lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int)]
+    out = [view(slots, float), view(channel_slots, float)]
+    if device.type == "cuda":
+        kernel = composite_blocks_gradient(settings.wanted, TILE)
+        args = [*lists_of, view(scene.records, float), *_features(scene), w, settings.alpha_max, view(part.planes, float)]
+        run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(grads, float), view(part.ends[0], int), *out], device)
+        return
+    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
+    sums = view(torch.zeros(BANDS, max(scene.channels, 1), TILE), lanes)
+    ends = [view(part.ends[0], int), _lanes_of(part.ends[1])]
+    kernel = composite_gradient(settings.wanted, settings.squarings)
+    run(kernel, BANDS, [*args, _lanes_of(part.planes), _lanes_of(grads), *ends, *out, sums], device)
+
+
+def _working(channels: int) -> list:
+    """The column ramp, and working rows of the tile at hand for each band."""
+    ramp = torch.arange(TILE, dtype=torch.float32)[None]
+    return [view(ramp, lanes), view(torch.empty(BANDS, int(HELD) + channels, TILE, TILE), lanes)]

@@ -1,0 +1,65 @@
+"""What stays the same during one call of the rasterizer, and the kernels' limits that follow from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from render.frame_types import RenderConfig
+from render.kernels.types import TILE, Wanted
+from scenes.gaussians import SplatModel
+from scenes.lenses import Lens, Pinhole
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Image size, model, config, what is wanted, each instance's id, lens type, and what the shutter does.
+
+    crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask `[h, w]` bool: which of its
+    pixels are drawn.
+    """
+
+    width: int
+    height: int
+    model: SplatModel
+    config: RenderConfig
+    wanted: Wanted
+    instances: tuple[int, ...]
+    lens: type[Lens] = Pinhole
+    shutter: str = "global"
+    rolling: bool = False
+    crop: tuple[int, int, int, int] | None = None
+    mask: torch.Tensor | None = None
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // TILE)
+
+    @property
+    def tiles_y(self) -> int:
+        return -(-self.height // TILE)
+
+    @property
+    def cutoff(self) -> float:
+        return max(self.config.alpha_cutoff, 1e-10)
+
+    @property
+    def squarings(self) -> int:
+        """How often exp's polynomial is squared, so that its argument stays within 0.75."""
+        return max(3, math.ceil(math.log2(-math.log(self.cutoff) / 0.75)))
+
+    @property
+    def least_opacity(self) -> float:
+        """Splats up to this opacity are not drawn: all below the cutoff, or, where faint ones have cutoffs of their own, far below it."""
+        return self.cutoff if self.config.faint <= self.cutoff else self.cutoff / 64
+
+    @property
+    def alpha_max(self) -> float:
+        return min(self.config.alpha_max, 1 - 1e-6)
+
+    @property
+    def termination(self) -> float:
+        """Transmittance below which a pixel is done. Not 0: backward divides by what is left, so nothing may underflow."""
+        return max(self.config.termination, 1e-10)
