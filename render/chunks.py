@@ -23,7 +23,7 @@ def window(left: int, top: int, tiles_x: int, tiles_y: int) -> Window:
 
 
 def windows(records: torch.Tensor, counts: torch.Tensor, whole: Window, most: int) -> list[Window]:
-    """The whole, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in the image at least."""
+    """The whole, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in it."""
     return [whole] if int(counts.sum(dtype=torch.int64)) <= most else _halved(records, counts, whole, most)
 
 

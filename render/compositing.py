@@ -63,9 +63,8 @@ class Slots:
 
 def draw(settings: Settings, scene: Projected) -> Picture:
     """The picture, or the crop of it that is wanted."""
-    x, y, width, height = settings.crop or (0, 0, settings.width, settings.height)
-    left, top = x // TILE, y // TILE
-    whole = window(left, top, -(-(x + width) // TILE) - left, -(-(y + height) // TILE) - top)
+    x, y, width, height = settings.part
+    whole = window(settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y)
     parts: list[Part] = []
     divided = windows(scene.records, scene.counts, whole, settings.config.most_entries)
     planes = picks = scene.records
@@ -81,8 +80,13 @@ def draw(settings: Settings, scene: Projected) -> Picture:
             for all_of_it, part in ((planes, drawn), (picks, picked)):
                 _inside(all_of_it, w, whole).copy_(part[..., : w.tiles_x * TILE])
             parts.append(Part(w, None, None, ends, drawn))
-    dx, dy = x - left * TILE, y - top * TILE
-    return Picture(planes[..., dy : dy + height, dx : dx + width], picks[..., dy : dy + height, dx : dx + width], parts)
+    dx, dy = x - whole.left * TILE, y - whole.top * TILE
+    planes, picks = (p[..., dy : dy + height, dx : dx + width] for p in (planes, picks))
+    if settings.mask is not None:  # as if nothing stood where it is False
+        here = settings.mask[settings.of_image]
+        planes = torch.cat([planes[:1].where(here, 1), planes[1:].where(here, 0)])
+        picks = picks.where(here, 0)
+    return Picture(planes, picks, parts)
 
 
 def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradients: Sequence[torch.Tensor | None]) -> Slots:
@@ -91,6 +95,8 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     sums = Sums(scene.counts) if len(parts) > 1 else None
     g_features = None if scene.features is None else torch.zeros_like(scene.features)
     wanted = [g if g.ndim == 3 else g[None] for g in gradients if g is not None]
+    if settings.mask is not None:
+        wanted = [g.where(settings.mask[settings.of_image], 0) for g in wanted]
     for part in parts:
         lists, counts = part.lists, part.counts
         if lists is None or counts is None:
@@ -109,8 +115,9 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
 
 def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tuple[TileLists, torch.Tensor]:
     """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up."""
-    counts = scene.counts if alone and settings.crop is None else room_in(scene.records, scene.counts, w)
-    return tile_lists(scene.records, scene.order, counts, w, counting=scene.records.device.type == "cpu"), counts
+    counts = scene.counts if alone else room_in(scene.records, scene.counts, w)
+    drawn = settings.drawn_tiles().to(counts.device)
+    return tile_lists(scene.records, scene.order, counts, w, drawn, counting=counts.device.type == "cpu"), counts
 
 
 def _planes(w: Window, count: int, device) -> torch.Tensor:
@@ -129,9 +136,9 @@ def _inside(planes: torch.Tensor, w: Window, whole: Window) -> torch.Tensor:
 
 def _of_part(settings: Settings, part: Part, gradients: Sequence[torch.Tensor]) -> torch.Tensor:
     """The window's planes of dL/d plane, with T dL/dT for the first; 0 beyond the image."""
-    x, y, width, height = settings.crop or (0, 0, settings.width, settings.height)
     w = part.window
-    left, top = w.left * TILE - x, w.top * TILE - y  # of the window in the picture; negative where it begins before
+    # of the window in the picture; negative where it begins before it
+    left, top = w.left * TILE - settings.part[0], w.top * TILE - settings.part[1]
     columns, rows = slice(max(left, 0), left + w.tiles_x * TILE), slice(max(top, 0), top + w.tiles_y * TILE)
     planes = _planes(w, sum(len(g) for g in gradients), part.planes.device).zero_()
     first = 0

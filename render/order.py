@@ -40,10 +40,13 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
     return pair[1, :n]
 
 
-def tile_lists(records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, counting: bool = True) -> TileLists:
+def tile_lists(
+    records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, drawn: torch.Tensor, counting: bool = True
+) -> TileLists:
     """Deal the visible records, sorted by depth, to the window's tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
-    counts `[N]`: entries to set aside for each record; replaced by how many it has.
+    counts `[N]`: entries to set aside for each record; replaced by how many it has. drawn int32 `[tiles_y, tiles_x]` of the image: 0 for
+    tiles that shall have no entries.
     """
     device, tiles = records.device, window.tiles_x * window.tiles_y
     visible = order.shape[0]
@@ -58,7 +61,7 @@ def tile_lists(records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor,
         chunk = -(-visible // CHUNKS)
         histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
         tile_keys = torch.empty(total, dtype=torch.int32)
-        args = [view(records, float), view(order, int), visible, chunk, window, view(first_slot, int)]
+        args = [view(records, float), view(order, int), visible, chunk, window, view(drawn, int), view(first_slot, int)]
         run(count_chunks, CHUNKS, [*args, view(counts, int), view(histogram, int), view(tile_keys, int)], device)
         by_tile = histogram.t().reshape(-1)
         after = by_tile.cumsum(0, dtype=torch.int32)
@@ -69,7 +72,7 @@ def tile_lists(records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor,
     elif total:
         pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
         owner = torch.empty(total, dtype=torch.int32, device=device)
-        args = [view(records, float), view(order, int), window, view(first_slot, int), view(counts, int)]
+        args = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int)]
         run(emit_pairs, visible, [*args, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
         sort_pairs(pair[0], pair[1], total)
         slot_of = pair[1, :total].clone()

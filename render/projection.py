@@ -150,7 +150,7 @@ def _view(settings: Settings, lens: Lens, sh_count: int) -> View:
         v.clamp_left, v.clamp_right, v.clamp_top, v.clamp_bottom = left - half_x, right + half_x, top - half_y, bottom + half_y
         margin = 4 * math.sqrt(settings.model.dilation) + 1
         v.left, v.right, v.top, v.bottom = view_box(lens, settings.width, settings.height, margin)
-    v.tiles_x, v.tiles_y = settings.tiles_x, settings.tiles_y
+    v.tile_left, v.tile_top, v.tiles_x, v.tiles_y = settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
     v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
     v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count

@@ -31,6 +31,8 @@ def rasterize(
     model: SplatModel = ...,
     config: RenderConfig = ...,
     features: Features | None = ...,
+    crop: tuple[int, int, int, int] | None = ...,
+    mask: torch.Tensor | None = ...,
 ) -> Frame: ...
 @overload
 def rasterize(
@@ -42,6 +44,8 @@ def rasterize(
     model: SplatModel = ...,
     config: RenderConfig = ...,
     features: Features | None = ...,
+    crop: tuple[int, int, int, int] | None = ...,
+    mask: torch.Tensor | None = ...,
 ) -> list[Frame]: ...
 def rasterize(
     splats: Gaussians | Placed | Sequence[Placed],
@@ -52,30 +56,33 @@ def rasterize(
     model: SplatModel = SplatModel(),  # noqa: B008 - frozen
     config: RenderConfig = RenderConfig(),  # noqa: B008 - frozen
     features: Features | None = None,
+    crop: tuple[int, int, int, int] | None = None,
+    mask: torch.Tensor | None = None,
 ) -> Frame | list[Frame]:
     """Draw Gaussian splats (Kerbl et al. 2023) as `camera` sees them; one Frame a camera.
 
     splats: in the world, or placed in it; quaternions of any length; nothing is changed. outputs: names of the fields of `Frame`; what is
     not asked for is None and costs nothing. background: `[3]` or `[H, W, 3]`; black otherwise, with rgb premultiplied. flow_to: the
     placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose. features: a further
-    field of the splats, `[N, C]` with C to 128, or one for each of the placed.
+    field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
+    the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
+    nothing stands.
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
     instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. ValueError for what
     cannot be drawn.
     """
     if not isinstance(camera, Camera):
-        return [rasterize(splats, c, outputs, background, flow_to, model, config, features) for c in camera]
+        return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask) for c in camera]
     outputs = check_outputs(outputs)
     placed = _as_placed(splats)
     _check(placed, camera, outputs, flow_to, model)
-    if background is not None:
-        check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
+    _check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
-        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features)
+        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features, crop, mask)
 
 
-def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features) -> Frame:
+def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
     cam_from_local = poses(camera, placed)
     summed = channel_fields(outputs, placed, cam_from_local[:, 0], features)
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
@@ -89,6 +96,8 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         lens=type(camera.lens),
         shutter=camera.shutter,
         rolling=moves(camera, placed),
+        crop=crop,
+        mask=mask,
     )
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
     channels = torch.cat(list(summed.values()), 1) if summed else None
@@ -97,7 +106,8 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
     frame: dict[str, torch.Tensor] = {"alpha": alpha, "instance": instance}
     frame["rgb"] = rgb.permute(1, 2, 0)
     if background is not None and "rgb" in outputs:
-        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * background
+        behind = background if background.ndim == 1 else background[settings.of_image]
+        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind
     if settings.wanted.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
         drawn = weights > 0
@@ -111,10 +121,10 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         frame["normal"] = unit(frame["normal"])
     for way in {o.split("_")[1] for o in outputs if o.startswith(("flow_", "visible_"))}:
         there, other = flow_to[way]
-        same = correspond(placed, camera, frame["depth"].detach(), instance, there, other)
+        same = correspond(placed, camera, frame["depth"].detach(), instance, there, other, settings.part[:2])
         frame[f"flow_{way}"] = same.flow
         if f"visible_{way}" in outputs:
-            shown = _draw(_as_placed(there), other, ("depth",), None, {}, model, config, None).depth
+            shown = _draw(_as_placed(there), other, ("depth",), None, {}, model, config).depth
             assert shown is not None
             frame[f"visible_{way}"] = same.visible(shown.detach())
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
@@ -125,6 +135,18 @@ def _as_placed(splats) -> list[Placed]:
         splats = Placed(splats, torch.eye(4, dtype=torch.float64))
     placed = [splats] if isinstance(splats, Placed) else list(splats)
     return placed or [Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64))]
+
+
+def _check_part(camera: Camera, background, crop, mask) -> None:
+    if background is not None:
+        check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
+    if mask is not None:
+        check_tensor("mask", mask, (camera.height, camera.width), torch.bool)
+    if crop is not None:
+        x, y, width, height = crop
+        if not (x >= 0 and y >= 0 and width >= 1 and height >= 1 and x + width <= camera.width and y + height <= camera.height):
+            size = f"{camera.width}x{camera.height}"
+            raise ValueError(f"crop must be x, y, width, height of a part of the image, which has {size} pixels, got {crop}")
 
 
 def _check(placed, camera, outputs, flow_to, model) -> None:

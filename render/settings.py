@@ -17,8 +17,8 @@ from scenes.lenses import Lens, Pinhole
 class Settings:
     """Image size, model, config, what is wanted, each instance's id, lens type, and what the shutter does.
 
-    crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask `[h, w]` bool: which of its
-    pixels are drawn.
+    crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask bool `[H, W]` of the whole
+    image: which pixels are drawn.
     """
 
     width: int
@@ -34,12 +34,39 @@ class Settings:
     mask: torch.Tensor | None = None
 
     @property
+    def part(self) -> tuple[int, int, int, int]:
+        """x, y, width, height of what is drawn."""
+        return self.crop or (0, 0, self.width, self.height)
+
+    @property
+    def tile_left(self) -> int:
+        return self.part[0] // TILE
+
+    @property
+    def tile_top(self) -> int:
+        return self.part[1] // TILE
+
+    @property
     def tiles_x(self) -> int:
-        return -(-self.width // TILE)
+        """Tiles that are drawn, from `tile_left` on: the grid is anchored at the image's origin, whatever the crop."""
+        return -(-(self.part[0] + self.part[2]) // TILE) - self.tile_left
 
     @property
     def tiles_y(self) -> int:
-        return -(-self.height // TILE)
+        return -(-(self.part[1] + self.part[3]) // TILE) - self.tile_top
+
+    @property
+    def of_image(self) -> tuple[slice, slice]:
+        """Rows and columns of what is drawn."""
+        x, y, width, height = self.part
+        return slice(y, y + height), slice(x, x + width)
+
+    def drawn_tiles(self) -> torch.Tensor:
+        """int32 `[rows, columns]` of all the image's tiles: 0 for those without a pixel of the mask."""
+        if self.mask is None:
+            return torch.ones(-(-self.height // TILE), -(-self.width // TILE), dtype=torch.int32)
+        pixels = self.mask[None, None].to(torch.float32)
+        return torch.nn.functional.max_pool2d(pixels, TILE, ceil_mode=True)[0, 0].to(torch.int32)
 
     @property
     def cutoff(self) -> float:

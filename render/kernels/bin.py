@@ -27,12 +27,6 @@ def span_within(centre: float, reach: float, start: int, tiles: int):
 
 
 @wp.func
-def tile_span(centre: float, reach: float, tiles: int):
-    """`span_within` all tiles of the image."""
-    return span_within(centre, reach, 0, tiles)
-
-
-@wp.func
 def tile_columns(records: wp.array2d[float], j: int, ty: int, window: Window):
     """First and last tile of tile row ty that the ellipse reaches: its extreme x over the row's span of y."""
     x = records[j, X]
@@ -77,12 +71,12 @@ def add_slots(
 
 @wp.kernel
 def count_chunks(
-    records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, window: Window, starts: wp.array[int],
-    counts: wp.array[int], histogram: wp.array2d[int], tile_keys: wp.array[int],
+    records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, window: Window, drawn: wp.array2d[int],
+    starts: wp.array[int], counts: wp.array[int], histogram: wp.array2d[int], tile_keys: wp.array[int],
     first: int,
 ):  # fmt: skip
     """A thread takes one chunk of the depth-ordered splats: the tile of every slot, each splat's exact count, and the histogram
-    `[chunks, tiles]` of entries a tile, zeroed before."""
+    `[chunks, tiles]` of entries a tile, zeroed before. drawn: 0 for tiles of the image that shall have no entries."""
     part = first + wp.tid()
     for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
         j = order[d]
@@ -92,10 +86,11 @@ def count_chunks(
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(records, j, ty, window)
             for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
-                tile = (ty - window.top) * window.tiles_x + tx - window.left
-                tile_keys[slot] = tile
-                histogram[part, tile] = histogram[part, tile] + 1
-                slot += 1
+                if drawn[ty, tx] != 0:
+                    tile = (ty - window.top) * window.tiles_x + tx - window.left
+                    tile_keys[slot] = tile
+                    histogram[part, tile] = histogram[part, tile] + 1
+                    slot += 1
         counts[j] = slot - starts[j]
 
 
@@ -119,7 +114,7 @@ def emit_chunks(
 
 @wp.kernel
 def emit_pairs(
-    records: wp.array2d[float], order: wp.array[int], window: Window, starts: wp.array[int],
+    records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int], starts: wp.array[int],
     counts: wp.array[int], tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
     first: int,
 ):  # fmt: skip
@@ -131,10 +126,11 @@ def emit_pairs(
     for ty in range(rows[0], rows[1] + 1):
         columns = tile_columns(records, j, ty, window)
         for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
-            tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left
-            slot_of[slot] = slot
-            owner[slot] = j
-            slot += 1
+            if drawn[ty, tx] != 0:
+                tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left
+                slot_of[slot] = slot
+                owner[slot] = j
+                slot += 1
     for spare in range(slot, end):
         tile_keys[spare] = window.tiles_x * window.tiles_y  # behind every tile
         slot_of[spare] = spare

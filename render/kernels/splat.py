@@ -5,7 +5,7 @@ Nothing from here on knows of lenses or shutters.
 
 import warp as wp
 
-from render.kernels.bin import ROOM, tile_span
+from render.kernels.bin import ROOM, span_within
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
@@ -109,8 +109,8 @@ def write_splat(
         records[j, INV_C] = 1.0 / c
         root = wp.sqrt(s_max / (c * h))
         records[j, Y_AT_EXT] = k * m * root
-        rows = tile_span(e.y, ROOM * records[j, Y_EXT] + SLACK, view.tiles_y)
-        columns = tile_span(e.x, ROOM * c * root / k + SLACK, view.tiles_x)
+        rows = span_within(e.y, ROOM * records[j, Y_EXT] + SLACK, view.tile_top, view.tiles_y)
+        columns = span_within(e.x, ROOM * c * root / k + SLACK, view.tile_left, view.tiles_x)
         total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
         colour = wp.vec3(0.0)
         if total > 0:

@@ -87,6 +87,8 @@ class View:
     clamp_right: float
     clamp_top: float
     clamp_bottom: float
+    tile_left: int  # the tiles that are drawn
+    tile_top: int
     tiles_x: int
     tiles_y: int
     dilation: float

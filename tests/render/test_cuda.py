@@ -136,8 +136,8 @@ def test_sorted_pairs_make_the_same_lists_as_counting():
     keys = torch.where(kept.scene.counts > 0, kept.scene.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     box = kept.scene.counts + (kept.scene.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
     count, pair = box.clone(), box.clone()
-    counted = tile_lists(kept.scene.records, depth_order(keys), count, whole(settings))
-    paired = tile_lists(kept.scene.records, depth_order(keys), pair, whole(settings), counting=False)
+    counted = tile_lists(kept.scene.records, depth_order(keys), count, whole(settings), settings.drawn_tiles())
+    paired = tile_lists(kept.scene.records, depth_order(keys), pair, whole(settings), settings.drawn_tiles(), counting=False)
     assert torch.equal(count, kept.scene.counts) and torch.equal(pair, kept.scene.counts)
     total = int(counted.starts[-1])
     assert total == int(kept.scene.counts.sum()) > 100

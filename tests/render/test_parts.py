@@ -1,0 +1,86 @@
+"""Crops, masks and many cameras: each the same bits as the whole, at a part of the work."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import RenderConfig, rasterize
+from scenes import Camera, Pinhole
+from scenes.poses import translation
+from tests.render.test_rasterize import two_instances
+
+CAMERA = Camera(Pinhole(120.0, 122.0, 65.0, 40.0), 139, 75, torch.eye(4, dtype=torch.float64))
+NAMES = ("rgb", "alpha", "depth", "median_depth", "normal", "features", "instance", "instance_alpha", "flow_next", "visible_next")
+FEATURES = torch.randn(170, 3, generator=torch.Generator().manual_seed(0))
+CROPS = [(0, 0, 139, 75), (0, 0, 1, 1), (16, 32, 32, 16), (37, 21, 60, 33), (130, 60, 9, 15)]
+
+
+def frame_of(placed, **more):
+    other = replace(CAMERA, world_from_cam=translation(0.1, 0, 0.2))
+    background = torch.linspace(0, 1, 139 * 75 * 3).reshape(75, 139, 3)
+    return rasterize(placed, CAMERA, NAMES, background, {"next": (placed, other)}, features=FEATURES, **more)
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return torch.equal(a.nan_to_num(nan=-7.0) if a.is_floating_point() else a, b.nan_to_num(nan=-7.0) if b.is_floating_point() else b)
+
+
+def gradients(placed, loss, **more):
+    leaves = [replace(p, gaussians=p.gaussians.map(lambda t: t.clone().requires_grad_())) for p in placed]
+    frame = rasterize(leaves, CAMERA, ("rgb", "alpha"), **more)
+    loss(frame).backward()
+    return [t.grad for p in leaves for t in p.gaussians.tensors().values()]
+
+
+@pytest.mark.parametrize("most", [1 << 25, 500])
+@pytest.mark.parametrize("crop", CROPS, ids=str)
+def test_a_crop_is_the_crop_of_the_whole(crop, most):
+    placed, (x, y, width, height) = two_instances(2), crop
+    whole, part = frame_of(placed), frame_of(placed, crop=crop, config=RenderConfig(most_entries=most))
+    for name, picture in part.outputs().items():
+        assert picture.shape[:2] == (height, width)
+        assert same(picture, getattr(whole, name)[y : y + height, x : x + width]), name
+
+
+def test_a_crops_gradients_are_those_of_its_pixels_in_the_whole():
+    placed, (x, y, width, height) = two_instances(3), (37, 21, 60, 33)
+    inside = (slice(y, y + height), slice(x, x + width))
+    part = gradients(placed, lambda f: f.rgb.square().sum() + f.alpha.sum(), crop=(x, y, width, height))
+    whole = gradients(placed, lambda f: f.rgb[inside].square().sum() + f.alpha[inside].sum())
+    for mine, reference in zip(part, whole, strict=True):
+        assert (mine - reference).abs().max() <= 1e-5 * reference.abs().max()
+
+
+@pytest.mark.parametrize("crop", [None, (37, 21, 60, 33)])
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.3])
+def test_a_mask_shows_the_whole_where_it_is_true_and_nothing_elsewhere(share, crop):
+    placed = two_instances(4)
+    mask = torch.rand(75, 139, generator=torch.Generator().manual_seed(1)) < share
+    x, y, width, height = crop or (0, 0, 139, 75)
+    inside = (slice(y, y + height), slice(x, x + width))
+    whole, part, here = frame_of(placed), frame_of(placed, mask=mask, crop=crop), mask[inside]
+    for name, picture in part.outputs().items():
+        assert same(picture[here], getattr(whole, name)[inside][here]), name
+    assert (part.alpha[~here] == 0).all() and part.depth[~here].isinf().all() and (part.instance[~here] == -1).all()
+    assert (part.features[~here] == 0).all() and part.median_depth[~here].isinf().all()
+
+
+def test_a_masks_gradients_are_those_of_its_pixels_in_the_whole():
+    placed = two_instances(5)
+    mask = torch.rand(75, 139, generator=torch.Generator().manual_seed(2)) < 0.01
+    part = gradients(placed, lambda f: f.rgb.square().sum() + f.alpha.sum(), mask=mask)
+    whole = gradients(placed, lambda f: f.rgb[mask].square().sum() + f.alpha[mask].sum())
+    for mine, reference in zip(part, whole, strict=True):
+        assert (mine - reference).abs().max() <= 1e-5 * reference.abs().max()
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 140, 75), (-1, 0, 5, 5), (3, 3, 0, 5), (139, 0, 1, 1)], ids=str)
+def test_a_crop_that_leaves_the_image_is_refused(crop):
+    with pytest.raises(ValueError, match="139x75"):
+        rasterize(two_instances(1), CAMERA, crop=crop)
+
+
+def test_a_mask_of_another_size_is_refused():
+    with pytest.raises(ValueError, match=r"mask must have shape \(75, 139\)"):
+        rasterize(two_instances(1), CAMERA, mask=torch.ones(75, 138, dtype=torch.bool))
