@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -140,7 +141,9 @@ def uniforms(settings: Settings, lens: Lens, pose: torch.Tensor, instance: int, 
     return [view, optics, motion]
 
 
+@lru_cache(maxsize=16)
 def _view(settings: Settings, lens: Lens, sh_count: int) -> View:
+    """The same for all instances of a frame and all frames of a camera, so kept: nobody writes to it."""
     v = View()
     if isinstance(lens, Pinhole):
         v.fx, v.fy, v.cx, v.cy = lens.params().tolist()

@@ -8,7 +8,8 @@ from typing import overload
 import torch
 
 from render.bridge import Rasterize
-from render.channels import Features, channel_fields, unit
+from render.channels import SUMMED, Features, channel_fields, unit
+from render.cull import in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
 from render.kernels.types import Wanted
@@ -83,8 +84,9 @@ def rasterize(
 
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
-    cam_from_local = poses(camera, placed)
-    summed = channel_fields(outputs, placed, cam_from_local[:, 0], features)
+    seen = placed if any(o in outputs for o in SUMMED) else in_sight(placed, camera, model)
+    cam_from_local = poses(camera, seen)
+    summed = channel_fields(outputs, seen, cam_from_local[:, 0], features)
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
     settings = Settings(
         width=camera.width,
@@ -92,14 +94,14 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         model=model,
         config=config,
         wanted=Wanted("depth" in outputs or flows, "median_depth" in outputs, "instance" in outputs or flows, bool(summed)),
-        instances=tuple(p.instance for p in placed),
+        instances=tuple(p.instance for p in seen),
         lens=type(camera.lens),
         shutter=camera.shutter,
         rolling=moves(camera, placed),
         crop=crop,
         mask=mask,
     )
-    fields = [t for p in placed for t in p.gaussians.tensors().values()]
+    fields = [t for p in seen for t in p.gaussians.tensors().values()]
     channels = torch.cat(list(summed.values()), 1) if summed else None
     rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), channels, *fields)
 

@@ -6,7 +6,7 @@ import importlib.util
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,16 +53,28 @@ def drive(width: int, height: int, folder: Path | None = None) -> Preset:
 
 
 def street(count: int, folder: Path | None = None) -> Preset:
-    """The drive's background laid side by side, at most 8 abreast, until there are `count` splats: a city of which a camera sees little."""
+    """The drive's background laid around itself on a grid of 150 m until there are `count` splats, each copy in order of space: a city of
+    which the camera in its middle sees little."""
     first = drive(960, 540, folder)
     g = first.placed[0].gaussians
+    g = g.select(space_order(g.means))
     copies = -(-count // len(g))
-    tiles = []
-    for i in range(copies):
-        shift = torch.tensor([150.0 * (i // 8), 150.0 * (i % 8), 0.0])
-        tiles.append(Gaussians(g.means + shift, g.quats, g.log_scales, g.logit_opacities, g.sh))
+    side = math.ceil(math.sqrt(copies))
+    cells = sorted(((x, y) for x in range(-side, side + 1) for y in range(-side, side + 1)), key=lambda c: (max(map(abs, c)), c))
+    tiles = [replace(g, means=g.means + torch.tensor([150.0 * x, 150.0 * y, 0.0])) for x, y in cells[:copies]]
     whole = Gaussians.cat(tiles).select(torch.arange(count))
     return Preset([Placed(whole, first.placed[0].world_from_local)], first.camera, first.model)
+
+
+def space_order(means: torch.Tensor) -> torch.Tensor:
+    """Indices `[N]` along the Z-order curve (Morton 1966) through a grid of 1024 cells a side: neighbours in space are near in memory."""
+    low, high = means.quantile(0.001, 0), means.quantile(0.999, 0)
+    cells = ((means - low) / (high - low) * 1023).clamp(0, 1023).long()
+    code = torch.zeros(len(means), dtype=torch.long)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort()
 
 
 def biker() -> Preset:
