@@ -111,12 +111,68 @@ class Show:
 
 
 @dataclass
+class Add:
+    """Add a textured mesh (.glb) or splats (.ply) of your own to the databank, turned and scaled to its frame."""
+
+    file: Positional[Annotated[Path, arg(metavar="FILE")]]
+    """Mesh, as car.glb, or splats, as car.ply."""
+    label: str
+    """What it is: car, pickup, van, truck, bus, motorcycle, bicycle, pedestrian, cone, sign, tree, or a name of its own."""
+    scale: Ratio = None
+    """Metres a unit of the file."""
+    up: str | None = None
+    """The file's axis that points up: x, -x, y, ...; a mesh's is y, as in glTF, and splats' -y, as cameras have it."""
+    forward: str | None = None
+    """The file's axis that points forward: a mesh's is z, as in glTF, and splats' z."""
+    licence: str = ""
+    """Its licence, as "CC BY 3.0"."""
+    attribution: str = ""
+    """Whom the licence wants named."""
+    force: Flag = False
+    """Add it though its size is not that of its class."""
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        from recon.adding import add_mesh, add_splats, holds_splats
+
+        add = add_splats if holds_splats(self.file) else add_mesh
+        share = {"licence": self.licence, "attribution": self.attribution}
+        id, said = add(self.databank, self.file, self.label, self.scale or 1.0, self.up, self.forward, share, self.force)
+        print(f"added {self.file} to {self.databank} as {id}: {said}")
+
+
+@dataclass
+class Check:
+    """Look through the databank for entries that are broken, of the wrong size, or turned; exit 1 where there are any."""
+
+    databank: Path = Path("databank")
+    """Folder of the databank."""
+
+    def run(self) -> None:
+        from recon.adding import check_databank
+        from scenes import Databank
+
+        entries = Databank(self.databank).entries()
+        problems = check_databank(self.databank)
+        for problem in problems:
+            print(problem)
+        if problems:
+            raise ValueError(f"{self.databank} has {len(problems)} problem{'s' * (len(problems) > 1)}")
+        print(f"{len(entries)} assets in {self.databank}, all whole, of their class's size, and upright")
+
+
+@dataclass
 class Assets:
-    """Assets of the databank: extract them from a scene, list them, show one."""
+    """Assets of the databank: extract them from a scene, add your own, list them, show one, check all."""
 
     action: OmitArgPrefixes[
         OmitSubcommandPrefixes[
-            Annotated[Extract, subcommand("extract")] | Annotated[List, subcommand("list")] | Annotated[Show, subcommand("show")]
+            Annotated[Extract, subcommand("extract")]
+            | Annotated[Add, subcommand("add")]
+            | Annotated[List, subcommand("list")]
+            | Annotated[Show, subcommand("show")]
+            | Annotated[Check, subcommand("check")]
         ]
     ]
 

@@ -138,6 +138,19 @@ def test_the_databank_is_listed_and_shown(door):
         assert part in shown
 
 
+def test_an_own_asset_is_added_and_the_databank_checked(door, tmp_path):
+    body = made.box((1.8, 1.5, 4.2), (0.2, 0.2, 0.8))  # y up, z forward, but standing on z = 0
+    save(body, tmp_path / "own.ply")
+    add = ["assets", "add", str(tmp_path / "own.ply"), "--label", "car", "--databank", str(tmp_path / "bank")]
+    assert "--forward, or --force" in door([*add, "--up", "y", "--forward", "x"], 1)[1]
+    out, _ = door([*add, "--up", "y", "--forward", "z", "--licence", "CC0-1.0"])
+    assert "as car/0001: 4.2" in out
+    check = ["assets", "check", "--databank", str(tmp_path / "bank")]
+    assert "1 assets" in door(check)[0]
+    door([*add, "--up", "y", "--forward", "x", "--force"])
+    assert "car/0002 is 1.8" in door(check, 1)[0]
+
+
 @pytest.mark.parametrize("path", ["street", "bank", "street/background.usdc", "bank/assets/car/0001/asset.usdc"])
 def test_info_and_validate_take_all_kinds_of_path(door, path):
     assert "splats" in door(["info", path])[0]

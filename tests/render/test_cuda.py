@@ -13,6 +13,7 @@ from render.chunks import window
 from render.frame_types import RenderConfig
 from render.kernels import bin as bin_kernels
 from render.kernels import project as project_kernels
+from render.kernels import trace as trace_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.project_lens import lens_kernels
@@ -31,6 +32,7 @@ KERNELS = {
     "opencv": lambda: lens_kernels(LENS_FUNCTIONS["opencv"], False).forward,
     "moving fisheye": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).forward,
     "moving fisheye backward": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).backward,
+    "trace": lambda: trace_kernels.trace_surface,
     "bin": lambda: bin_kernels.emit_pairs,
     "composite": lambda: composite_blocks(EVERYTHING, TILE),
     "composite backward": lambda: composite_blocks_gradient(EVERYTHING, TILE),

@@ -1,0 +1,130 @@
+"""Assets from outside: a mesh or splats of one's own become an entry of the databank, and entries are checked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from recon.assets import moved, thumbnail
+from recon.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
+from render.progress import Progress
+from scenes.asset import Asset
+from scenes.databank import Databank
+from scenes.files import USD_SUFFIXES, load
+from scenes.gaussians import Gaussians
+from scenes.report import validate
+from scenes.sizes import odd_size
+
+OUTLIERS = 0.002
+"""Part of the opacity of splats, on either side of an axis, that their box leaves out: floaters are not part of a thing."""
+
+OFF = 0.12
+"""Part of an asset's size by which its splats' box may differ from it before it counts as misplaced."""
+
+
+def add_mesh(
+    databank: Path, file: Path, label: str, scale: float, up: str | None, forward: str | None, share: dict, force: bool = False,
+    config: MeshFit = MeshFit(),  # noqa: B008 - frozen
+) -> tuple[str, str]:  # fmt: skip
+    """Store a mesh file as a splat asset; its id, and what a person should know. ValueError where its size is odd and not `force`d."""
+    mesh = read_mesh(file, up or "y", forward or "z", scale)
+    _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), force)
+    with Progress("fit", total=config.steps) as steps:
+        meta = {**share, "source": file.name}
+        asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
+    id = Databank(databank).add(asset, thumbnail(asset))
+    likeness = f"{asset.meta['psnr_unseen_whole_picture']:.1f} dB (over its own pixels {asset.meta['psnr_unseen']:.1f} dB)"
+    return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views"
+
+
+def add_splats(
+    databank: Path, file: Path, label: str, scale: float, up: str | None, forward: str | None, share: dict, force: bool = False
+) -> tuple[str, str]:
+    """Store a file of splats as an asset: turned, scaled, and set down on the ground; returns and raises as `add_mesh`."""
+    splats = load(file)
+    if not isinstance(splats, Gaussians):
+        raise ValueError(f"{file} holds no plain splats; assets and scenes are opened as they are")
+    if not len(splats):
+        raise ValueError(f"{file} holds no splats")
+    upright = turned_upright(splats, scale, up or "-y", forward or "z")
+    low, high = solid_box(upright)
+    base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
+    asset = Asset(replace(upright, means=upright.means - base), (high - low).double(), label, meta={**share, "source": file.name})
+    _check_size(file, label, asset.size.tolist(), force)
+    return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
+
+
+def turned_upright(splats: Gaussians, scale: float, up: str, forward: str) -> Gaussians:
+    """Splats in the axes of assets: x forward, z up, `scale` metres a unit of theirs."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(turn_to_asset(up, forward))
+    grown = replace(splats, means=splats.means * scale, log_scales=splats.log_scales + torch.tensor(scale).log())
+    reach = 2 * grown.means.abs().amax() + 1
+    return moved(grown, pose, reach.double().expand(3))
+
+
+def solid_box(splats: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
+    """Low and high corner `[3]` of all but the outermost `OUTLIERS` of the splats' opacity along each axis."""
+    weight = torch.sigmoid(splats.logit_opacities.double())
+    low, high = torch.zeros(3), torch.zeros(3)
+    for axis in range(3):
+        values, order = splats.means[:, axis].sort()
+        share = weight[order].cumsum(0) / weight.sum()
+        low[axis] = values[int((share < OUTLIERS).sum().clamp_max(len(values) - 1))]
+        high[axis] = values[int((share < 1 - OUTLIERS).sum().clamp_max(len(values) - 1))]
+    return low, high
+
+
+def holds_splats(file: Path) -> bool:
+    """Whether a file holds splats rather than a mesh: USD, or a PLY with opacities."""
+    if file.suffix.lower() != ".ply" or not file.is_file():
+        return file.suffix.lower() in USD_SUFFIXES
+    with open(file, "rb") as opened:
+        head = opened.read(4096).split(b"end_header")[0]
+    return b"opacity" in head or b"packed_position" in head
+
+
+def check_databank(path: Path) -> list[str]:
+    """What is wrong with the entries of a databank, one sentence a problem: files, values, sizes, and where the splats stand."""
+    bank, problems = Databank(path), validate(path)
+    for entry in bank.entries():
+        if odd := odd_size(entry.label, entry.size):
+            problems.append(f"{entry.id} {odd}")
+        try:
+            asset = bank.load(entry.id)
+        except (ValueError, OSError):
+            continue  # said above
+        if misplaced := _misplaced(asset):
+            problems.append(f"{entry.id} {misplaced}")
+    return problems
+
+
+def _misplaced(asset: Asset) -> str:
+    """How the splats of an asset do not stand in its box, or ''."""
+    if not len(asset.gaussians):
+        return "has no splats"
+    low, high = (corner.tolist() for corner in solid_box(asset.gaussians))
+    length, width, height = asset.size.tolist()
+    slack = OFF * max(length, width, height)
+    box = [(-length / 2, length / 2), (-width / 2, width / 2), (0.0, height)]
+    # seen from one side only, splats may fill half a box, so they are only held to stay inside, and to fill half of it
+    out = max(max(b[0] - lo, hi - b[1]) for lo, hi, b in zip(low, high, box, strict=True))
+    if out > slack:
+        where = " to ".join("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (low, high))
+        size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
+        return f"has splats at {where} m, {out:.2f} m outside its box of {size}: its origin or axes are wrong"
+    filled = [(hi - lo) / v for lo, hi, v in zip(low, high, (length, width, height), strict=True)]
+    if min(filled[0], filled[2]) < 0.5:
+        return f"has splats that fill {min(filled[0], filled[2]):.0%} of its box: its scale or axes are wrong"
+    return ""
+
+
+def _check_size(file: Path, label: str, size: list[float], force: bool) -> None:
+    if not force and (odd := odd_size(label, size)):
+        raise ValueError(f"{file} {odd}, or --force to keep it so")
+
+
+def _told(asset: Asset) -> str:
+    return "{:.2f} m long, {:.2f} m wide, {:.2f} m high, {} splats".format(*asset.size.tolist(), len(asset.gaussians))

@@ -1,0 +1,48 @@
+"""How large things of a class are: what finds an asset in the wrong unit or on its side. Pure Python."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+    "car": ((2.5, 6.0), (1.3, 2.6), (1.0, 2.3)),
+    "pickup": ((4.0, 7.5), (1.5, 2.8), (1.3, 2.6)),
+    "van": ((3.5, 8.0), (1.4, 2.8), (1.5, 3.5)),
+    "truck": ((4.0, 25.0), (1.6, 4.0), (1.7, 5.0)),
+    "bus": ((5.0, 25.0), (1.8, 3.5), (2.0, 5.0)),
+    "motorcycle": ((1.2, 3.0), (0.4, 1.5), (0.7, 2.3)),
+    "bicycle": ((1.0, 2.6), (0.3, 1.2), (0.7, 2.3)),
+    "pedestrian": ((0.2, 1.8), (0.2, 1.8), (0.8, 2.3)),
+    "cone": ((0.1, 0.9), (0.1, 0.9), (0.3, 1.3)),
+    "sign": ((0.01, 2.0), (0.01, 2.0), (0.4, 6.0)),
+    "tree": ((0.5, 25.0), (0.5, 25.0), (1.0, 40.0)),
+}
+"""Length, width and height in metres, least and most, of what goes by that name; generous. Other classes are only held to ANYTHING."""
+
+ANYTHING = (0.01, 40.0)
+AXES = ("length", "width", "height")
+
+
+def odd_size(label: str, size: Sequence[float]) -> str:
+    """What is odd about the size `[length, width, height]` in metres of a thing of a class, with the likely cause; '' where nothing is."""
+    told = " x ".join(f"{v:.3g}" for v in size)
+    ranges = SIZES.get(label, (ANYTHING,) * 3)
+    wrong = [axis for axis, v, r in zip(AXES, size, ranges, strict=True) if not r[0] <= v <= r[1]]
+    if not wrong:
+        return ""
+    low, high = (" x ".join(f"{r[i]:g}" for r in ranges) for i in (0, 1))
+    said = f"is {told} m long, wide and high, but a {label} has {low} to {high} m"
+    for factor, unit in ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"), (1000.0, "kilometres")):
+        if _fits([v * factor for v in size], ranges):
+            return f"{said}: it seems to be in {unit}; give --scale {factor:g}"
+    turned = [size[1], size[0], size[2]]
+    if _fits(turned, ranges):
+        return f"{said}: it seems to stand across; give another --forward"
+    if any(_fits([size[i] for i in order], ranges) for order in ((0, 2, 1), (2, 1, 0), (2, 0, 1), (1, 2, 0))):
+        return f"{said}: it seems to lie on its side; give another --up"
+    middle = [(r[0] * r[1]) ** 0.5 for r in ranges]
+    return f"{said}; if it is one, give --scale {max(middle) / max(max(size), 1e-9):.2g} or so"
+
+
+def _fits(size: Sequence[float], ranges: Sequence[tuple[float, float]]) -> bool:
+    return all(r[0] <= v <= r[1] for v, r in zip(size, ranges, strict=True))

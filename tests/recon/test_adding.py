@@ -1,0 +1,99 @@
+import json
+
+import pytest
+import torch
+from randomized import gaussians
+from street import box, car
+
+from recon.adding import add_splats, check_databank, holds_splats, turned_upright
+from scenes import Asset, Databank, save
+from scenes.poses import matrix_from_quat
+from scenes.sizes import SIZES, odd_size
+
+
+def lying(tmp_path):
+    """A car in a camera's axes (x right, y down, z forward), a thousandth of its size, off its origin; and where it was."""
+    upright = box((4.2, 1.8, 1.5), (0.8, 0.2, 0.1))
+    turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera from asset
+    means = (upright.means @ turn.T + torch.tensor([3.0, 1.0, 7.0])) / 1000
+    splats = type(upright)(means, upright.quats, upright.log_scales - torch.tensor(1000.0).log(), upright.logit_opacities, upright.sh)
+    save(splats, tmp_path / "car.ply")
+    return tmp_path / "car.ply", upright
+
+
+def test_splats_of_any_axes_and_unit_become_an_asset(tmp_path):
+    file, upright = lying(tmp_path)
+    id, said = add_splats(tmp_path / "bank", file, "car", 1000.0, "-y", "z", {"licence": "CC0-1.0"})
+    asset = Databank(tmp_path / "bank").load(id)
+    assert id == "car/0001" and "4.20 m long, 1.80 m wide, 1.50 m high" in said
+    torch.testing.assert_close(asset.gaussians.means, upright.means, atol=2e-3, rtol=0)
+    assert Databank(tmp_path / "bank").entry(id).thumb and check_databank(tmp_path / "bank") == []
+
+
+def test_turning_splats_turns_their_axes_and_their_harmonics():
+    from scenes.harmonics import evaluate
+
+    g = gaussians(50)
+    turned = turned_upright(g, 2.0, "-y", "z")
+    rotation = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    torch.testing.assert_close(turned.means, 2 * g.means @ rotation.T)
+    torch.testing.assert_close(matrix_from_quat(turned.quats), rotation @ matrix_from_quat(g.quats), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(turned.log_scales.exp(), 2 * g.log_scales.exp())
+    look = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    torch.testing.assert_close(evaluate(turned.sh, look @ rotation.T), evaluate(g.sh, look), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("scale", "up", "forward", "said"),
+    [
+        (1.0, "-y", "z", "a car has 2.5 x 1.3 x 1 to 6 x 2.6 x 2.3 m"),
+        (1e6, "-y", "z", "in millimetres; give --scale 0.001"),
+        (1000.0, "-y", "x", "stand across; give another --forward"),
+        (1000.0, "z", "y", "lie on its side; give another --up"),
+    ],
+)
+def test_a_wrong_size_or_axis_is_refused_with_its_cause(tmp_path, scale, up, forward, said):
+    file, _ = lying(tmp_path)
+    with pytest.raises(ValueError, match="or --force") as refused:
+        add_splats(tmp_path / "bank", file, "car", scale, up, forward, {})
+    assert said in str(refused.value)
+    assert not (tmp_path / "bank").exists()
+    add_splats(tmp_path / "bank", file, "car", scale, up, forward, {}, force=True)
+    assert any("car/0001 is" in p for p in check_databank(tmp_path / "bank"))
+
+
+@pytest.mark.parametrize("label", SIZES)
+def test_things_in_the_middle_of_their_class_are_not_odd(label):
+    assert odd_size(label, [(a * b) ** 0.5 for a, b in SIZES[label]]) == ""
+
+
+def test_check_finds_what_is_broken_misplaced_or_turned(tmp_path):
+    bank = Databank(tmp_path / "bank")
+    good = car()
+    bank.add(good)
+    assert check_databank(bank.path) == []
+    g = good.gaussians
+    bank.add(Asset(type(g)(g.means - torch.tensor([0, 0, 0.75]), *list(g.tensors().values())[1:]), good.size, "car"))
+    bank.add(Asset(g, good.size[[1, 0, 2]], "car"))
+    bank.add(Asset(type(g)(0.3 * g.means, *list(g.tensors().values())[1:]), good.size, "car"))
+    bank.add(good)
+    (bank.path / "assets/car/0005/asset.usdc").write_bytes(b"cut")
+    problems = "\n".join(check_databank(bank.path))
+    for id, said in (("0002", "its origin or axes are wrong"), ("0003", "stand across"), ("0004", "scale or axes"), ("0005", "")):
+        assert f"car/{id}" in problems and said in problems, id
+    assert "car/0001" not in problems
+
+
+def test_a_ply_is_known_to_hold_splats_or_a_mesh(tmp_path):
+    import trimesh
+
+    file, _ = lying(tmp_path)
+    trimesh.creation.box().export(tmp_path / "mesh.ply")
+    assert holds_splats(file) and not holds_splats(tmp_path / "mesh.ply") and not holds_splats(tmp_path / "a.glb")
+
+
+def test_the_index_of_a_mesh_tells_its_licence(tmp_path):
+    file, _ = lying(tmp_path)
+    add_splats(tmp_path / "bank", file, "car", 1000.0, None, None, {"licence": "CC BY 3.0", "attribution": "OSRF"})
+    (entry,) = json.loads((tmp_path / "bank" / "index.json").read_text())["entries"]
+    assert (entry["licence"], entry["attribution"], entry["source"]) == ("CC BY 3.0", "OSRF", "car.ply")

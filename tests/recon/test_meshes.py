@@ -1,0 +1,138 @@
+"""Meshes become assets: axes and scale, the tracer against what is known of a box, and the fit against the tracer."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from recon.assets import looking_at
+from recon.meshes import MeshFit, asset_of_mesh, likeness, read_mesh, splats_of_mesh, turn_to_asset, views_around
+from render.rays import camera_rays
+from render.tracer import Blockers, TracedMesh, fibonacci, lit
+from scenes.poses import matrix_from_quat
+
+SIZE = (4.0, 1.8, 1.5)  # length, width, height
+
+
+def write_box(path: Path, inner: bool = False) -> Path:
+    """A car-sized box in glTF's axes: its nose (+z) red, its left (+x) green, its top blue, the rest grey, of one texture."""
+    length, width, height = SIZE
+    box = trimesh.creation.box((width, height, length))
+    box.apply_translation((0, height / 2, 0))
+    box.unmerge_vertices()
+    colours = np.array([[200, 30, 30, 255], [30, 160, 30, 255], [30, 30, 200, 255], [128, 128, 128, 255]], np.uint8)
+    normals = box.face_normals
+    which = np.select([normals[:, 2] > 0.9, normals[:, 0] > 0.9, normals[:, 1] > 0.9], [0, 1, 2], 3)
+    uv = np.stack([(which[:, None] + 0.5) / 4 * np.ones((1, 3)), np.full((len(which), 3), 0.5)], -1).reshape(-1, 2)
+    from PIL import Image
+
+    image = Image.fromarray(np.repeat(np.repeat(colours[None], 16, 1), 16, 0))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    parts = [box]
+    if inner:
+        smaller = trimesh.creation.box((width / 2, height / 2, length / 2))
+        parts.append(smaller.apply_translation((0, 0.7, 0)))
+    trimesh.Scene(parts).export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory) -> Path:
+    return write_box(tmp_path_factory.mktemp("mesh") / "box.glb")
+
+
+def view(*eye: float, pixels=(96, 72)):
+    return looking_at(torch.tensor([0.0, 0.0, 0.75], dtype=torch.float64), torch.tensor(eye, dtype=torch.float64), *pixels)
+
+
+def test_a_gltf_stands_upright_and_faces_forward(box):
+    mesh = read_mesh(box)
+    np.testing.assert_allclose(mesh.vertices.min(0), [-2, -0.9, 0], atol=1e-5)
+    np.testing.assert_allclose(mesh.vertices.max(0), [2, 0.9, 1.5], atol=1e-5)
+    traced = TracedMesh(mesh)
+    for eye, channel in (((9.0, 0.0, 0.75), 0), ((0.0, 9.0, 0.75), 1), ((0.001, 0.0, 9.0), 2)):
+        rgb = traced.render(view(*eye)).rgb[36, 48]
+        assert int(rgb.argmax()) == channel and rgb.max() > 2 * rgb.median(), eye
+
+
+def test_other_axes_and_scales_are_turned_and_scaled(box):
+    mesh = read_mesh(box, up="z", forward="-x", scale=0.5)
+    np.testing.assert_allclose(mesh.vertices.max(0) - mesh.vertices.min(0), [0.9, 0.75, 2.0], atol=1e-5)
+    for up in ("x", "-y", "z"):
+        for forward in ("y", "-z", "x", "-x"):
+            if up[-1] != forward[-1]:
+                turn = turn_to_asset(up, forward)
+                np.testing.assert_allclose(turn @ turn.T, np.eye(3))
+                assert np.linalg.det(turn) == pytest.approx(1)
+    with pytest.raises(ValueError, match="lie along one axis"):
+        turn_to_asset("y", "-y")
+    with pytest.raises(ValueError, match='--up "w" is not an axis'):
+        turn_to_asset("w", "x")
+
+
+def test_a_traced_box_is_hit_where_geometry_says(box):
+    traced, camera = TracedMesh(read_mesh(box)), view(9.0, 2.0, 3.0)
+    pose = camera.world_from_cam.float()
+    rays = torch.nn.functional.normalize(camera_rays(camera).reshape(-1, 3) @ pose[:3, :3].T, dim=1)
+    _, normals, distance = traced.trace(pose[:3, 3].expand(len(rays), 3), rays)
+    low, high = torch.tensor([-2.0, -0.9, 0.0]), torch.tensor([2.0, 0.9, 1.5])
+    ends = torch.stack([(low - pose[:3, 3]) / rays, (high - pose[:3, 3]) / rays])
+    near, far = ends.amin(0).amax(1), ends.amax(0).amin(1)
+    clear = (near - far).abs() > 1e-2  # rays along an edge may fall on either side of it
+    expected = torch.where(near < far, near, torch.inf)
+    torch.testing.assert_close(distance[clear], expected[clear], atol=1e-3, rtol=0)
+    hit = torch.isfinite(distance)
+    assert ((normals[hit] * rays[hit]).sum(1) < 0).all()
+
+
+def test_the_light_of_two_half_spheres_is_that_of_their_cosine_integral():
+    directions = fibonacci(20_000)
+    radiance = torch.where(directions[:, 2:] > 0, 1.0, 0.3)
+    for normal in torch.nn.functional.normalize(torch.tensor([[0.0, 0, 1], [1.0, 0, 0], [1.0, 1, -2], [0.0, 0, -1]]), dim=1):
+        integral = float((radiance[:, 0] * (directions @ normal).clamp_min(0)).mean() * 4)  # over pi
+        from scenes.sky import linear_from_srgb
+
+        assert float(linear_from_srgb(lit(torch.ones(1, 3), normal[None]))[0, 0]) == pytest.approx(integral, abs=2e-3)
+
+
+def test_a_plate_blocks_the_directions_that_it_covers():
+    plate = np.array([[[-1, -1, 1], [1, -1, 1], [1, 1, 1]], [[-1, -1, 1], [1, 1, 1], [-1, 1, 1]]], np.float32)
+    directions = fibonacci(4000)
+    directions = directions[directions[:, 2] > 0]
+    weights = directions[:, 2].contiguous()
+    points = torch.tensor([[0.0, 0, 0], [0.0, 0, 2], [50.0, 0, 0]])
+    share = Blockers(plate).open_share(points, directions, weights, 10.0)
+    # the form factor of a 2 x 2 plate 1 m above: 4 (2 / pi) (1 / sqrt 2) atan(1 / sqrt 2) / 2 = 0.554
+    assert share.tolist() == pytest.approx([1 - 0.554, 1.0, 1.0], abs=0.01)
+
+
+def test_splats_lie_flat_on_what_can_be_seen(tmp_path):
+    splats = splats_of_mesh(read_mesh(write_box(tmp_path / "nested.glb", inner=True)), 2000)
+    assert 1600 < len(splats) < 2400
+    edge = torch.tensor(SIZE) / 2
+    off = (splats.means - torch.tensor([0, 0, SIZE[2] / 2])).abs() - edge
+    assert off.amax(1).abs().max() < 1e-4  # on the skin; none of the box within
+    axis = off.argmax(1)
+    normals = matrix_from_quat(splats.quats)[:, :, 2].abs()
+    assert (normals[torch.arange(len(axis)), axis] > 0.999).all()
+
+
+def test_a_fitted_asset_looks_as_its_mesh_does_from_views_it_never_saw(box):
+    config = MeshFit(splats=2500, views=16, steps=120, size=(96, 72))
+    mesh = read_mesh(box)
+    asset = asset_of_mesh(mesh, "car", {"licence": "CC0-1.0"}, config)
+    assert asset.size.tolist() == pytest.approx(SIZE, abs=1e-4) and asset.meta["licence"] == "CC0-1.0"
+    before, _ = likeness(splats_of_mesh(mesh, config.splats), TracedMesh(mesh), views_around(np.array(SIZE), 8, (96, 72), 0.37))
+    assert asset.meta["psnr_unseen_whole_picture"] > max(30, before + 3)
+    assert asset.meta["psnr_unseen"] > 25
+
+
+def test_a_file_that_is_no_mesh_says_so(tmp_path):
+    (tmp_path / "a.glb").write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="a.glb does not read as a mesh"):
+        read_mesh(tmp_path / "a.glb")
+    with pytest.raises(FileNotFoundError):
+        read_mesh(tmp_path / "b.glb")
