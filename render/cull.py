@@ -5,7 +5,7 @@ made once for a set of splats and kept beside it, so that the cameras of a rig a
 slices of the same tensors, in the same order: the picture is the same bits. Splats in no spatial order have clusters as large as the
 scene, of which none is left out; then this costs the test of a few spheres.
 
-Only where nothing is differentiated: a splat that is not drawn would still need its gradient of zeros.
+Only for what is not differentiated: a splat that is not drawn would still need its gradient of zeros.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ _bounds = WeakTensorKeyDictionary()  # by means: what they were made from, and t
 def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> list[Placed]:
     """Those of `placed`, and the parts of them, that `camera` may see: at least one, maybe empty, so that there is something to draw."""
     placed = list(placed)
-    if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed) or _differentiated(placed, camera):
+    if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
         return placed
     sides = _sides(camera, model)
     seen = [part for p in placed for part in _parts(p, inverse(camera.world_from_cam) @ p.world_from_local, sides)]
     return seen or [replace(placed[0], gaussians=placed[0].gaussians.map(lambda t: t[:0]))]
 
 
-def _differentiated(placed: list[Placed], camera: Camera) -> bool:
+def differentiated(placed: Sequence[Placed], camera: Camera) -> bool:
+    """Whether autograd will ask for a gradient of anything here."""
     if not torch.is_grad_enabled():
         return False
     tensors = [t for p in placed for t in (p.world_from_local, *p.gaussians.tensors().values())]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import overload
 
 import torch
 
+from render.bands import without_zero_bands
 from render.bridge import Rasterize
 from render.channels import SUMMED, Features, channel_fields, unit
-from render.cull import in_sight
+from render.cull import differentiated, in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
 from render.kernels.types import Wanted
@@ -84,7 +86,11 @@ def rasterize(
 
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
-    seen = placed if any(o in outputs for o in SUMMED) else in_sight(placed, camera, model)
+    seen = placed
+    if not differentiated(placed, camera):
+        seen = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
+        if not any(o in outputs for o in SUMMED):
+            seen = in_sight(seen, camera, model)
     cam_from_local = poses(camera, seen)
     summed = channel_fields(outputs, seen, cam_from_local[:, 0], features)
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)

