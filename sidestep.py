@@ -21,7 +21,7 @@ from enhance.commands import Enhance, Pairs, Train
 from enhance.demo import Demo
 from recon.commands import Assets, Recon
 from render.outputs import check_outputs
-from scenes.commands import Edit, Info, Validate
+from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
 from scenes.opening import UsageError, fresh, open_scene, warn
 from scenes.options import (
@@ -173,7 +173,7 @@ def check_device(device: str) -> None:
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
 COMMANDS = {
     "recon": Recon, "assets": Assets, "insert": Insert, "edit": Edit, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
-    "info": Info, "validate": Validate, "demo": Demo,
+    "convert": Convert, "info": Info, "validate": Validate, "demo": Demo,
 }  # fmt: skip
 
 

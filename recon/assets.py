@@ -18,7 +18,7 @@ from scenes.camera import Camera
 from scenes.databank import Databank
 from scenes.files import load
 from scenes.gaussians import Gaussians
-from scenes.harmonics import basis
+from scenes.harmonics import turned
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene
@@ -174,18 +174,6 @@ def moved(gaussians: Gaussians, to_from_local: torch.Tensor, size: torch.Tensor)
     gaussians, means = gaussians.select(near), means[near]
     quats = quat_from_matrix(rotation @ matrix_from_quat(gaussians.quats.double()))
     return replace(gaussians, means=means.float(), quats=quats.float(), sh=turned(gaussians.sh, rotation))
-
-
-def turned(sh: torch.Tensor, transform: torch.Tensor) -> torch.Tensor:
-    """Harmonics `[N, K, 3]` of colours whose directions an orthogonal `[3, 3]` maps: rotations and mirrors alike.
-
-    Bands map to themselves, so K well-spread directions determine the matrix exactly.
-    """
-    count = sh.shape[1]
-    directions = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    directions = directions / directions.norm(dim=1, keepdim=True)
-    matrix = torch.linalg.lstsq(basis(directions, count), basis(directions @ transform, count)).solution
-    return torch.einsum("kj,njc->nkc", matrix.to(sh), sh)
 
 
 def completed(gaussians: Gaussians, left: float, right: float) -> tuple[Gaussians, bool]:

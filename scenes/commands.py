@@ -1,23 +1,23 @@
-"""`sidestep info`, `sidestep validate` and `sidestep edit`."""
+"""`sidestep info`, `sidestep validate`, `sidestep convert` and `sidestep edit`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from tyro.conf import UseAppendAction
+from tyro.conf import Positional, UseAppendAction, arg
 
-from scenes.opening import UsageError, dropped, open_scene
-from scenes.options import AnyPath, Flag, Name, Replacement, Retiming, ScenePath, Shift, Track
+from scenes.opening import UsageError, dropped, fresh, open_scene, open_splats, warn
+from scenes.options import AnyPath, Flag, Name, Overwrite, Replacement, Retiming, ScenePath, Shift, Track
 
 Value = TypeVar("Value")
 
 
 @dataclass
 class Info:
-    """Say what a scene, databank, PLY or USD file holds."""
+    """Say what a scene, databank, asset or splat file holds."""
 
     path: AnyPath
     """Folder or file."""
@@ -38,7 +38,7 @@ class Info:
 
 @dataclass
 class Validate:
-    """Check a scene, databank, PLY or USD file, with USD's own validators too; exit 1 where something is wrong."""
+    """Check a scene, databank, asset or splat file, with USD's own validators too; exit 1 where something is wrong."""
 
     path: AnyPath
     """Folder or file."""
@@ -58,6 +58,28 @@ class Validate:
         if problems:
             raise ValueError(f"{self.path} has {len(problems)} problem{'s' * (len(problems) > 1)}")
         print(f"{self.path} is valid")
+
+
+@dataclass
+class Convert:
+    """Convert splats between PLY, PlayCanvas compressed PLY, USD, GLB, SPZ, .splat and SOG, and say what the new file keeps of them."""
+
+    source: AnyPath
+    """Splat file or asset to read."""
+    target: Positional[Annotated[Path, arg(metavar="TARGET")]]
+    """File to write; its suffix says the format: .ply, .compressed.ply, .usdc, .usda, .glb, .spz, .splat or .sog."""
+    drop_invalid: Flag = False
+    """Leave out splats with values that are not finite, and count them, instead of refusing the file."""
+    overwrite: Overwrite = False
+    """Replace an existing file."""
+
+    def run(self) -> None:
+        fresh(self.target, self.overwrite)
+        from scenes.convert import convert
+
+        thing, warnings = open_splats(self.source, self.drop_invalid)
+        warn(warnings)
+        print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite)}")
 
 
 @dataclass

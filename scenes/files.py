@@ -8,16 +8,15 @@ from pathlib import Path
 
 from scenes.asset import Asset
 from scenes.databank import Databank
+from scenes.formats import SUFFIXES, USD, found, named
 from scenes.gaussians import Gaussians
-from scenes.ply import load_ply, save_ply
 from scenes.scene import Scene
 
-USD_SUFFIXES = (".usdc", ".usda", ".usd")
 KINDS = ("scene", "databank", "asset", "splats")
 
 
 def load(path: str | os.PathLike) -> Scene | Asset | Gaussians:
-    """What a path holds: a Scene (folder), an Asset (USD, or its folder in a databank) or Gaussians (PLY, USD).
+    """What a path holds: a Scene (folder), an Asset (USD, or its folder in a databank) or Gaussians (any of scenes.formats).
 
     Raises FileNotFoundError where the path or a file that it needs is missing; ValueError where it is none of these, is
     corrupt or cut short, or holds a value that is not finite, naming splat and field. Nothing is loaded in part.
@@ -32,7 +31,7 @@ def load_dropping(path: str | os.PathLike) -> tuple[Scene | Asset | Gaussians, i
 
 
 def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: bool = False, half: bool = False) -> None:
-    """Write a Scene as a folder, an Asset as .usdc or .usda, Gaussians as .ply, .usdc or .usda: whole or not at all.
+    """Write a Scene as a folder, an Asset as .usdc or .usda, Gaussians as the suffix says (scenes.formats): whole or not at all.
 
     `half` stores all but positions in USD's half precision, at about half the bytes. An existing target raises
     FileExistsError; with `overwrite` a file is replaced, a folder only if it is a scene. Raises ValueError where a value is
@@ -46,9 +45,9 @@ def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: b
             gaussians.validate(name)
         save_scene(path, thing, overwrite, half)
         return
-    suffixes = USD_SUFFIXES if isinstance(thing, Asset) else (".ply", *USD_SUFFIXES)
-    if path.suffix.lower() not in suffixes:
-        what = "an asset" if isinstance(thing, Asset) else "splats"
+    form = named(path)
+    if form is None or (isinstance(thing, Asset) and form is not USD):
+        what, suffixes = ("an asset", USD.suffixes) if isinstance(thing, Asset) else ("splats", SUFFIXES)
         raise ValueError(f'{path} has the suffix "{path.suffix}"; {what} can be written as {", ".join(suffixes)}')
     if path.is_dir() or (path.exists() and not overwrite):
         raise FileExistsError(f"{path} exists" + ("" if path.is_dir() else "; pass overwrite=True (-w) to replace it"))
@@ -58,12 +57,12 @@ def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: b
         from scenes.usd_splats import save_asset
 
         save_asset(path, thing, half)
-    elif path.suffix.lower() == ".ply":
-        save_ply(path, thing)
-    else:
+    elif form is USD:
         from scenes.usd_splats import save_gaussians
 
         save_gaussians(path, thing, half=half)
+    else:
+        form.save(path, thing)
 
 
 def kind_of(path: str | os.PathLike) -> str:
@@ -78,18 +77,20 @@ def kind_of(path: str | os.PathLike) -> str:
         for name, kind in (("scene.usda", "scene"), ("metadata.json", "scene"), ("index.json", "databank"), ("asset.usdc", "asset")):
             if (path / name).exists():
                 return kind
-        raise ValueError(f"{path} is neither a scene (scene.usda) nor a databank (index.json)")
-    if path.name == "scene.usda":
+    elif path.name == "scene.usda":
         return "scene"
-    if path.suffix.lower() == ".ply":
-        return "splats"
-    if path.suffix.lower() in USD_SUFFIXES:
+    form = found(path)
+    if form is USD:
         from scenes.usd import open_stage, own_data
 
         with open_stage(path) as stage:
             root = stage.GetDefaultPrim()
             return "asset" if root and own_data(root).get("kind") == "asset" else "splats"
-    raise ValueError(f"{path} is not a kind of file that Sidestep knows: a scene or databank folder, .ply, {', '.join(USD_SUFFIXES)}")
+    if form is not None:
+        return "splats"
+    if path.is_dir():
+        raise ValueError(f"{path} is neither a scene (scene.usda), a databank (index.json) nor SOG splats (meta.json)")
+    raise ValueError(f"{path} is not a kind of file that Sidestep knows: a scene or databank folder, {', '.join(SUFFIXES)}")
 
 
 class Dropping:
@@ -116,17 +117,15 @@ def read(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] =
     if kind == "databank":
         ids = [e.id for e in Databank(path).entries()]
         raise ValueError(f"{path} is a databank; load one of its assets: {', '.join(ids[:6]) or 'it has none'}")
-    if kind == "splats" and path.suffix.lower() == ".ply":
-        return load_ply(path, clean)
+    if kind == "splats" and (form := found(path)):
+        return form.load(path, clean)
     if kind == "scene":
         from scenes.usd_scene import load_scene
 
         return load_scene(path if path.is_dir() else path.parent, clean)
-    from scenes.usd_splats import load_asset, load_gaussians
+    from scenes.usd_splats import load_asset
 
-    if kind == "asset":
-        return load_asset(path / "asset.usdc" if path.is_dir() else path, clean)
-    return load_gaussians(path, clean)
+    return load_asset(path / "asset.usdc" if path.is_dir() else path, clean)
 
 
 def splats_of(thing: Scene | Asset | Gaussians) -> list[tuple[str, Gaussians]]:

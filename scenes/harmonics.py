@@ -11,13 +11,13 @@ C3 = (
 )  # fmt: skip
 
 
-def sh_from_rgb(rgb: torch.Tensor) -> torch.Tensor:
-    """The constant coefficient that shows `rgb`."""
+def sh_from_rgb(rgb):
+    """The constant coefficient that shows `rgb`; a tensor or an array."""
     return (rgb - 0.5) / C0
 
 
-def rgb_from_sh(dc: torch.Tensor) -> torch.Tensor:
-    """The colour that a constant coefficient shows."""
+def rgb_from_sh(dc):
+    """The colour that a constant coefficient shows; of a tensor or an array."""
     return dc * C0 + 0.5
 
 
@@ -42,3 +42,15 @@ def basis(directions: torch.Tensor, count: int) -> torch.Tensor:
 def evaluate(sh: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """Colours `[N, 3]`, clamped below at 0, of coefficients `[N, K, 3]` seen along unit directions `[N, 3]` from the eye."""
     return ((basis(directions, sh.shape[1])[..., None] * sh).sum(1) + 0.5).clamp_min(0)
+
+
+def turned(sh: torch.Tensor, transform: torch.Tensor) -> torch.Tensor:
+    """Harmonics `[N, K, 3]` of colours whose directions an orthogonal `[3, 3]` maps: rotations and mirrors alike.
+
+    Bands map to themselves, so K well-spread directions determine the matrix exactly.
+    """
+    count = sh.shape[1]
+    directions = torch.randn(64, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    matrix = torch.linalg.lstsq(basis(directions, count), basis(directions @ transform, count)).solution
+    return torch.einsum("kj,njc->nkc", matrix.to(sh), sh)

@@ -28,15 +28,30 @@ def fresh(path: Path, overwrite: bool) -> Path:
 def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
     """The scene of a folder, and what was dropped from it. ValueError where it is something else, empty, or not finite."""
     from scenes import Scene
-    from scenes.files import Dropping, read
 
-    dropping = Dropping()
-    thing = read(path, dropping if drop_invalid else _refuse)
+    thing, warnings = _open(path, drop_invalid)
     if not isinstance(thing, Scene):
         raise ValueError(f"{path} holds {_kind(thing)}, not a scene; give a folder that sidestep recon wrote")
     if not len(thing.background.gaussians) and not thing.actors:
         raise ValueError(f"{path} is empty: it has no splats and no actors; reconstruct it again with sidestep recon")
-    thing = replace(thing, meta={**thing.meta, "path": str(path)})  # errors name the folder that the user named
+    return replace(thing, meta={**thing.meta, "path": str(path)}), warnings  # errors name the folder that the user named
+
+
+def open_splats(path: Path, drop_invalid: bool = False) -> tuple[Asset | Gaussians, list[str]]:
+    """The splats or asset of a file, and what was dropped. ValueError where it is a scene or not finite."""
+    from scenes import Scene
+
+    thing, warnings = _open(path, drop_invalid)
+    if isinstance(thing, Scene):
+        raise ValueError(f"{path} is a scene of many files; give one of them, as {path / 'background.usdc'}")
+    return thing, warnings
+
+
+def _open(path: Path, drop_invalid: bool) -> tuple[Asset | Gaussians | Scene, list[str]]:
+    from scenes.files import Dropping, read
+
+    dropping = Dropping()
+    thing = read(path, dropping if drop_invalid else _refuse)
     return thing, [dropped(dropping.count)] if dropping.count else []
 
 

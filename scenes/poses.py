@@ -47,6 +47,17 @@ def quat_from_matrix(rotation: torch.Tensor) -> torch.Tensor:
     return torch.where(quat[..., :1] < 0, -quat, quat)
 
 
+def quat_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Quaternions wxyz `[..., 4]` that turn by `b`, then by `a` (Hamilton's product)."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    terms = [
+        aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+    ]  # fmt: skip
+    return torch.stack(terms, -1)
+
+
 def pose_from(quat, translation) -> torch.Tensor:
     """Pose `[..., 4, 4]` from a quaternion wxyz `[..., 4]` and a translation `[..., 3]`."""
     quat, translation = (torch.as_tensor(v, dtype=torch.float64) for v in (quat, translation))

@@ -11,7 +11,8 @@ import torch
 
 from scenes.asset import Asset
 from scenes.databank import Databank, Entry
-from scenes.files import USD_SUFFIXES, as_is, kind_of, read, splats_of
+from scenes.files import as_is, kind_of, read, splats_of
+from scenes.formats import USD, found
 from scenes.gaussians import Gaussians
 from scenes.lenses import Lens
 from scenes.scene import Scene
@@ -26,7 +27,7 @@ def describe(path: str | os.PathLike) -> dict:
     """
     path = Path(path)
     kind = kind_of(path)
-    if kind == "scene" and path.is_file():
+    if path.name in ("scene.usda", "meta.json"):
         path = path.parent
     told: dict = {"path": str(path), "kind": kind, "bytes": _bytes(path)}
     if kind == "databank":
@@ -35,7 +36,8 @@ def describe(path: str | os.PathLike) -> dict:
         return told | {"splats": sum(e.splats for e in entries), "entries": [asdict(e) for e in entries], "warnings": lost}
     thing = read(path)
     if isinstance(thing, Gaussians):
-        return told | _about_splats(thing)
+        form = found(path)
+        return told | ({"format": form.name} if form else {}) | _about_splats(thing)
     if isinstance(thing, Asset):
         about = {"label": thing.label, "size": thing.size.tolist(), "model": asdict(thing.model)}
         return told | about | _about_splats(thing.gaussians) | {"meta": thing.meta}
@@ -48,7 +50,7 @@ def summary(told: dict) -> list[str]:
 
 
 def validate(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = as_is) -> list[str]:
-    """What is wrong with a scene, databank, PLY or USD file, one sentence a problem; [] where nothing is.
+    """What is wrong with a scene, databank or splat file, one sentence a problem; [] where nothing is.
 
     Checks that everything loads, that values are finite and rotations are rotations, that scales are plausible, that no file
     is missing, and runs USD's own validators. With `clean` a `Dropping`, splats that it leaves out are counted there and are no
@@ -251,7 +253,7 @@ def _usd_files(path: Path) -> list[Path]:
     """The USD files that stand for a path: a scene's root and its edits, an asset's file, or the file itself."""
     if path.is_dir():
         return [p for p in (path / "scene.usda", path / "asset.usdc") if p.is_file()] + sorted(path.glob("edits/*.usda"))
-    return [path] if path.suffix.lower() in USD_SUFFIXES else []
+    return [path] if found(path) is USD else []
 
 
 def _usd_problems(file: Path) -> list[str]:

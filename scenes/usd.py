@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,7 @@ def new_stage(path: Path, default_prim: str) -> Iterator[Usd.Stage]:
 
 @contextmanager
 def open_stage(path: Path) -> Iterator[Usd.Stage]:
-    """The composed stage of a file, fresh from the disk. What USD finds wrong inside the block becomes a ValueError."""
+    """The composed stage of a file, fresh from the disk. What USD or the block finds wrong becomes a ValueError that names it."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     with _quiet():
@@ -60,6 +60,10 @@ def open_stage(path: Path) -> Iterator[Usd.Stage]:
             yield stage
         except Tf.ErrorException as error:
             raise ValueError(f"{path} is not a whole USD file: {first_line(error)}") from error
+        except ValueError as error:  # of a prim, which may stand in one of many files
+            if str(path) in str(error):
+                raise
+            raise ValueError(f"{path}: {error}") from error
 
 
 @contextmanager
@@ -69,13 +73,17 @@ def _quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        delegate.TakeUncoalescedDiagnostics()
+        with suppress(UnicodeDecodeError):  # of a damaged file, which they quote
+            delegate.TakeUncoalescedDiagnostics()
         del delegate
 
 
 def first_line(error: Tf.ErrorException) -> str:
     """What USD says went wrong first, without its source lines."""
-    said = [e.commentary for e in error.args if isinstance(e, Tf.Error)] or [str(error)]
+    try:
+        said = [e.commentary for e in error.args if isinstance(e, Tf.Error)] or [str(error)]
+    except UnicodeDecodeError:
+        return "USD quotes of it what is not text"
     return " ".join(said[0].split())
 
 

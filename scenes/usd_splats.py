@@ -17,10 +17,10 @@ import torch
 from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
 from scenes.asset import Asset
+from scenes.formats.packing import logits_from, opacities_from, unit
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
 
-LOGIT_LIMIT = 15.0
 EXTENT_SIGMAS = 3.0
 _SPLATS = "ParticleField3DGaussianSplat"
 _HALF_TINY, _HALF_MAX = 2.0**-14, 65504.0
@@ -77,10 +77,7 @@ def author_splats(stage: Usd.Stage, where: str, gaussians: Gaussians, model: Spl
     g = {name: t.detach().cpu().numpy().astype(np.float64) for name, t in gaussians.tensors().items()}
     n, k = len(gaussians), gaussians.sh.shape[1]
     scales = np.exp(g["log_scales"]).clip(*((_HALF_TINY, _HALF_MAX) if half else (np.finfo("f4").tiny, np.finfo("f4").max)))
-    opacities = 1 / (1 + np.exp(-g["logit_opacities"].clip(-LOGIT_LIMIT, LOGIT_LIMIT)))
-    # scaled by the largest term first, so that denormal quaternions keep their direction
-    quats = g["quats"] / np.abs(g["quats"]).max(1, keepdims=True)
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    opacities, quats = opacities_from(g["logit_opacities"]), unit(g["quats"])
     sh = g["sh"].reshape(n * k, 3)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, where)
     splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(g["means"].astype(np.float32)))
@@ -120,10 +117,8 @@ def read_splats(prim: Usd.Prim) -> Gaussians:
         if found != wanted:
             raise ValueError(f"{prim.GetPath()} has {found} {name} for {n} positions of SH degree {degree}; it needs {wanted}")
     with np.errstate(divide="ignore", invalid="ignore"):  # what is out of range becomes inf or nan, which `validate` names
-        p = opacities[:, 0].astype(np.float64)
-        logits = np.clip(np.log(p) - np.log1p(-p), -LOGIT_LIMIT, LOGIT_LIMIT)
         log_scales = np.log(scales.astype(np.float64))
-    fields = means, quats[:, [3, 0, 1, 2]], log_scales, logits, sh.reshape(n, SH_COUNTS[degree], 3)
+    fields = means, quats[:, [3, 0, 1, 2]], log_scales, logits_from(opacities[:, 0]), sh.reshape(n, SH_COUNTS[degree], 3)
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(f, np.float32)) for f in fields))
 
 

@@ -248,7 +248,7 @@ def test_a_databank_entry_with_a_missing_file_is_named(door, tmp_path):
 @pytest.fixture
 def spoiled(tmp_path) -> Path:
     """A PLY of ten splats, two of which are not finite."""
-    from scenes.ply import save_ply
+    from scenes.formats.ply import save_ply
 
     splats = made.splats(torch.rand(10, 3, generator=torch.Generator().manual_seed(0)), (0.5, 0.5, 0.5), (0.1, 0.1, 0.1))
     splats.means[3, 1], splats.sh[7] = float("nan"), float("inf")
@@ -266,6 +266,30 @@ def test_nan_in_a_splat_file_is_named_and_refused(door, spoiled):
 def test_nan_is_dropped_and_counted_when_asked(door, spoiled):
     out, _ = door(["validate", str(spoiled), "--drop-invalid"])
     assert "dropped 2 splats" in out and "is valid" in out
+
+
+def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
+    out, _ = door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.spz")])
+    assert "a.spz: " in out and "bytes each; off by at most" in out
+    assert "a.spz exists; give -w" in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "a.spz")], 1)[1]
+    door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.compressed.ply")])
+    assert json.loads(door(["info", str(tmp_path / "b.compressed.ply"), "--json"])[0])["format"] == "compressed PLY"
+    assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]
+    assert "background.usdc" in door(["convert", "street", str(tmp_path / "c.ply")], 1)[1]
+    assert 'suffix ".obj"' in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "c.obj")], 1)[1]
+
+
+def test_a_converted_asset_stays_one_as_usd(door, tmp_path):
+    door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.usda")])
+    assert json.loads(door(["info", str(tmp_path / "a.usda"), "--json"])[0])["label"] == "car"
+
+
+def test_nan_is_refused_or_dropped_in_conversion(door, spoiled):
+    target = spoiled.with_name("b.spz")
+    assert "splat 3 has nan in means" in (errors := door(["convert", str(spoiled), str(target)], 1)[1]) and "--drop-invalid" in errors
+    assert not target.exists()
+    out, errors = door(["convert", str(spoiled), str(target), "--drop-invalid"])
+    assert "dropped 2 splats" in errors and "8 splats" in out
 
 
 def test_nan_in_a_scene_is_refused_or_dropped(door, tmp_path, monkeypatch):

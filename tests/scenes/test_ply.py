@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from randomized import gaussians
 
 from scenes import Gaussians, load, load_dropping, save
-from scenes.ply import load_ply, save_ply
+from scenes.formats.ply import load_ply, save_ply
 
 DEGREE_1 = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -145,10 +145,6 @@ def test_a_wrong_number_of_sh_properties_is_refused(tmp_path):
     with pytest.raises(ValueError, match="10 f_rest properties"):
         load_ply(tmp_path / "a.ply")
 
-
-def test_the_compressed_format_is_named(shared):
-    with pytest.raises(ValueError, match="compressed splat PLY"):
-        load_ply(shared / "splats" / "biker.compressed.ply")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

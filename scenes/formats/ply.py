@@ -34,7 +34,7 @@ _FIELDS = {
 
 
 @dataclass
-class _Element:
+class Element:
     """An element of the header: how many records, and each property's name and numpy type ("list" for lists)."""
 
     name: str
@@ -48,7 +48,7 @@ def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     `clean(gaussians, where)` answers for the values: by default those that are not finite are refused by splat and field.
     """
     path = Path(path)
-    order, elements, offset = _read_header(path)
+    order, elements, offset = read_header(path)
     rest = _check_splats(path, elements)
     vertices = _read_vertices(path, order, elements, offset)
     columns = {name: _columns(vertices, names) for name, names in _FIELDS.items()}
@@ -73,7 +73,7 @@ def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
         file.write(torch.cat(parts, 1).numpy().astype("<f4", copy=False).data)
 
 
-def _read_header(path: Path) -> tuple[str, list[_Element], int]:
+def read_header(path: Path) -> tuple[str, list[Element], int]:
     """Byte order, elements, and where the data starts."""
     with open(path, "rb") as file:
         head = file.read(_MAX_HEADER)
@@ -93,7 +93,7 @@ def _read_header(path: Path) -> tuple[str, list[_Element], int]:
                 case ["format", kind, "1.0"]:
                     order = _FORMATS[kind]
                 case ["element", name, count] if count.isdigit():
-                    elements.append(_Element(name, int(count), {}))
+                    elements.append(Element(name, int(count), {}))
                 case ["property", "list", _, _, name]:
                     _add_property(elements, name, "list")
                 case ["property", kind, name]:
@@ -107,13 +107,13 @@ def _read_header(path: Path) -> tuple[str, list[_Element], int]:
     return order, elements, stop + 1
 
 
-def _add_property(elements: list[_Element], name: str, kind: str) -> None:
+def _add_property(elements: list[Element], name: str, kind: str) -> None:
     if name in elements[-1].properties:
         raise KeyError(name)
     elements[-1].properties[name] = kind
 
 
-def _check_splats(path: Path, elements: list[_Element]) -> int:
+def _check_splats(path: Path, elements: list[Element]) -> int:
     """The number of f_rest properties; ValueError saying what the file is instead where it holds no splats."""
     names = {e.name: e.properties for e in elements}
     vertex = names.get("vertex", {})
@@ -129,7 +129,7 @@ def _check_splats(path: Path, elements: list[_Element]) -> int:
     return len(rest)
 
 
-def _read_vertices(path: Path, order: str, elements: list[_Element], offset: int) -> np.ndarray:
+def _read_vertices(path: Path, order: str, elements: list[Element], offset: int) -> np.ndarray:
     """The vertex records as a structured array, mapped from the file where it is binary."""
     at = next(i for i, e in enumerate(elements) if e.name == "vertex")
     vertex, before, last = elements[at], elements[:at], at == len(elements) - 1
@@ -137,8 +137,8 @@ def _read_vertices(path: Path, order: str, elements: list[_Element], offset: int
         raise ValueError(f"{path} has list properties before or in its vertices, which is not a Gaussian splat file's layout")
     if order == "=":
         return _read_ascii(path, vertex, sum(e.count for e in before), last, offset)
-    kind = _record(vertex, order)
-    start = offset + sum(e.count * _record(e, order).itemsize for e in before)
+    kind = record(vertex, order)
+    start = offset + sum(e.count * record(e, order).itemsize for e in before)
     stop, size = start + vertex.count * kind.itemsize, path.stat().st_size
     if stop > size:
         raise ValueError(f"{path} is truncated: its header claims {vertex.count} splats, {stop} bytes in all, but it has {size}")
@@ -147,7 +147,7 @@ def _read_vertices(path: Path, order: str, elements: list[_Element], offset: int
     return np.memmap(path, kind, "r", start, (vertex.count,)) if vertex.count else np.zeros(0, kind)
 
 
-def _read_ascii(path: Path, vertex: _Element, skip: int, last: bool, offset: int) -> np.ndarray:
+def _read_ascii(path: Path, vertex: Element, skip: int, last: bool, offset: int) -> np.ndarray:
     with open(path, "rb") as file:
         file.seek(offset)
         lines = file.read().split(b"\n")
@@ -165,7 +165,7 @@ def _read_ascii(path: Path, vertex: _Element, skip: int, last: bool, offset: int
     return np.rec.fromarrays(list(values.T), dtype=np.dtype([(name, "f8") for name in vertex.properties]))
 
 
-def _record(element: _Element, order: str) -> np.dtype:
+def record(element: Element, order: str) -> np.dtype:
     return np.dtype([(name, order + kind) for name, kind in element.properties.items()])
 
 

@@ -1,0 +1,74 @@
+"""Splat files: one module a format, one registry. Each module has `load_*(path, clean)` and `save_*(path, gaussians)`.
+
+Splats keep the numbers of their file: PLY, compressed PLY, SPZ, .splat and SOG name no axes that all tools agree on, so nothing is
+turned. GLB does (glTF is Y up), so its splats are turned to this project's Z up on the way in, and its node turns them back.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from scenes.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of splat file: its name, its suffixes, and the module that reads and writes it.
+
+    ordered: whether it is written along a Morton curve, since its neighbours share a range of values or compress together.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    module: str
+    functions: str
+    ordered: bool = False
+
+    def load(self, path: Path, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
+        """The splats of a file. ValueError where it is not of this format or not whole; `clean` answers for the values."""
+        return getattr(importlib.import_module(self.module), f"load_{self.functions}")(path, clean)
+
+    def save(self, path: Path, gaussians: Gaussians) -> None:
+        """Write splats, as `arranged` has them, whole or not at all. ValueError where the format cannot hold them."""
+        getattr(importlib.import_module(self.module), f"save_{self.functions}")(path, self.arranged(gaussians))
+
+    def arranged(self, gaussians: Gaussians) -> Gaussians:
+        """The splats in the order in which this format stores them."""
+        if not self.ordered:
+            return gaussians
+        from scenes.formats.packing import morton_order
+
+        return gaussians.select(morton_order(gaussians.means))
+
+
+PLY = Format("PLY", (".ply",), "scenes.formats.ply", "ply")
+COMPRESSED_PLY = Format("compressed PLY", (".compressed.ply",), "scenes.formats.compressed_ply", "compressed_ply", ordered=True)
+USD = Format("USD", (".usdc", ".usda", ".usd"), "scenes.usd_splats", "gaussians")
+GLB = Format("GLB", (".glb",), "scenes.formats.glb", "glb")
+SPZ = Format("SPZ", (".spz",), "scenes.formats.spz", "spz")
+SPLAT = Format(".splat", (".splat",), "scenes.formats.splat", "splat")
+SOG = Format("SOG", (".sog",), "scenes.formats.sog", "sog", ordered=True)
+FORMATS = (PLY, COMPRESSED_PLY, USD, GLB, SPZ, SPLAT, SOG)
+SUFFIXES = tuple(suffix for form in FORMATS for suffix in form.suffixes)
+
+
+def named(path: Path) -> Format | None:
+    """The format that a path's name asks for, None where it is no splat file's."""
+    name = path.name.lower()
+    fits = [(len(suffix), form) for form in FORMATS for suffix in form.suffixes if name.endswith(suffix)]
+    return max(fits, key=lambda fit: fit[0])[1] if fits else None
+
+
+def found(path: Path) -> Format | None:
+    """The format of what stands at a path, None where it holds no splats: its name says, and of the two kinds of PLY its header."""
+    if path.name == "meta.json" or (path.is_dir() and (path / "meta.json").is_file()):
+        return SOG
+    form = named(path) if path.is_file() else None
+    if form in (PLY, COMPRESSED_PLY):
+        with open(path, "rb") as file:
+            head = file.read(4096)
+        return COMPRESSED_PLY if b"packed_position" in head else PLY
+    return form
