@@ -12,7 +12,8 @@ from recon.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
 from render.progress import Progress
 from scenes.asset import Asset
 from scenes.databank import Databank
-from scenes.files import USD_SUFFIXES, load
+from scenes.files import load
+from scenes.formats import GLB, PLY, found
 from scenes.gaussians import Gaussians
 from scenes.report import validate
 from scenes.sizes import odd_size
@@ -78,12 +79,13 @@ def solid_box(splats: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def holds_splats(file: Path) -> bool:
-    """Whether a file holds splats rather than a mesh: USD, or a PLY with opacities."""
-    if file.suffix.lower() != ".ply" or not file.is_file():
-        return file.suffix.lower() in USD_SUFFIXES
+    """Whether a file holds splats rather than a mesh: of the kinds that can hold either, the header says."""
+    form = found(file)
+    mark = {PLY: b"opacity", GLB: b"KHR_gaussian_splatting"}.get(form) if form else None
+    if mark is None:
+        return form is not None
     with open(file, "rb") as opened:
-        head = opened.read(4096).split(b"end_header")[0]
-    return b"opacity" in head or b"packed_position" in head
+        return mark in opened.read(1 << 20)
 
 
 def check_databank(path: Path) -> list[str]:
