@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,17 @@ from scenes.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
+class Packed:
+    """A picture inside a larger file: `name` for messages, `read()` gives its bytes."""
+
+    name: str
+    read: Callable[[], bytes] = field(repr=False)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True)
 class LogCamera:
     """A camera of the log: lens and native size, and per frame its file, time (us) and pose `world_from_cam` `[F, 4, 4]`."""
 
@@ -24,7 +36,7 @@ class LogCamera:
     lens: Lens
     width: int
     height: int
-    files: tuple[Path, ...]
+    files: tuple[Path | Packed, ...]
     times_us: torch.Tensor
     world_from_cam: torch.Tensor
 
@@ -37,7 +49,7 @@ class LogCamera:
 
         path = self.files[index]
         try:
-            with Image.open(path) as opened:
+            with Image.open(BytesIO(path.read()) if isinstance(path, Packed) else path) as opened:
                 picture = opened.convert("RGB")
         except FileNotFoundError:
             raise

@@ -40,6 +40,10 @@ PICKLES = (".pkl.gz", ".pkl")
 FRONT = ("front_camera", "front_left_camera", "front_right_camera")
 
 
+def is_pandaset(path: Path) -> bool:
+    return (path / "camera").is_dir()
+
+
 def read_pandaset(path: Path) -> Log:
     """The drive in folder `path`. FileNotFoundError and ValueError name the file that is missing or wrong."""
     lidar_times, lidar_poses = _stamped(path / "lidar")

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from recon.argoverse2 import is_argoverse2, read_argoverse2
+from recon.colmap import find_model, read_colmap
+from recon.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from recon.log import Log
+from recon.nuscenes import is_nuscenes, read_nuscenes
+from recon.pandaset import is_pandaset, read_pandaset
+from recon.waymo import is_waymo, read_waymo
 
 
 def open_log(path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
@@ -16,43 +22,42 @@ def open_log(path: str | Path, camera_height: float | None = None, metres_per_un
     a file is corrupt, or metres are given to a log that has its own.
     """
     path = Path(path)
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path} is not a folder; give the folder of one drive, as pandaset/002")
     read = metric_reader(path)
     if read is not None:
-        _without_metres(path, camera_height, metres_per_unit)
+        given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
+        if given:
+            raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
         return read(path)
-    from recon.colmap import find_model, read_colmap
-
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path} is not a folder; give the folder of one drive, as pandaset/002")
     if find_model(path) is not None:
         return read_colmap(path, camera_height, metres_per_unit)
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
     hint = f" Did you mean {inside[0]}?" if inside else ""
-    raise ValueError(f"{path} is not a known layout of a drive: {LAYOUTS}.{hint}")
+    raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")
 
 
-LAYOUTS = (
-    "PandaSet's has camera/, KITTI's raw one oxts/ and image_02/, KITTI's odometry calib.txt and times.txt, "
-    "COLMAP's cameras.bin and images.bin"
-)
+READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Log]]] = {
+    "PandaSet": (is_pandaset, read_pandaset),
+    "nuScenes": (is_nuscenes, read_nuscenes),
+    "Argoverse 2": (is_argoverse2, read_argoverse2),
+    "Waymo": (is_waymo, read_waymo),
+    "KITTI raw": (is_kitti_raw, read_kitti_raw),
+    "KITTI odometry": (is_kitti_odometry, read_kitti_odometry),
+}
+"""Readers of logs with metres of their own: whether a path is one, and what reads it."""
+
+LAYOUTS = {
+    "PandaSet": "camera/",
+    "nuScenes": "samples/ and v1.0-*/ (name a scene, as nuscenes/scene-0061)",
+    "Argoverse 2": "city_SE3_egovehicle.feather",
+    "Waymo": "camera_image/ and vehicle_pose/ (name a segment in it)",
+    "KITTI raw": "oxts/ and image_02/",
+    "KITTI odometry": "calib.txt and times.txt",
+    "COLMAP": "cameras.bin, images.bin and points3D.bin",
+}
 
 
 def metric_reader(path: Path) -> Callable[[Path], Log] | None:
-    """What reads a folder with metres of its own; None where it is another layout."""
-    from recon import kitti
-
-    if (path / "camera").is_dir():
-        from recon.pandaset import read_pandaset
-
-        return read_pandaset
-    if kitti.is_kitti_raw(path):
-        return kitti.read_kitti_raw
-    if kitti.is_kitti_odometry(path):
-        return kitti.read_kitti_odometry
-    return None
-
-
-def _without_metres(path: Path, camera_height: float | None, metres_per_unit: float | None) -> None:
-    given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
-    if given:
-        raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
+    """What reads a path that has metres of its own; None where it is another layout."""
+    return next((read for is_one, read in READERS.values() if is_one(path)), None)

@@ -69,8 +69,11 @@ def tape(street) -> Tape:
     return Tape(still, ego, {"front": front, "right": front @ translation(0.5, 0.0, 0.0)}, points)
 
 
-def check(log: Log, tape: Tape, names: dict[str, str], label: str = "car", atol: float = 1e-6) -> None:
-    """The log says what the tape does, in a world of its own. names: the log's camera by the tape's; atol: metres a pose may be off."""
+def check(log: Log, tape: Tape, names: dict[str, str], atol: float = 1e-6, lidar: float = 0.02) -> None:
+    """The log says what the tape does, in a world of its own.
+
+    names: the log's camera by the tape's; atol, lidar: metres that poses and points may be off.
+    """
     lead = log.camera(names["front"])
     home, away = inverse(lead.world_from_cam[0]), inverse(tape.camera("front", int(lead.times_us[0])).world_from_cam)
     for theirs, ours in names.items():
@@ -91,9 +94,9 @@ def check(log: Log, tape: Tape, names: dict[str, str], label: str = "car", atol:
             got = sweep.read()
             ours = got.xyz @ home[:3, :3].numpy().T + home[:3, 3].numpy()
             truth = tape.points @ away[:3, :3].numpy().T + away[:3, 3].numpy()
-            assert np.abs(ours - truth).max() < 0.02 and np.abs(got.times_us - sweep.time_us).max() <= STEP_US
+            assert np.abs(ours - truth).max() < lidar and np.abs(got.times_us - sweep.time_us).max() <= STEP_US
     if log.tracks:
-        assert {(t.moving, t.label) for t in log.tracks} == {(True, label), (False, label)}
+        assert {(t.moving, t.label) for t in log.tracks} == {(True, "car"), (False, "car")}
         assert [t.name for t in log.tracks] == ["veh_1", "veh_2"]
         moving = next(t for t in log.tracks if t.moving)
         parked = next(t for t in log.tracks if not t.moving)

@@ -1,0 +1,181 @@
+"""Reads a scene of nuScenes from its json tables (Caesar et al. 2020; the tables as in the devkit's docs/schema_nuscenes.md).
+
+`nuscenes/scene-0061`: the data set's folder, with samples/, perhaps sweeps/, and a v1.0-*/ of tables, then the scene's name. The body is
+the ego frame (rear axle, x forward, y left, z up), the world the map less its place at the start. Boxes are annotated at 2 Hz, centres
+and sizes as width, length, height. Sweeps are published free of the car's own motion, without a time for each point.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
+from recon.tracks import Boxes, slug, tracks_of
+from scenes.lenses import Pinhole
+from scenes.names import unknown
+from scenes.poses import pose_from, translation
+from scenes.trajectory import Trajectory
+
+FRONT = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT")
+LABELS = {
+    "construction": "construction-vehicle", "emergency": "emergency-vehicle", "trafficcone": "cone", "adult": "pedestrian",
+    "child": "pedestrian", "construction_worker": "pedestrian", "police_officer": "pedestrian", "stroller": "pedestrian",
+    "wheelchair": "pedestrian", "personal_mobility": "scooter",
+}  # fmt: skip
+
+
+def is_nuscenes(path: Path) -> bool:
+    """Whether a path is the data set's folder, or one of its scenes (which need be no folder)."""
+    return any((root / "samples").is_dir() and any(root.glob("v1.0-*")) for root in (path, path.parent))
+
+
+def read_nuscenes(path: Path) -> Log:
+    """The scene that `path` names. FileNotFoundError and ValueError name what is missing: scene, table, key or file."""
+    root, name = (path, None) if (path / "samples").is_dir() else (path.parent, path.name)
+    tables, scene = _scene(root, name)
+    samples = {s["token"]: s for s in tables.rows("sample") if s["scene_token"] == scene["token"]}
+    taken = sorted((d for d in tables.rows("sample_data") if d["sample_token"] in samples), key=lambda d: d["timestamp"])
+    if not taken:
+        raise ValueError(f"{tables.folder / 'sample_data.json'} has nothing of {scene['name']}; fetch the tables of the part that has it")
+    mounts = {row["token"]: row for row in tables.rows("calibrated_sensor")}
+    channels = {row["token"]: row["channel"] for row in tables.rows("sensor")}
+    wanted = {d["ego_pose_token"] for d in taken}
+    egos = {row["token"]: row for row in tables.rows("ego_pose") if row["token"] in wanted}
+    moments = {int(row["timestamp"]): _pose(row) for row in egos.values()}
+    times = np.array(sorted(moments), dtype=np.int64)
+    bodies = torch.stack([moments[int(t)] for t in times])
+    origin = bodies[0, :3, 3].clone()
+    home = translation(*(-origin).tolist())
+    ego = lengthened(times, home @ bodies)
+
+    by_channel: dict[str, list[dict]] = {}
+    for d in taken:
+        # frames between the annotated ones come as a download of their own, which need not be there
+        if d["is_key_frame"] or (root / d["filename"]).is_file():
+            by_channel.setdefault(channels[mounts[d["calibrated_sensor_token"]]["sensor_token"]], []).append(d)
+    cameras, sweeps = {}, []
+    for channel, frames in sorted(by_channel.items(), key=lambda item: (item[0] != FRONT[0], item[0])):
+        mount = mounts[frames[0]["calibrated_sensor_token"]]
+        files = tuple(root / d["filename"] for d in frames)
+        lost = next((f for f in files if not f.is_file()), None)
+        if lost is not None and (channel.startswith("CAM") or channel == "LIDAR_TOP"):
+            raise FileNotFoundError(f"{lost} is missing; {tables.folder / 'sample_data.json'} names it: fetch the part that has it")
+        poses = torch.stack([home @ _pose(egos[d["ego_pose_token"]]) @ _pose(mount) for d in frames])
+        stamps = torch.tensor([int(d["timestamp"]) for d in frames])
+        if channel.startswith("CAM"):
+            k = mount["camera_intrinsic"]
+            lens = Pinhole(float(k[0][0]), float(k[1][1]), float(k[0][2]), float(k[1][2]))
+            cameras[channel] = LogCamera(channel, lens, int(frames[0]["width"]), int(frames[0]["height"]), files, stamps, poses)
+        elif channel == "LIDAR_TOP":
+            when = stamps.tolist()
+            sweeps = [Sweep(i, t, partial(_points, files[i], poses[i], t)) for i, t in enumerate(when)]
+    if not cameras:
+        raise ValueError(f"{scene['name']} in {tables.folder} has no camera; nuScenes' are CAM_FRONT and five more")
+    meta: dict = {
+        "name": f"nuscenes-{scene['name']}", "source": f"nuScenes {scene['name']}", "licence": "CC BY-NC-SA 4.0",
+        "attribution": "nuScenes by Motional", "body": "ego frame, x forward, y left, z up", "world_origin": origin.tolist(),
+    }  # fmt: skip
+    tracks = _tracks(tables, samples, by_channel.get("LIDAR_TOP", []), home, ego)
+    return Log(meta["name"], path, cameras, tuple(sweeps), tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+
+
+class Tables:
+    """The tables of one version, read as they are asked for."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def rows(self, name: str) -> list[dict]:
+        """The rows of a table. FileNotFoundError, ValueError naming the file."""
+        path = self.folder / f"{name}.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing; nuScenes' metadata comes as a download of its own: unpack it there")
+        try:
+            rows = json.loads(path.read_text())
+        except (json.JSONDecodeError, UnicodeDecodeError) as problem:
+            raise ValueError(f"{path} is not json ({problem}); fetch it again") from None
+        lost = [key for key in KEYS[name] if not isinstance(rows, list) or any(key not in row for row in rows)]
+        if lost:
+            raise ValueError(f'{path} has rows without "{lost[0]}"; it is not as nuScenes writes it')
+        return rows
+
+
+KEYS = {
+    "scene": ("token", "name"),
+    "sample": ("token", "timestamp", "scene_token"),
+    "sample_data": (
+        "sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "is_key_frame", "filename", "width", "height",
+    ),
+    "calibrated_sensor": ("token", "sensor_token", "translation", "rotation", "camera_intrinsic"),
+    "sensor": ("token", "channel"),
+    "ego_pose": ("token", "timestamp", "translation", "rotation"),
+    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
+    "instance": ("token", "category_token"),
+    "category": ("token", "name"),
+}  # fmt: skip
+
+
+def _scene(root: Path, name: str | None) -> tuple[Tables, dict]:
+    """The tables that have the named scene, and its row; without a name, the only scene there is."""
+    known: dict[str, tuple[Tables, dict]] = {}
+    for folder in sorted(p for p in root.glob("v1.0-*") if p.is_dir()):
+        tables = Tables(folder)
+        known |= {row["name"]: (tables, row) for row in tables.rows("scene")}
+    if name is None and len(known) == 1:
+        return next(iter(known.values()))
+    if name is None:
+        some = ", ".join(list(known)[:8]) or "none"
+        raise ValueError(f"{root} holds {len(known)} scenes ({some}); name one, as {root / next(iter(known), 'scene-0061')}")
+    if name not in known:
+        raise ValueError(unknown("scene", name, str(root), known))
+    return known[name]
+
+
+def _pose(row: dict) -> torch.Tensor:
+    """The pose of a row's translation (metres) and rotation (wxyz)."""
+    try:
+        return pose_from(torch.tensor(row["rotation"], dtype=torch.float64), torch.tensor(row["translation"], dtype=torch.float64))
+    except (TypeError, ValueError) as problem:
+        raise ValueError(f"row {row.get('token', '?')} of nuScenes' tables has no pose ({problem})") from None
+
+
+def _points(file: Path, world_from_lidar: torch.Tensor, stamp: int) -> LidarPoints:
+    """A sweep of float32 x, y, z, intensity, ring, in the lidar's frame."""
+    values = np.fromfile(file, dtype="<f4")
+    if len(values) % 5:
+        raise ValueError(f"{file} is cut off: {len(values)} numbers are no rows of five; fetch it again")
+    xyz = values.reshape(-1, 5)[:, :3].astype(np.float64)
+    xyz = xyz[np.isfinite(xyz).all(1)] @ world_from_lidar[:3, :3].numpy().T + world_from_lidar[:3, 3].numpy()
+    return LidarPoints(xyz, np.full(len(xyz), stamp), np.zeros(len(xyz), np.int64))
+
+
+def _tracks(tables: Tables, samples: dict, sweeps: list[dict], home: torch.Tensor, ego: Trajectory) -> tuple[Track, ...]:
+    """Tracks of the annotated instances, at the time of their sample's own sweep."""
+    if not (tables.folder / "sample_annotation.json").is_file():
+        return ()
+    at = {token: int(s["timestamp"]) for token, s in samples.items()}
+    at |= {d["sample_token"]: int(d["timestamp"]) for d in sweeps if d["is_key_frame"]}
+    classes = {row["token"]: row["name"] for row in tables.rows("category")}
+    kinds = {row["token"]: classes[row["category_token"]] for row in tables.rows("instance")}
+    seen: dict[str, list[dict]] = {}
+    for row in tables.rows("sample_annotation"):
+        if row["sample_token"] in samples:
+            seen.setdefault(row["instance_token"], []).append(row)
+    found = []
+    for instance, rows in seen.items():
+        times = np.array([at[row["sample_token"]] for row in rows], dtype=np.int64)
+        sizes = np.array([[row["size"][1], row["size"][0], row["size"][2]] for row in rows])
+        base = torch.stack([home @ _pose(row) @ translation(0.0, 0.0, -row["size"][2] / 2) for row in rows])
+        found.append(Boxes(instance, label_of(kinds[instance]), times, base, sizes))
+    return tracks_of(found, ego, str(tables.folder / "sample_annotation.json"))
+
+
+def label_of(category: str) -> str:
+    """`vehicle.bus.rigid` is bus, `human.pedestrian.adult` pedestrian, `movable_object.trafficcone` cone."""
+    parts = category.split(".")
+    return slug(next((p for p in parts[1:] if p in LABELS), parts[min(1, len(parts) - 1)]), LABELS)

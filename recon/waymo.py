@@ -1,0 +1,211 @@
+"""Reads a segment of the Waymo Open Dataset, version 2 (Sun et al. 2020; columns as in waymo_open_dataset/v2/perception).
+
+`waymo/training/<segment>`: the folder that has camera_image/, camera_calibration/, vehicle_pose/, and lidar/, lidar_calibration/,
+lidar_pose/, lidar_box/ where lidar and boxes are wanted, then the segment's name, a parquet file in each of them. The body is the
+vehicle frame; cameras look along their own x, with y left and z up, through OpenCV's lens. Lidar comes as range images: of the top lidar
+with a pose a pixel, since it turns while the car drives.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.arrow import read_cell, read_table
+from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
+from recon.tracks import Boxes, tracks_of
+from scenes.lenses import OpenCV
+from scenes.names import unknown
+from scenes.poses import inverse, translation, yaw
+from scenes.trajectory import Trajectory
+
+CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
+LABELS = {1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
+TOP = 1
+FRONT = ("front", "front_left", "front_right")
+OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+IMAGE = "[CameraImageComponent].image"
+WHEN = "key.frame_timestamp_micros"
+LENS = tuple(f"[CameraCalibrationComponent].intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
+BOX = tuple(f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading"))
+
+
+def is_waymo(path: Path) -> bool:
+    """Whether a path is a folder of segments, or one of its segments (which are no folders)."""
+    return any((root / "camera_image").is_dir() and (root / "vehicle_pose").is_dir() for root in (path, path.parent))
+
+
+def read_waymo(path: Path) -> Log:
+    """The segment that `path` names. FileNotFoundError and ValueError name what is missing: segment, component or column."""
+    root, name = (path, None) if (path / "vehicle_pose").is_dir() else (path.parent, path.name.removesuffix(".parquet"))
+    segment = _segment(root, name)
+
+    def component(kind: str) -> Path:
+        return root / kind / f"{segment}.parquet"
+
+    pose_column = "[VehiclePoseComponent].world_from_vehicle.transform"
+    table = read_table(component("vehicle_pose"), (WHEN, pose_column))
+    order = np.argsort(table[WHEN])
+    times = table[WHEN][order].astype(np.int64)
+    bodies = torch.stack([_matrix(table[pose_column][i], component("vehicle_pose")) for i in order])
+    origin = bodies[0, :3, 3].clone()
+    home = translation(*(-origin).tolist())
+    ego = lengthened(times, home @ bodies)
+    cameras = _cameras(component, home)
+    meta: dict = {
+        "name": f"waymo-{segment}", "source": f"Waymo Open Dataset segment {segment}", "licence": "Waymo Dataset License Agreement",
+        "attribution": "Waymo Open Dataset by Waymo", "body": "vehicle frame, x forward, y left, z up", "world_origin": origin.tolist(),
+    }  # fmt: skip
+    sweeps = tuple(Sweep(i, t, partial(_points, component, t, home)) for i, t in enumerate(_swept(component)))
+    tracks = _tracks(component("lidar_box"), ego)
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+
+
+def _segment(root: Path, name: str | None) -> str:
+    known = sorted(p.stem for p in (root / "vehicle_pose").glob("*.parquet"))
+    if name is None and len(known) == 1:
+        return known[0]
+    if name is None:
+        some = ", ".join(known[:4]) or "none"
+        raise ValueError(f"{root} holds {len(known)} segments ({some}); name one, as {root / (known[0] if known else '<segment>')}")
+    if name not in known:
+        raise ValueError(unknown("segment", name, str(root), known))
+    return name
+
+
+def _matrix(values, path: Path) -> torch.Tensor:
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    if len(flat) != 16 or not np.isfinite(flat).all():
+        raise ValueError(f"{path} holds a pose of {len(flat)} numbers; 16 finite ones make one")
+    return torch.from_numpy(flat.reshape(4, 4).copy())
+
+
+def _cameras(component, home: torch.Tensor) -> dict[str, LogCamera]:
+    where, mount = component("camera_calibration"), "[CameraCalibrationComponent].extrinsic.transform"
+    width, height = (f"[CameraCalibrationComponent].{k}" for k in ("width", "height"))
+    table = read_table(where, ("key.camera_name", mount, width, height, *LENS))
+    images = component("camera_image")
+    stamp, pose = "[CameraImageComponent].pose_timestamp", "[CameraImageComponent].pose.transform"
+    taken = read_table(images, ("key.camera_name", WHEN, stamp, pose), others=False)  # without the pictures themselves
+    cameras = {}
+    for row, number in enumerate(table["key.camera_name"].tolist()):
+        mine = np.flatnonzero(taken["key.camera_name"] == number)
+        mine = mine[np.argsort(taken[WHEN][mine])]
+        if not len(mine):
+            continue
+        moments = np.round(taken[stamp][mine] * 1e6).astype(np.int64)
+        name = CAMERAS.get(int(number), f"camera_{number}")
+        lens = OpenCV(*(float(table[k][row]) for k in LENS))
+        body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
+        poses = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine]) @ body_from_cam
+        files = tuple(Packed(f"{images}, {name} at {taken[WHEN][i]}", partial(read_cell, images, IMAGE, int(i))) for i in mine)
+        size = int(table[width][row]), int(table[height][row])
+        cameras[name] = LogCamera(name, lens, *size, files, torch.from_numpy(moments), poses)
+    if not cameras:
+        raise ValueError(f"{images} has no picture of the cameras of {where}")
+    return dict(sorted(cameras.items(), key=lambda item: (item[0] not in FRONT, item[0])))
+
+
+def _swept(component) -> list[int]:
+    """The sweeps' stamps; none where the lidar was not fetched."""
+    if not component("lidar").is_file():
+        return []
+    for kind in ("lidar_calibration", "lidar_pose"):
+        if not component(kind).is_file():
+            raise FileNotFoundError(f"{component(kind)} is missing; lidar/ cannot be read without it: fetch it too")
+    return [int(t) for t in np.unique(read_table(component("lidar"), (WHEN,), others=False)[WHEN])]
+
+
+def _points(component, stamp: int, home: torch.Tensor) -> LidarPoints:
+    """First returns of all lidars at a stamp, in the world."""
+    values, shape = (f"[LiDARComponent].range_image_return1.{k}" for k in ("values", "shape"))
+    table = read_table(component("lidar"), ("key.laser_name", WHEN, values, shape), others=False, rows=(WHEN, stamp))
+    of_pixel = "[LiDARPoseComponent].range_image_return1."
+    keys = ("key.laser_name", WHEN, f"{of_pixel}values", f"{of_pixel}shape")
+    turning = read_table(component("lidar_pose"), keys, others=False, rows=(WHEN, stamp))
+    prefix = "[LiDARCalibrationComponent]."
+    calibration = read_table(
+        component("lidar_calibration"),
+        ("key.laser_name", f"{prefix}extrinsic.transform", *(f"{prefix}beam_inclination.{k}" for k in ("min", "max"))),
+    )
+    poses = "[VehiclePoseComponent].world_from_vehicle.transform"
+    vehicle = read_table(component("vehicle_pose"), (WHEN, poses), others=False, rows=(WHEN, stamp))
+    body = _matrix(vehicle[poses][0], component("vehicle_pose"))
+    xyz, sensor = [], []
+    for row, laser in enumerate(table["key.laser_name"].tolist()):
+        at = int(np.flatnonzero(calibration["key.laser_name"] == laser)[0])
+        image = _image(table[values][row], table[shape][row], component("lidar"))
+        mount = _matrix(calibration[f"{prefix}extrinsic.transform"][at], component("lidar_calibration"))
+        beams = calibration.get(f"{prefix}beam_inclination.values")
+        limits = [float(calibration[f"{prefix}beam_inclination.{k}"][at]) for k in ("min", "max")]
+        local, hit = _from_range(image[..., 0], mount.numpy(), None if beams is None else beams[at], limits)
+        placed = local @ mount[:3, :3].numpy().T + mount[:3, 3].numpy()
+        own = np.flatnonzero(turning["key.laser_name"] == laser)
+        if len(own):
+            pixel = _image(turning[keys[2]][own[0]], turning[keys[3]][own[0]], component("lidar_pose"))[hit].astype(np.float64)
+            placed = np.einsum("nij,nj->ni", _rotations(pixel[:, :3]), placed) + pixel[:, 3:]
+        else:
+            placed = placed @ body[:3, :3].numpy().T + body[:3, 3].numpy()
+        xyz.append(placed + home[:3, 3].numpy())
+        sensor.append(np.full(len(placed), laser))
+    points = np.concatenate(xyz) if xyz else np.zeros((0, 3))
+    return LidarPoints(points, np.full(len(points), stamp), np.concatenate(sensor) if sensor else np.zeros(0, np.int64))
+
+
+def _image(values, shape, path: Path) -> np.ndarray:
+    flat, size = np.asarray(values, dtype=np.float32), tuple(int(n) for n in shape)
+    if len(size) != 3 or flat.size != np.prod(size):
+        raise ValueError(f"{path} holds a range image of {flat.size} numbers for the shape {size}; fetch it again")
+    return flat.reshape(size)
+
+
+def _from_range(ranges: np.ndarray, mount: np.ndarray, beams, limits: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Points `[N, 3]` in the lidar's frame of a range image `[H, W]`, and the mask of pixels that have one.
+
+    Rows run from the highest beam down, columns from behind over the left to behind again, less the lidar's own heading
+    (waymo_open_dataset/utils/range_image_utils.py).
+    """
+    height, width = ranges.shape
+    if beams is None or np.size(beams) != height:
+        beams = limits[0] + (np.arange(height) + 0.5) / height * (limits[1] - limits[0])
+    inclination = np.asarray(beams, dtype=np.float64)[::-1, None]
+    azimuth = (1 - 2 * (np.arange(width) + 0.5) / width) * np.pi - np.arctan2(mount[1, 0], mount[0, 0])
+    hit = ranges > 0
+    level = np.cos(inclination) * ranges
+    xyz = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(inclination) * ranges + 0 * azimuth], -1)
+    return xyz[hit], hit
+
+
+def _rotations(angles: np.ndarray) -> np.ndarray:
+    """Rz(yaw) Ry(pitch) Rx(roll) `[N, 3, 3]` of roll, pitch, yaw `[N, 3]` in radians."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles).T, np.sin(angles).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(r, -1) for r in rows], -2)
+
+
+def _base(row: np.ndarray) -> torch.Tensor:
+    """The place of a box's base centre, of its middle and size."""
+    return translation(float(row[0]), float(row[1]), float(row[2] - row[5] / 2))
+
+
+def _tracks(path: Path, ego: Trajectory) -> tuple:
+    """Tracks of the boxes, which stand in the vehicle frame by their middles; signs are no objects that move."""
+    if not path.is_file():
+        return ()
+    kind = "[LiDARBoxComponent].type"
+    table = read_table(path, ("key.laser_object_id", WHEN, kind, *BOX))
+    times = table[WHEN].astype(np.int64)
+    rows = np.stack([table[k] for k in BOX], 1).astype(np.float64)
+    found = []
+    for name in dict.fromkeys(table["key.laser_object_id"].tolist()):
+        mine = np.flatnonzero(table["key.laser_object_id"] == name)
+        poses = [ego.near(int(times[i])) @ _base(rows[i]) @ yaw(rows[i, 6]) for i in mine]
+        found.append(Boxes(str(name), LABELS.get(int(table[kind][mine[0]]), "object"), times[mine], torch.stack(poses), rows[mine, 3:6]))
+    return tracks_of(found, ego, str(path))

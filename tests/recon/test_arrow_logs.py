@@ -1,0 +1,156 @@
+"""The readers of data sets that come as Arrow tables: Argoverse 2 (feather) and Waymo (parquet)."""
+
+import shutil
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'sidestep[arrow]'")
+
+from made_argoverse2 import NAMES as RING  # noqa: E402
+from made_argoverse2 import write_argoverse2  # noqa: E402
+from made_tape import check, tape  # noqa: E402
+from made_waymo import NAMES as FIVE  # noqa: E402
+from made_waymo import SEGMENT, near_points, write_waymo  # noqa: E402
+
+from recon import open_log  # noqa: E402
+from recon.waymo import _from_range, _rotations  # noqa: E402
+from scenes.lenses import OpenCV, Pinhole  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def recorded(street):
+    return tape(street)
+
+
+@pytest.fixture(scope="module")
+def near(recorded):
+    return replace(recorded, points=near_points(recorded))
+
+
+@pytest.fixture(scope="module")
+def argoverse(recorded, tmp_path_factory):
+    return write_argoverse2(tmp_path_factory.mktemp("av2") / "0b97", recorded)
+
+
+@pytest.fixture(scope="module")
+def waymo(near, tmp_path_factory):
+    return write_waymo(tmp_path_factory.mktemp("waymo") / "training", near)
+
+
+@pytest.fixture
+def own_argoverse(argoverse, tmp_path):
+    return shutil.copytree(argoverse, tmp_path / "0b97")
+
+
+@pytest.fixture
+def own_waymo(waymo, tmp_path):
+    return shutil.copytree(waymo, tmp_path / "training")
+
+
+def test_an_argoverse_log_reads_as_it_was_recorded(argoverse, recorded):
+    log = open_log(argoverse)
+    check(log, recorded, RING, atol=1e-5)
+    assert log.front == ("ring_front_center", "ring_front_right") and len(log.tracks) == 2
+    assert isinstance(log.camera("ring_front_center").lens, Pinhole)  # its pictures are published undistorted
+    assert set(log.sweeps[0].read().sensor.tolist()) == {0, 1}
+
+
+def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
+    log = open_log(waymo / SEGMENT)
+    check(log, near, FIVE, atol=1e-5, lidar=0.1)
+    assert log.front == ("front", "front_right") and len(log.tracks) == 2
+    assert isinstance(log.camera("front").lens, OpenCV)
+    assert open_log(waymo).name == log.name  # the only segment needs no name
+
+
+def test_a_range_images_middle_column_looks_ahead_and_its_first_row_up():
+    ranges = np.zeros((3, 4))
+    ranges[0, 1], ranges[2, 3] = 10.0, 5.0
+    xyz, hit = _from_range(ranges, np.eye(4), np.array([-0.3, 0.0, 0.2]), [-0.3, 0.2])
+    assert hit.sum() == 2
+    np.testing.assert_allclose(xyz[0], [10 * np.cos(0.2) * np.cos(np.pi / 4)] * 2 + [10 * np.sin(0.2)], atol=1e-12)
+    np.testing.assert_allclose(xyz[1], [-5 * np.cos(0.3) * np.cos(np.pi / 4)] * 2 + [-5 * np.sin(0.3)], atol=1e-12)
+    turned, _ = _from_range(ranges, np.array([[0.0, -1], [1, 0]]), None, [-0.3, 0.3])  # the lidar's own heading is taken back
+    np.testing.assert_allclose(turned[0, :2] / np.linalg.norm(turned[0, :2]), [np.cos(np.pi / 4), -np.sin(np.pi / 4)], atol=1e-12)
+
+
+def test_pixel_poses_turn_by_roll_then_pitch_then_yaw():
+    from scipy.spatial.transform import Rotation
+
+    angles = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    np.testing.assert_allclose(_rotations(angles), Rotation.from_euler("xyz", angles).as_matrix(), atol=1e-12)
+
+
+def test_a_segment_must_exist(own_waymo):
+    with pytest.raises(ValueError, match=f'segment "10017_000" is not in .*; it has {SEGMENT}'):
+        open_log(own_waymo / "10017_000")
+    shutil.copy(own_waymo / f"vehicle_pose/{SEGMENT}.parquet", own_waymo / "vehicle_pose/other.parquet")
+    with pytest.raises(ValueError, match="holds 2 segments"):
+        open_log(own_waymo)
+
+
+@pytest.mark.parametrize("kind", ["vehicle_pose", "camera_image", "camera_calibration", "lidar_pose", "lidar_calibration"])
+def test_missing_and_cut_components_are_named(own_waymo, kind):
+    path = own_waymo / kind / f"{SEGMENT}.parquet"
+    whole = path.read_bytes()
+    if not kind.startswith("lidar"):
+        path.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(ValueError, match=f"{kind}/.*is cut off or corrupt"):
+            open_log(own_waymo / SEGMENT)
+    if kind != "vehicle_pose":  # without it there is no segment
+        path.unlink()
+        with pytest.raises(FileNotFoundError, match=f"{kind}/.*is missing"):
+            open_log(own_waymo / SEGMENT)
+
+
+def test_segments_without_lidar_or_boxes_are_read(own_waymo):
+    for kind in ("lidar", "lidar_box"):
+        shutil.rmtree(own_waymo / kind)
+    log = open_log(own_waymo / SEGMENT)
+    assert log.sweeps == () and log.tracks == ()
+
+
+@pytest.mark.parametrize(
+    "file", ["city_SE3_egovehicle.feather", "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"]
+)
+def test_missing_and_cut_feather_files_are_named(own_argoverse, file):
+    path = own_argoverse / file
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match=f"{path.name} is cut off or corrupt"):
+        open_log(own_argoverse)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{path.name} is missing"):
+        open_log(own_argoverse)
+
+
+def test_a_column_that_is_missing_is_named(own_argoverse):
+    import pandas as pd
+
+    path = own_argoverse / "calibration/intrinsics.feather"
+    pd.read_feather(path).drop(columns="fx_px").to_feather(path)
+    with pytest.raises(ValueError, match='intrinsics.feather has no column "fx_px"; it has sensor_name'):
+        open_log(own_argoverse)
+
+
+def test_a_log_of_the_test_split_has_no_boxes(own_argoverse):
+    (own_argoverse / "annotations.feather").unlink()
+    shutil.rmtree(own_argoverse / "sensors/cameras/ring_front_right")
+    log = open_log(own_argoverse)
+    assert log.tracks == () and list(log.cameras) == ["ring_front_center"]
+
+
+def test_without_pyarrow_the_fix_is_named(argoverse, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ValueError, match=r"pip install 'sidestep\[arrow\]'"):
+        open_log(argoverse)
+
+
+def test_pictures_come_from_a_row_of_the_parquet_file(waymo, near):
+    camera = open_log(waymo / SEGMENT).camera("front_right")
+    truth = [near.image("right", int(t)) for t in camera.times_us]
+    off = torch.tensor([[float(np.abs(camera.image(i).astype(int) - t).mean()) for t in truth] for i in range(len(truth))])
+    assert off.argmin(1).tolist() == list(range(len(truth)))

@@ -1,0 +1,73 @@
+import json
+import shutil
+
+import pytest
+from made_nuscenes import NAMES, write_nuscenes
+from made_tape import check, tape
+
+from recon import open_log
+from recon.nuscenes import label_of
+
+
+@pytest.fixture(scope="module")
+def recorded(street):
+    return tape(street)
+
+
+@pytest.fixture(scope="module")
+def data_set(recorded, tmp_path_factory):
+    return write_nuscenes(tmp_path_factory.mktemp("data") / "nuscenes", recorded)
+
+
+@pytest.fixture
+def own(data_set, tmp_path):
+    return shutil.copytree(data_set, tmp_path / "nuscenes")
+
+
+def test_a_scene_reads_as_it_was_recorded(data_set, recorded):
+    log = open_log(data_set / "scene-0061")
+    check(log, recorded, NAMES)
+    assert log.front == ("CAM_FRONT", "CAM_FRONT_RIGHT") and len(log.tracks) == 2 and log.name == "nuscenes-scene-0061"
+
+
+def test_a_scene_must_be_named_and_exist(data_set):
+    with pytest.raises(ValueError, match="holds 2 scenes .scene-0061, scene-0103.; name one, as .*scene-0061"):
+        open_log(data_set)
+    with pytest.raises(ValueError, match='scene "scene-0016" is not in .*Did you mean scene-0061'):
+        open_log(data_set / "scene-0016")
+    with pytest.raises(ValueError, match="has nothing of scene-0103"):
+        open_log(data_set / "scene-0103")
+
+
+def test_a_missing_picture_is_named(own):
+    file = next((own / "samples/CAM_FRONT").iterdir())
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{file.name} is missing"):
+        open_log(own / "scene-0061")
+
+
+@pytest.mark.parametrize("table", ["sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor"])
+def test_missing_and_wrong_tables_are_named(own, table):
+    path = own / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    for key in ("token", "sample_token", "channel"):
+        if key in rows[0]:
+            path.write_text(json.dumps([{k: v for k, v in row.items() if k != key} for row in rows]))
+    with pytest.raises(ValueError, match=f"{table}.json has rows without"):
+        open_log(own / "scene-0061")
+    path.write_text("[{")
+    with pytest.raises(ValueError, match=f"{table}.json is not json"):
+        open_log(own / "scene-0061")
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{table}.json is missing"):
+        open_log(own / "scene-0061")
+
+
+def test_the_test_part_has_no_boxes(own):
+    (own / "v1.0-mini/sample_annotation.json").unlink()
+    assert open_log(own / "scene-0061").tracks == ()
+
+
+def test_categories_become_classes():
+    names = ("vehicle.car", "vehicle.bus.rigid", "human.pedestrian.adult", "movable_object.trafficcone", "vehicle.construction", "animal")
+    assert [label_of(n) for n in names] == ["car", "bus", "pedestrian", "cone", "construction-vehicle", "animal"]
