@@ -19,6 +19,7 @@ from tyro.conf import UseAppendAction, subcommand
 
 from enhance.commands import Enhance, Pairs, Train
 from enhance.demo import Demo
+from enhance.doctor import Doctor
 from recon.commands import Assets, Recon
 from render.outputs import check_outputs
 from scenes.commands import Convert, Edit, Info, Validate
@@ -173,7 +174,7 @@ def check_device(device: str) -> None:
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
 COMMANDS = {
     "recon": Recon, "assets": Assets, "insert": Insert, "edit": Edit, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
-    "convert": Convert, "info": Info, "validate": Validate, "demo": Demo,
+    "convert": Convert, "info": Info, "validate": Validate, "doctor": Doctor, "demo": Demo,
 }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
-COMMANDS = ["recon", "assets", "insert", "edit", "render", "pairs", "train", "enhance", "convert", "info", "validate", "demo"]
+COMMANDS = ["recon", "assets", "insert", "edit", "render", "pairs", "train", "enhance", "convert", "info", "validate", "doctor", "demo"]
 ORDER = ["scenes", "render", "recon", "enhance"]
 
 
