@@ -18,23 +18,27 @@ from render.kernels.types import OPTIONS, TILE, lanes
 CHAINS = 8
 
 
-def timed(work: Callable[[], object], repeat: int) -> float:
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+"""cpu: the time of all threads together, for machines that others use as well."""
+
+
+def timed(work: Callable[[], object], repeat: int, clock: str = "wall") -> float:
     """Median milliseconds of `work()` after one warm-up."""
     work()
     times = []
     for _ in range(repeat):
-        start = time.perf_counter()
+        start = CLOCKS[clock]()
         work()
-        times.append(1000 * (time.perf_counter() - start))
+        times.append(1000 * (CLOCKS[clock]() - start))
     return statistics.median(times)
 
 
-def in_turns(works: dict[str, Callable[[], object]], repeat: int, rounds: int = 3) -> dict[str, float]:
+def in_turns(works: dict[str, Callable[[], object]], repeat: int, clock: str = "wall", rounds: int = 3) -> dict[str, float]:
     """Median milliseconds of each, in rounds that alternate, so that a change of the machine's speed meets all alike."""
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(rounds):
         for name, work in works.items():
-            times[name].append(timed(work, max(1, repeat // rounds)))
+            times[name].append(timed(work, max(1, repeat // rounds), clock))
     return {name: statistics.median(values) for name, values in times.items()}
 
 

@@ -1,6 +1,6 @@
 """Milliseconds of whole frames, projection to image, on every preset, and beside the prototype's kernels on the same splats.
 
-    python -m tests.bench.speed [--only NAME,NAME] [--drive FOLDER] [--lund FOLDER] [--repeat 9] [--plot PNG] [--json FILE]
+    python -m tests.bench.speed [--only NAME,NAME] [--drive FOLDER] [--lund FOLDER] [--repeat 9] [--clock cpu] [--plot PNG] [--json FILE]
 
 Each preset runs in a process of its own, so that its peak memory is its own. Nothing here asserts a time.
 """
@@ -17,12 +17,12 @@ import torch
 
 from render import RenderConfig, rasterize
 from tests.bench.limit import forward_limit
-from tests.bench.measure import in_turns, lane_rate, peak_memory, timed
+from tests.bench.measure import CLOCKS, in_turns, lane_rate, peak_memory, timed
 from tests.bench.plot import Chart, save
 from tests.bench.presets import Missing, Preset, load_prototype, presets, uniform
 
 
-def measure(name: str, preset: Preset, repeat: int) -> dict:
+def measure(name: str, preset: Preset, repeat: int, clock: str) -> dict:
     """One preset's row."""
     threads, camera = torch.get_num_threads(), preset.camera
     leaves = [_leaf(p) for p in preset.placed]
@@ -43,7 +43,7 @@ def measure(name: str, preset: Preset, repeat: int) -> dict:
         tiles.run(lanes.forward, 1)
         tiles.set_grad(torch.nn.functional.pad(weights, (0, 0, 0, tiles.tx * 16 - camera.width, 0, tiles.ty * 16 - camera.height)).numpy())
         works |= {f"prototype {k}": lambda k=k: tiles.run(getattr(lanes, k), threads) for k in ("forward", "backward")}
-    ms = in_turns(works, repeat)
+    ms = in_turns(works, repeat, clock)
     if name == "uniform-100k":
         more = {
             "unscented": lambda: rasterize(preset.placed, camera, ("rgb",)),
@@ -54,8 +54,8 @@ def measure(name: str, preset: Preset, repeat: int) -> dict:
             "max_error 1/1024": lambda: forward(config=RenderConfig(max_error=1 / 1024)),
             "max_error 1/4096": lambda: forward(config=RenderConfig(max_error=1 / 4096)),
         }
-        ms |= in_turns(more, repeat)
-        ms["prototype plain"] = timed(lambda: tiles.run(lanes.plain, threads), 1)
+        ms |= in_turns(more, repeat, clock)
+        ms["prototype plain"] = timed(lambda: tiles.run(lanes.plain, threads), 1, clock)
     row = {"name": name, "splats": len(preset), "size": f"{camera.width}x{camera.height}", "threads": threads, "ms": ms, "memory": memory}
     if name == "uniform-100k":
         row["limit_ms"] = forward_limit(preset) / lane_rate(threads) * 1000
@@ -106,15 +106,15 @@ def details(row: dict) -> str:
     return "\n".join(lines)
 
 
-def scaling(repeat: int) -> list[Chart]:
+def scaling(repeat: int, clock: str) -> list[Chart]:
     """Forward and forward + backward over splats, over pixels, over threads."""
     charts = [Chart(f"Time over {x}", x, "ms", {}) for x in ("splats", "pixels", "threads")]
 
     def both(chart: Chart, x: float, n: int, width: int, height: int) -> None:
         g, camera, model = uniform(n, width, height)
         leaves = g.map(lambda t: t.clone().requires_grad_())
-        forward = timed(lambda: rasterize(g, camera, ("rgb",), model=model), repeat)
-        whole = timed(lambda: rasterize(leaves, camera, ("rgb",), model=model).rgb.sum().backward(), repeat)
+        forward = timed(lambda: rasterize(g, camera, ("rgb",), model=model), repeat, clock)
+        whole = timed(lambda: rasterize(leaves, camera, ("rgb",), model=model).rgb.sum().backward(), repeat, clock)
         chart.lines.setdefault("forward", []).append((x, forward))
         chart.lines.setdefault("forward + backward", []).append((x, whole))
 
@@ -136,13 +136,14 @@ def main() -> None:
     parser.add_argument("--drive", type=Path, help="a scene folder of drive 002; the bundled demo's otherwise")
     parser.add_argument("--lund", type=Path, help="a scene folder of lund")
     parser.add_argument("--repeat", type=int, default=9)
+    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: of all threads together, for a busy machine")
     parser.add_argument("--plot", type=Path, help="write the scaling plot here")
     parser.add_argument("--json", type=Path, help="write all rows here")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     args = parser.parse_args()
     makers = presets(args.drive, args.lund)
     if args.worker:
-        print(json.dumps(measure(args.worker, makers[args.worker](), args.repeat)))
+        print(json.dumps(measure(args.worker, makers[args.worker](), args.repeat, args.clock)))
         return
     rows = []
     for name in args.only.split(",") if args.only else makers:
@@ -151,18 +152,18 @@ def main() -> None:
         except Missing as missing:
             rows.append({"name": name, "missing": str(missing)})
             continue
-        command = [sys.executable, "-m", "tests.bench.speed", "--worker", name, "--repeat", str(args.repeat)]
+        command = [sys.executable, "-m", "tests.bench.speed", "--worker", name, "--repeat", str(args.repeat), "--clock", args.clock]
         command += [a for flag, folder in (("--drive", args.drive), ("--lund", args.lund)) if folder for a in (flag, str(folder))]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         rows.append(json.loads(done.stdout.splitlines()[-1]))
-    print(f"{torch.get_num_threads()} threads, whole frames, median ms of {args.repeat}\n\n{table(rows)}\n")
+    print(f"{torch.get_num_threads()} threads, whole frames, median ms ({args.clock}) of {args.repeat}\n\n{table(rows)}\n")
     for row in rows:
         if "limit_ms" in row:
             print(details(row))
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1))
     if args.plot:
-        save(scaling(max(1, args.repeat // 3)), args.plot, columns=3)
+        save(scaling(max(1, args.repeat // 3), args.clock), args.plot, columns=3)
 
 
 if __name__ == "__main__":
