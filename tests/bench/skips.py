@@ -139,9 +139,8 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=100_000)
     parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: of all threads together, for a busy machine")
     args = parser.parse_args()
-    print(
-        f"{torch.get_num_threads()} threads, {args.splats} splats, median ms ({args.clock})\n\n{table(args.splats, args.repeat, args.clock)}"
-    )
+    print(f"{torch.get_num_threads()} threads, {args.splats} splats, median ms ({args.clock})\n")
+    print(table(args.splats, args.repeat, args.clock))
 
 
 if __name__ == "__main__":
