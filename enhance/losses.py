@@ -31,26 +31,17 @@ def region_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, l
     return (each * some).sum() / some.sum().clamp_min(1)
 
 
-def gate_loss(logits: torch.Tensor, given: torch.Tensor, target: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of the gate's `logits` `[B, 1, H, W]` with where the `given` frame is wrong: by 4 percent or more, fully.
+def where_loss(logits: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """Cross entropy of `logits` `[B, 1, H, W]` with the `region` 0..1 that is damaged, counted apart where it is and is not.
 
-    Only the product of gate and change reaches the picture: a closed gate hides the change's error and a useless change closes the
-    gate, and training would end there. So this teaches the gate, and `region_loss` of the ungated frame the change, apart.
+    For the gate and for altered colours alike. Only the product of gate and change reaches the picture: a closed gate hides the
+    change's error and a useless change closes the gate, and training would end there. So this teaches where, and `region_loss` of
+    the ungated frame what, apart. All of a rendered frame counts as damaged: told instead how wrong each place is, the gate is
+    never sure of anything there and stays shut.
     """
-    wrong = F.avg_pool2d((given - target).abs().mean(1, keepdim=True), 9, 1, 4, count_include_pad=False) / 0.04
-    wrong = wrong.clamp(0, 1) * region
+    each = F.binary_cross_entropy_with_logits(logits, region, reduction="none")
     total = logits.new_zeros(())
     for part in (region, 1 - region):
-        each, some = _part_mean(F.binary_cross_entropy_with_logits(logits, wrong, reduction="none"), part)
-        total = total + (each * some).sum() / some.sum().clamp_min(1)
-    return total
-
-
-def altered_loss(logits: torch.Tensor, altered: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of `logits` `[B, 1, H, W]` with where colours are `altered`, 0..1, counted apart where they are and are not."""
-    each = F.binary_cross_entropy_with_logits(logits, altered, reduction="none")
-    total = logits.new_zeros(())
-    for part in (altered, 1 - altered):
         mean, some = _part_mean(each, part)
         total = total + (mean * some).sum() / some.sum().clamp_min(1)
     return total

@@ -13,7 +13,7 @@ from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
 from enhance.shards import PairSet, Shard, Window
 
-KIND_WEIGHTS = {"underfit": 0.5, "isp": 0.32, "clean": 0.18}
+KIND_WEIGHTS = {"underfit": 0.6, "isp": 0.2, "clean": 0.2}
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 

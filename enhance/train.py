@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from enhance.autoencoder import Autoencoder
 from enhance.calibrate import calibrate_colour, calibrate_gate
 from enhance.colour import altered_logits, colour_change
-from enhance.losses import PatchPerceptual, altered_loss, gate_loss, pixel_loss, region_loss, temporal_loss
+from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
 from enhance.past import Past
 from enhance.precision import autocast, channels_last
@@ -36,9 +36,9 @@ FROZEN = ("encoder.", "colour.")  # parts of the network that the last stage lea
 class TrainConfig:
     """How to train."""
 
-    autoencoder: float = 0.12
+    autoencoder: float = 0.07
     """Share of the budget for the autoencoder."""
-    colour: float = 0.33
+    colour: float = 0.28
     """Share of the budget for the colour network."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
@@ -56,7 +56,7 @@ class TrainConfig:
     """Highest learning rate."""
     latent: float = 0.1
     """Weight of the distance of the enhanced latent to the target's."""
-    logarithm: float = 0.03
+    logarithm: float = 0.1
     """Weight of the logarithm of the squared error beside the absolute one, in the region."""
     gate: float = 0.1
     """Weight of the cross entropy of the gate."""
@@ -242,7 +242,7 @@ def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
     change = colour_change(drawn.given, fields)
     loss = pixel_loss(drawn.given + drawn.region * change, drawn.target, drawn.region)
     loss = loss + pixel_loss(drawn.given + torch.sigmoid(logits) * change, drawn.target, drawn.region)
-    return _update(run, "colour", [loss + 0.1 * altered_loss(logits, drawn.region)])
+    return _update(run, "colour", [loss + 0.1 * where_loss(logits, drawn.region)])
 
 
 CROPS = (1.0, 1.0, 1.5, 2.0)
@@ -286,7 +286,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
                 wanted = net.encoder(target.contiguous(memory_format=torch.channels_last))
             seen = perceptual(out.rgb, target, rng) if c.perceptual else 0.0
         loss = pixel_loss(out.rgb, target, region, c.logarithm) + c.perceptual * seen
-        loss = loss + region_loss(out.ungated, target, region, c.logarithm) + c.gate * gate_loss(out.logits, out.base, target, region)
+        loss = loss + region_loss(out.ungated, target, region, c.logarithm) + c.gate * where_loss(out.logits, region)
         loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
         if previous is not None:
             loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from enhance.autoencoder import Encoder
-from enhance.losses import PatchPerceptual, gate_loss, pixel_loss, region_loss, temporal_loss
+from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 
 
 def test_pixel_loss_is_least_at_the_target_and_counts_small_regions_fully():
@@ -23,12 +23,12 @@ def test_pixel_loss_has_a_gradient_without_region():
     assert out.grad is not None and torch.isfinite(out.grad).all() and out.grad.abs().sum() > 0
 
 
-def test_gate_loss_opens_the_gate_in_the_region_and_closes_it_elsewhere():
-    target, region = torch.rand(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
-    region[:, :, :16] = 1
-    given = target + 0.2 * region
-    right, wrong = (2 * region - 1) * 8, (1 - 2 * region) * 8
-    assert gate_loss(right, given, target, region) < 0.5 < 1 < gate_loss(wrong, given, target, region)
+def test_where_loss_opens_the_gate_in_the_region_and_closes_it_elsewhere():
+    region = torch.zeros(1, 1, 32, 32)
+    region[:, :, :6] = 1
+    assert where_loss((2 * region - 1) * 8, region) < 0.1 < 8 < where_loss((1 - 2 * region) * 8, region)
+    nowhere = torch.full_like(region, -8)
+    assert where_loss(nowhere, region) > 7, "a small region counts fully"
 
 
 def test_region_loss_counts_the_region_alone():
