@@ -15,9 +15,9 @@ import torch
 
 from enhance.enhancer import Enhancer, Memory
 from enhance.shards import KINDS, PairSet, Shard, Window
-from enhance.warp import warp
 from render.compare import psnr
 from render.frame_types import Frame
+from render.warp import warp
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
 

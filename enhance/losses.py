@@ -10,7 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.autoencoder import Encoder
-from enhance.warp import warp
+from render.warp import warp
 
 
 def pixel_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, logarithm: float = 0.01) -> torch.Tensor:

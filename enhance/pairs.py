@@ -15,10 +15,10 @@ from torch.nn import functional as F
 from enhance.degrade import random_underfit, unfinish
 from enhance.isp import alter, random_isp
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
-from enhance.warp import visible
 from recon import open_log
 from recon.log import Log, LogCamera
 from render import render_frame
+from render.warp import visible
 from scenes.atomic import atomic_file
 from scenes.files import load
 from scenes.names import unknown

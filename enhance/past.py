@@ -8,7 +8,8 @@ import torch
 
 from enhance.autoencoder import LATENT, STRIDE
 from enhance.colour import FIELDS
-from enhance.warp import shrink_flow, warp
+from enhance.flow import shrink_flow
+from render.warp import warp
 
 STEADY = 3
 """Frames whose colour fields are averaged with a new one's, at most."""

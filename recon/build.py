@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,6 +15,7 @@ from recon.fit import POSE_UNITS, Fit, FitConfig, run
 from recon.frames import Frames, load_frames
 from recon.log import Log, Track
 from recon.model import MODEL, Knots, scaled, small_poses
+from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.start import Start, prepare
 from render.progress import Progress
@@ -46,7 +48,8 @@ def reconstruct(
     """Fit a scene to a log's images and write it to the folder `output`.
 
     cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
-    are fitted, `fit_size` where None. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr. An
+    are fitted, `fit_size` where None. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr;
+    neither does every `held_out`th lidar sweep, against which the scene is measured on the path and beside it (`meta["off_path"]`). An
     interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
 
@@ -65,7 +68,9 @@ def reconstruct(
     checkpoint = checkpoint_path(output)
     saved = load_checkpoint(checkpoint, options) if resume else None
 
-    start, fit = begin(log, names, span, size, config, held_out, saved[0] if saved else None)
+    unseen = held_out_sweeps(log, held_out)
+    fitted = replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
+    start, fit = begin(fitted, names, span, size, config, held_out, saved[0] if saved else None)
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
@@ -82,6 +87,10 @@ def reconstruct(
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
     print(table_text(rows), file=sys.stderr)
+    within = [s for s in unseen if span[0] <= s.time_us <= span[1]]
+    if within:
+        scene.meta["off_path"] = off_path_table(scene, log, within)
+        print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     save(scene, output, overwrite, half)
     checkpoint.unlink(missing_ok=True)
     return scene

@@ -16,6 +16,7 @@ from recon.densify import Growth, adjusted, grow
 from recon.frames import Frames, View
 from recon.losses import PictureLoss
 from recon.model import FIELDS, Knots, Splats, draw, placed_groups, scaled, small_poses
+from render.rays import world_directions
 from scenes.camera import Camera, RigCamera
 from scenes.poses import inverse
 from scenes.sky import sample_equirect
@@ -55,6 +56,12 @@ class FitConfig:
 
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
+
+SOLID_WEIGHT = 0.03
+"""Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
+
+HORIZON = -0.02
+"""Rays that fall more than this (1 degree) are below the horizon."""
 
 FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
@@ -135,7 +142,8 @@ class Fit:
         target = self._target(view, self.shrink())
         rgb, alpha = self.render(view, camera)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
-        haze = SKY_WEIGHT * (F.interpolate(alpha[None, None], view.sky.shape)[0, 0] * view.sky).mean()
+        coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
+        haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         regular = 1e-4 * self.ego.unrest() + sum(1e-4 * a.unrest() for a in self.actors)
         (loss + haze + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self._follow()
@@ -179,12 +187,22 @@ class Fit:
         moved = small_poses(scaled(torch.stack(deltas), *POSE_UNITS["actor"]))
         return {int(i) + 1: self._boxes[i][0][row] @ m for i, m in zip(near, moved, strict=True)}
 
+    def _below(self, camera: Camera, view: View) -> torch.Tensor:
+        """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
+        small = camera.resized(view.sky.shape[1], view.sky.shape[0])
+        return (world_directions(small)[..., 2] < HORIZON) & ~view.sky
+
     def _sky_behind(self, camera: Camera) -> torch.Tensor:
-        """Sky colour `[H, W, 3]` at every pixel, sampled every few pixels."""
-        small = camera.resized(max(2, camera.width // SKY_STEP), max(2, camera.height // SKY_STEP))
-        rays = small.lens.unproject(small.pixel_centres()) @ small.world_from_cam[:3, :3].detach().T
+        """Sky colour `[H, W, 3]` at every pixel: sampled every few pixels, at others each time, or those between would never learn."""
+        shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator)
+        sides = torch.tensor([camera.height, camera.width])
+        y, x = (SKY_STEP * (torch.arange(n) + 0.5) - float(s) for n, s in zip((sides // SKY_STEP + 2).tolist(), shift, strict=True))
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double()
+        rays = camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].detach().T
         colours = sample_equirect(self.sky, rays).permute(2, 0, 1)[None]
-        return F.interpolate(colours, (camera.height, camera.width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+        fine = F.interpolate(colours, scale_factor=SKY_STEP, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+        top, left = shift.tolist()
+        return fine[top : top + camera.height, left : left + camera.width]
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)

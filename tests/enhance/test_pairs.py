@@ -59,7 +59,7 @@ def test_colour_changes_stay_on_instances(folder):
 
 
 def test_flow_moves_the_previous_target_onto_this_one(folder):
-    from enhance.warp import warp
+    from render.warp import warp
 
     w = PairSet(folder).of("clean", "held out")[0].window()
     moved, inside = warp(w.target[:2], w.flow[1:])

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from enhance.samples import Photos, Sampler
-from enhance.warp import warp
 from render.video import write_image
+from render.warp import warp
 
 
 @pytest.fixture(scope="module")

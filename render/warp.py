@@ -23,19 +23,6 @@ def warp(previous: torch.Tensor, flow_prev: torch.Tensor) -> tuple[torch.Tensor,
     return torch.where(inside, moved, 0).to(previous.dtype), inside.to(previous.dtype)
 
 
-def shrink_flow(flow: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
-    """Flow `[B, 2, H, W]` in pixels on a coarser grid of `size` (h, w), in its cells: means of what is known.
-
-    A cell without any known pixel stays unknown (NaN).
-    """
-    known = torch.isfinite(flow).all(1, keepdim=True)
-    size = (size[0], size[1])
-    share = F.adaptive_avg_pool2d(known.float(), size)
-    mean = F.adaptive_avg_pool2d(torch.where(known, flow, 0).float(), size) / share
-    scale = mean.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])[:, None, None]
-    return torch.where(share > 0, mean * scale, torch.nan)
-
-
 def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance: float = 1.0) -> torch.Tensor:
     """Where this frame's pixel was seen in the previous one, bool `[B, 1, H, W]`: going there and back returns within `tolerance` pixels.
 

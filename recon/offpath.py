@@ -1,0 +1,121 @@
+"""How well a reconstruction holds where the car never drove: depth against lidar that the fit never saw, holes, and flicker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from recon.actors import split_points
+from recon.log import Log, Sweep
+from recon.seed import project
+from render import render_frame
+from render.rays import world_directions
+from render.warp import visible, warp
+from scenes.camera import Camera
+from scenes.poses import inverse
+from scenes.scene import Scene
+
+SHIFTS = (0.0, 1.0, 2.0, 3.0)
+"""Metres aside of the recorded path: to the left for one sweep, to the right for the next."""
+
+SOLID = 0.9
+"""Alpha below which a pixel under the horizon counts as a hole."""
+
+CELL = 4
+"""Pixels around a lidar point within which a nearer one may hide it."""
+
+HIDING = 1.25
+"""How many times nearer a point must be to hide its neighbours: less is a slope."""
+
+CALM_FRAMES = 10
+"""Consecutive frames of which flicker is measured."""
+
+
+def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
+    """Sweeps kept from the fit: one in `every`, half a period off the held-out pictures; none where `every` is 0."""
+    return tuple(s for s in log.sweeps if every > 0 and s.index % every == every // 2)
+
+
+def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequence[float] = SHIFTS) -> list[dict]:
+    """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
+
+    depth_error: median of |z - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, z being the expected
+    depth; points: how many those are. holes: share of pixels below the horizon with alpha under 0.9. flicker: mean absolute
+    difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
+    """
+    movers = [t for t in log.tracks if t.moving]
+    static = [(s, split_points(log, [s], movers).static) for s in sweeps]
+    rows = []
+    for shift in shifts:
+        errors, below, open_ = [], 0, 0
+        paths = [scene.ego.shifted(lateral=side) for side in (shift, -shift)]
+        for k, (sweep, points) in enumerate(static):
+            for name in scene.rig:
+                times = scene.frame_times(name)
+                time = int(times[(times - sweep.time_us).abs().argmin()])
+                camera = scene.camera(name, time, paths[k % 2])
+                with torch.no_grad():
+                    frame = render_frame(scene, camera, ("alpha", "depth"))
+                assert frame.alpha is not None and frame.depth is not None
+                ground = world_directions(camera)[..., 2] < 0
+                below += int(ground.sum())
+                open_ += int((ground & (frame.alpha < SOLID)).sum())
+                errors.append(depth_errors(frame.depth.numpy(), points, camera))
+        found = np.concatenate(errors) if errors else np.zeros(0)
+        row = {"shift_m": shift, "depth_error": float(np.median(found)) if len(found) else None, "points": len(found)}
+        rows.append(row | {"holes": open_ / below if below else None, "flicker": flicker_along(scene, shift)})
+    return rows
+
+
+def depth_errors(depth: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Relative errors of `depth` `[H, W]` at the world points `[N, 3]` that `camera` sees; 1 where nothing was drawn."""
+    row, column, z, seen = project(points, inverse(camera.world_from_cam).numpy(), camera)
+    row, column, z = row[seen], column[seen], z[seen]
+    nearest = np.full(depth.shape, np.inf)
+    np.minimum.at(nearest, (row, column), z)
+    nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
+    open_ = z <= HIDING * nearest[row, column]
+    drawn = depth[row[open_], column[open_]]
+    return np.where(np.isfinite(drawn), np.abs(drawn - z[open_]) / z[open_], 1.0)
+
+
+def flicker_along(scene: Scene, shift: float) -> float:
+    """Exact-flow warp error of the first camera's middle frames along the path shifted by `shift` metres to the left, in 8-bit levels."""
+    name = next(iter(scene.rig))
+    times = scene.frame_times(name).tolist()
+    first = max(0, (len(times) - CALM_FRAMES) // 2)
+    path = scene.ego.shifted(lateral=shift)
+    cameras = [scene.camera(name, t, path) for t in times[first : first + CALM_FRAMES]]
+    found, last, after = [], None, None
+    for k, camera in enumerate(cameras):
+        following = cameras[k + 1] if k + 1 < len(cameras) else None
+        outputs = ("rgb",) + ("flow_prev",) * (k > 0) + ("flow_next",) * (following is not None)
+        with torch.no_grad():
+            frame = render_frame(scene, camera, outputs, cameras[k - 1] if k else None, following)
+        rgb = _planes(frame.rgb)
+        if last is not None and after is not None:
+            flow = _planes(frame.flow_prev)
+            moved, inside = warp(last, flow)
+            both = visible(flow, after) & (inside > 0)
+            if both.any():
+                found.append(255 * float(((rgb - moved).abs().mean(1, keepdim=True))[both].mean()))
+        last, after = rgb, None if frame.flow_next is None else _planes(frame.flow_next)
+    return float(np.mean(found)) if found else 0.0
+
+
+def _planes(image: torch.Tensor | None) -> torch.Tensor:
+    assert image is not None
+    return image.permute(2, 0, 1)[None]
+
+
+def off_path_text(rows: Sequence[dict]) -> str:
+    """The rows for people."""
+    lines = [f"{'off the path':<14} {'depth error':>12} {'lidar points':>13} {'holes':>8} {'flicker, levels':>16}"]
+    for r in rows:
+        error, holes = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "holes"))
+        where = f"{r['shift_m']:g} m aside" if r["shift_m"] else "as recorded"
+        lines.append(f"{where:<14} {error:>12} {r['points']:>13} {holes:>8} {r['flicker']:>16.2f}")
+    return "\n".join(lines)

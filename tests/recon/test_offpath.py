@@ -1,0 +1,63 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from recon import open_log
+from recon.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
+from scenes import Gaussians
+
+
+def without(scene, which):
+    g = scene.background.gaussians
+    return replace(scene, background=replace(scene.background, gaussians=Gaussians(*(t[~which] for t in g.tensors().values()))))
+
+
+@pytest.fixture(scope="module")
+def log(drive):
+    return open_log(drive)
+
+
+def test_sweeps_are_held_out_between_the_held_out_pictures(log):
+    assert [s.index for s in held_out_sweeps(log, 4)] == [2, 6]
+    assert held_out_sweeps(log, 0) == ()
+
+
+def test_the_street_itself_is_near_its_lidar_on_and_off_the_path(street, log):
+    rows = off_path_table(street, log, held_out_sweeps(log, 4), (0.0, 2.0))
+    assert [r["shift_m"] for r in rows] == [0.0, 2.0]
+    for row in rows:
+        assert row["depth_error"] < 0.1 and row["points"] > 200 and row["holes"] < 0.02
+    assert "2 m aside" in off_path_text(rows)
+
+
+def test_a_torn_road_shows_as_holes_and_a_wrong_one_as_depth_error(street, log):
+    sweeps = held_out_sweeps(log, 4)
+    means = street.background.gaussians.means
+    torn = without(street, (means[:, 2] < 0.1) & (means[:, 0] % 6 < 3))
+    right, holed = (off_path_table(s, log, sweeps, (0.0,))[0] for s in (street, torn))
+    assert holed["holes"] > right["holes"] + 0.1
+    pose = street.background.world_from_local.clone()
+    pose[1, 3] = 4.0
+    aside = replace(street, background=replace(street.background, world_from_local=pose))
+    assert off_path_table(aside, log, sweeps, (0.0,))[0]["depth_error"] > 2 * right["depth_error"]
+
+
+def test_points_behind_nearer_points_do_not_count(street):
+    camera = street.camera("front_camera", int(street.frame_times("front_camera")[0]))
+    pose = camera.world_from_cam
+    near, far = ((pose @ torch.tensor([0.01, 0.01, z, 1.0], dtype=torch.float64))[:3].numpy() for z in (5.0, 50.0))
+    depth = np.full((camera.height, camera.width), 5.0)
+    assert np.allclose(depth_errors(depth, np.stack([near, far]), camera), [0.0], atol=1e-6)
+    assert np.allclose(depth_errors(depth, far[None], camera), [0.9])
+    assert np.allclose(depth_errors(np.full_like(depth, np.inf), near[None], camera), [1.0])
+
+
+def test_a_street_that_does_not_change_hardly_flickers(street):
+    means = street.background.gaussians.means
+    calm = flicker_along(street, 1.0)
+    shades = street.background.gaussians.sh.clone()
+    shades[means[:, 2] < 0.1] += 2 * torch.rand(int((means[:, 2] < 0.1).sum()), 1, 3, generator=torch.Generator().manual_seed(0)) - 1
+    noisy = replace(street, background=replace(street.background, gaussians=replace(street.background.gaussians, sh=shades)))
+    assert 0 < calm < flicker_along(noisy, 1.0)
