@@ -95,6 +95,7 @@ NEEDS = (
     _package("trimesh", "assets add of a mesh"),
     _package("zstandard", "convert to and from .spz"),
     Need("weights", "render --enhance, enhance, demo", "git checkout enhance/weights, or install again", WEIGHTS),
+    _package("pyarrow", "recon of Argoverse 2 and Waymo", extra="arrow"),
     _package("pycolmap", "recon of COLMAP folders, photos and videos", extra="colmap"),
 )
 
