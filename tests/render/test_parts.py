@@ -7,7 +7,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from scenes import Camera, Pinhole
-from scenes.poses import translation
+from scenes.poses import pose_from, translation
 from tests.render.test_rasterize import two_instances
 
 CAMERA = Camera(Pinhole(120.0, 122.0, 65.0, 40.0), 139, 75, torch.eye(4, dtype=torch.float64))
@@ -84,3 +84,14 @@ def test_a_crop_that_leaves_the_image_is_refused(crop):
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(ValueError, match=r"mask must have shape \(75, 139\)"):
         rasterize(two_instances(1), CAMERA, mask=torch.ones(75, 138, dtype=torch.bool))
+
+
+def test_a_rig_of_ragged_cameras_is_drawn_in_one_call_as_one_by_one():
+    placed = two_instances(6)
+    lenses = [Pinhole(40.0 + i, 40.0, 20.0 + i, 15.0) for i in range(7)]
+    poses = [pose_from([1.0, 0, 0.4 * i, 0], [0.2 * i, 0, 0]) for i in range(7)]
+    rig = [Camera(lens, 40 + 3 * i, 30 + i, pose) for i, (lens, pose) in enumerate(zip(lenses, poses, strict=True))]
+    together = rasterize(placed, rig)
+    assert [tuple(f.rgb.shape) for f in together] == [(30 + i, 40 + 3 * i, 3) for i in range(7)]
+    for camera, frame in zip(rig, together, strict=True):
+        assert torch.equal(frame.rgb, rasterize(placed, camera).rgb)
