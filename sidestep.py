@@ -109,7 +109,7 @@ class Render:
     weights: str = "builtin"
     """The enhancer's weights: builtin, or a file that sidestep train wrote."""
     no_shadows: Flag = False
-    """Leave out the contact shadows of inserted assets."""
+    """Leave out the shadows of inserted assets."""
     start: Time = 0
     """Where to begin, after the camera's first frame."""
     duration: TimeOrAll = None

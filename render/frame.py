@@ -1,4 +1,4 @@
-"""A frame: the splats of a scene at a camera's time, then contact shadows, the sky behind them, and the camera's exposure."""
+"""A frame: the splats of a scene at a camera's time, then shadows of inserted assets, the sky behind them, and the camera's exposure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def render_frame(
     shadows: bool = True,
     config: RenderConfig = DEFAULT,
 ) -> Frame:
-    """Background and actors at `camera.time_us`, contact shadows of inserted assets, the sky, and last the camera's exposure.
+    """Background and actors at `camera.time_us`, shadows of inserted assets, the sky, and last the camera's exposure.
 
     previous, following: the cameras that flow_prev and flow_next lead to; needed exactly where those are asked for.
     Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky.

@@ -1,42 +1,59 @@
-"""A first contact shadow: inserted assets darken the ground below and beside them, softly, by their footprint.
+"""Shadows of inserted assets: of the sun and of the sky, on the ground and on what stands beside them.
 
-No light is traced. What a rough sky does under a car is near enough a function of the distance to its footprint:
-dark underneath, fading over about the height of the body's underside above the ground (an ambient-occlusion look).
-Where a pixel's ray meets the plane that the asset stands on says how dark; the rendered depth only says whether that
-plane is what the pixel sees, with much tolerance, since the depth of splatted asphalt is rough.
+The light is that of the scene's sky (scenes/light.py), less what the houses and trees around keep off. How much of it an asset keeps from
+the places around it is traced once (render/occlusion.py); a frame only looks it up, where the camera sees those places. For the ground
+that is where a pixel's ray meets the plane that the asset stands on, since the depth of splatted asphalt is rough; the rendered depth
+says what the pixel sees. Light is taken away in linear light, whatever the surface.
+
 Inserted assets are those with `inserted` in their meta, or `edited`; other recorded actors keep the shadows of their photos.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
 from render.frame_types import Frame
+from render.occlusion import Box, Field, shadow_box, squares, trace_field
 from render.rays import camera_rays
+from render.tracer import Blockers
 from scenes.asset import Actor
 from scenes.camera import Camera
-from scenes.poses import inverse
+from scenes.light import light_of
+from scenes.poses import inverse, yaw, yaw_of
 from scenes.scene import Scene
+from scenes.sky import linear_from_srgb, srgb_from_linear
 
-DARKNESS = 0.62  # how much of the light the middle of a footprint loses
-REACH = 0.55  # metres beside the footprint at which the shadow has gone
-INSET = 0.35  # metres inside the footprint's edge at which it is full
-RECEIVES = 0.3  # surfaces up to so many metres above the plane receive all of it: asphalt, a kerb
-CEILING = 0.8  # and those from here on none: other cars, people
-SKIRT = 0.35  # of the asset itself only what is lower receives some: tyres, and the rim of asphalt that was cut out with it
+GROUND = 0.3
+"""Metres around the plane within which a surface is the ground: asphalt, a kerb."""
+
+SKIRT = 0.25
+"""Of the asset itself only what is lower receives some: tyres, and the rim of asphalt that was cut out with it."""
+
+TURN = math.radians(3)
+"""Turn of an asset from which its shadow is traced anew."""
+
+STEP = 6.0
+"""Metres of its way from which it is asked anew what houses and trees keep off."""
+
+AROUND = 80.0
+"""Metres within which houses and trees keep light off."""
 
 
 @dataclass(frozen=True)
 class Caster:
-    """A footprint in the view: instance id, `asset_from_cam` `[4, 4]`, half length and width in metres, and the pixels
-    `x0, y0, x1, y1` that its shadow can fall into."""
+    """A shadow in the view: instance id, `asset_from_cam` `[4, 4]`, the pixels `x0, y0, x1, y1` that it can fall into, half the
+    asset's length and width `[2]`, and what it keeps off."""
 
     instance: int
     asset_from_cam: torch.Tensor
-    half: tuple[float, float]
     window: tuple[int, int, int, int]
+    half: torch.Tensor
+    field: Callable[[], Field]
 
 
 def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
@@ -45,17 +62,15 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     for i, actor in enumerate(scene.actors):
         if not _placed_anew(actor) or not actor.trajectory.covers(camera.time_us):
             continue
-        asset_from_cam = inverse(actor.trajectory.at(camera.time_us)) @ camera.world_from_cam.detach()
-        half = (float(actor.asset.size[0]) / 2, float(actor.asset.size[1]) / 2)
-        window = _window(asset_from_cam, half, camera)
+        pose, shade = actor.trajectory.at(camera.time_us), _shade(scene)
+        directions, weights = shade.at(actor, pose)
+        box = shadow_box(actor.asset.size, directions[weights > 0])
+        asset_from_cam = inverse(pose) @ camera.world_from_cam.detach()
+        window = _window(asset_from_cam, box, camera)
         if window is not None:
-            found.append(Caster(i + 1, asset_from_cam, half, window))
+            field = partial(shade.field, actor, box, directions, weights)
+            found.append(Caster(i + 1, asset_from_cam, window, actor.asset.size[:2] / 2, field))
     return found
-
-
-def _placed_anew(actor: Actor) -> bool:
-    """Whether it stands where no photo shows its shadow."""
-    return bool(actor.asset.meta.get("inserted") or actor.asset.meta.get("edited"))
 
 
 def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
@@ -67,21 +82,76 @@ def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
         depth = frame.depth[y0:y1, x0:x1].detach()
         pose = caster.asset_from_cam.to(depth.device, torch.float32)
         rays = camera_rays(frame.camera)[y0:y1, x0:x1].to(depth.device) @ pose[:3, :3].T
-        down = rays[..., 2].clamp_max(-1e-6)  # rays that rise never meet the plane: their point lies far off, where no shadow is
-        plane = pose[:2, 3] - (pose[2, 3] / down)[..., None] * rays[..., :2]
-        height = pose[2, 3] + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth)) * rays[..., 2]
-        own = frame.instance[y0:y1, x0:x1] == caster.instance
-        receives = torch.where(own, _smooth(1 - height / SKIRT), _smooth((CEILING - height) / (CEILING - RECEIVES)))
-        rgb[y0:y1, x0:x1] *= (1 - receives * shade_at(plane, caster.half))[..., None].to(rgb)
+        down = rays[..., 2:].clamp_max(-1e-6)  # rays that rise never meet the plane: their point lies far off, where no shadow is
+        plane = pose[:3, 3] - (pose[2, 3] / down) * rays
+        seen = pose[:3, 3] + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))[..., None] * rays
+        height = seen[..., 2]
+        # within the footprint the depth mixes the asset with the ground that shows through it
+        own = (frame.instance[y0:y1, x0:x1] == caster.instance) | ((seen[..., :2].abs() < caster.half.to(seen)).all(-1) & (height > 0.1))
+        field = caster.field()
+        blocked = field.at(torch.where((own | (height < GROUND))[..., None], plane, seen))
+        receives = torch.where(own, _smooth(1 - height / SKIRT), torch.ones_like(height)) * torch.isfinite(depth)
+        light = (1 - receives * blocked)[..., None].to(rgb)
+        # without a shadow nothing is changed, not even by rounding
+        part = rgb[y0:y1, x0:x1]
+        rgb[y0:y1, x0:x1] = torch.where(light < 1, srgb_from_linear(linear_from_srgb(part) * light), part)
     return rgb
 
 
-def shade_at(points: torch.Tensor, half: tuple[float, float]) -> torch.Tensor:
-    """The share of light `[...]` that points `[..., 2]` on the asset's plane lose to a footprint of that half length and width."""
-    beside = points.abs() - torch.tensor(half, dtype=points.dtype, device=points.device)
-    # signed distance to the rectangle: negative inside
-    distance = beside.clamp_min(0).norm(dim=-1) + beside.amax(-1).clamp_max(0)
-    return DARKNESS * _smooth((REACH - distance) / (REACH + INSET))
+def _placed_anew(actor: Actor) -> bool:
+    """Whether it stands where no photo shows its shadow."""
+    return bool(actor.asset.meta.get("inserted") or actor.asset.meta.get("edited"))
+
+
+class Shade:
+    """The light of one scene, and what its assets keep off, traced when first asked for."""
+
+    def __init__(self, scene: Scene):
+        self.scene, self.light = scene, light_of(scene)
+        self._houses: Blockers | None = None
+        self._passing: dict[tuple[int, ...], torch.Tensor] = {}
+        self._fields: dict[tuple, Field] = {}
+
+    def at(self, actor: Actor, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Directions `[K, 3]` of the light in the frame of an actor at a pose, and how much of each `[K]` reaches that place."""
+        place = tuple((pose[:3, 3] / STEP).round().int().tolist())
+        if place not in self._passing:
+            self._passing[place] = self._pass(pose, actor.asset.size)
+        # the asset's tilt is left out: the ground that is shaded tilts along
+        turned = yaw(-TURN * round(float(yaw_of(pose)) / TURN))[:3, :3]
+        return (self.light.directions @ turned.T).float(), self._passing[place]
+
+    def field(self, actor: Actor, box: Box, directions: torch.Tensor, weights: torch.Tensor) -> Field:
+        """What an actor keeps off in a box of its frame."""
+        key = (actor.track, directions.numpy().tobytes(), weights.numpy().tobytes())
+        if key not in self._fields:
+            self._fields[key] = trace_field(actor.asset.gaussians.detach().to("cpu"), box, directions, weights)
+        return self._fields[key]
+
+    def _pass(self, pose: torch.Tensor, size: torch.Tensor) -> torch.Tensor:
+        """The part `[K]` of the light from each direction that houses and trees let pass to just above an asset."""
+        background = self.scene.background
+        if self._houses is None:
+            self._houses = Blockers(squares(background.gaussians.detach().to("cpu")))
+        length, width, height = size.tolist()
+        spots = [[0, 0], [length / 2, width / 2], [-length / 2, width / 2], [length / 2, -width / 2], [-length / 2, -width / 2]]
+        points = torch.tensor([[x, y, height + 0.3] for x, y in spots], dtype=torch.float64)
+        local_from_asset = inverse(background.world_from_local) @ pose
+        points = points @ local_from_asset[:3, :3].T + local_from_asset[:3, 3]
+        turned = self.light.directions @ inverse(background.world_from_local)[:3, :3].T
+        each = torch.eye(len(turned))
+        passing = torch.stack([self._houses.open_share(points, turned, one, AROUND).mean() for one in each])
+        return passing if bool((passing > 0).any()) else torch.ones(len(turned))  # under a bridge any light will do
+
+
+_last: list[Shade] = []
+
+
+def _shade(scene: Scene) -> Shade:
+    """The shade of a scene; that of the last one asked for is kept, since a clip asks frame by frame."""
+    if not _last or _last[0].scene is not scene:
+        _last[:] = [Shade(scene)]
+    return _last[0]
 
 
 def _smooth(u: torch.Tensor) -> torch.Tensor:
@@ -89,14 +159,12 @@ def _smooth(u: torch.Tensor) -> torch.Tensor:
     return u * u * (3 - 2 * u)
 
 
-def _window(asset_from_cam: torch.Tensor, half: tuple[float, float], camera: Camera) -> tuple[int, int, int, int] | None:
-    """Pixels that the footprint's reach projects into; None where that is outside the image or seen from below."""
+def _window(asset_from_cam: torch.Tensor, box: Box, camera: Camera) -> tuple[int, int, int, int] | None:
+    """Pixels that a box projects into; None where that is outside the image or the ground is seen from below."""
     if not asset_from_cam[2, 3] > 0:
         return None
-    x, y = half[0] + REACH, half[1] + REACH
-    corners = torch.tensor([[a * x, b * y, 0.0] for a in (-1, 1) for b in (-1, 1)], dtype=torch.float64)
     cam_from_asset = inverse(asset_from_cam)
-    seen = corners @ cam_from_asset[:3, :3].T + cam_from_asset[:3, 3]
+    seen = box.corners() @ cam_from_asset[:3, :3].T + cam_from_asset[:3, 3]
     if not (seen[:, 2] > 0).any():
         return None
     if (seen[:, 2] > 0.1).all():

@@ -1,65 +1,144 @@
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 from street import START_US, car
+from street import street as made_street
 
+from render import render_frame
 from render.frame_types import Frame
-from render.shadow import DARKNESS, REACH, cast, shade_at, shadow_casters
+from render.occlusion import shadow_box, trace_field
+from render.shadow import cast, shadow_casters
+from scenes import Placed, Sky
+from scenes.hdr import load_hdr
 from scenes.insert import insert
+from scenes.light import disc, light_of
 from scenes.placement import Placement
 
-HALF = (2.1, 0.9)
+CAR = car()
+OVERCAST = light_of(replace(made_street(), sky=None)).directions.float()
 
 
-def shade(x, y) -> float:
-    return float(shade_at(torch.tensor([x, y], dtype=torch.float64), HALF))
+def field(directions):
+    return trace_field(CAR.gaussians, shadow_box(CAR.size, directions), directions, torch.ones(len(directions)))
 
 
-def test_the_middle_of_the_footprint_is_darkest():
-    assert shade(0, 0) == pytest.approx(DARKNESS)
-    assert DARKNESS > shade(HALF[0], 0) > shade(HALF[0] + 0.3, 0) > 0
+def sun(elevation, yaw=0.0, radius=0.005):
+    middle = torch.tensor([math.cos(elevation) * math.cos(yaw), math.cos(elevation) * math.sin(yaw), math.sin(elevation)])
+    return disc(middle.double(), radius, 32).float()
 
 
-def test_beyond_its_reach_there_is_no_shadow():
-    assert shade(HALF[0] + REACH, 0) == 0
-    assert shade(0, HALF[1] + REACH) == 0
-    assert shade(HALF[0] + 0.8 * REACH, HALF[1] + 0.8 * REACH) == 0  # corners are round
+def at(field, x, y, z=0.0) -> float:
+    return float(field.at(torch.tensor([x, y, z])))
 
 
-def test_only_surfaces_near_the_plane_receive_it(street):
-    """A pixel that sees the plane, something on it, something high, and nothing at all."""
+def test_under_a_closed_sky_it_is_darkest_below_the_asset_and_light_again_beside_it():
+    shade = field(OVERCAST)
+    assert at(shade, 0, 0) > 0.85 > at(shade, 2.3, 0) > at(shade, 2.7, 0) > at(shade, 3.2, 0)
+    assert at(shade, 6.2, 0) == 0
+    for x, y in ((0.0, 1.2), (2.4, 0.0), (2.3, 1.1)):
+        assert at(shade, x, y) == pytest.approx(at(shade, -x, y), abs=0.06)
+        assert at(shade, x, y) == pytest.approx(at(shade, x, -y), abs=0.06)
+
+
+def test_the_suns_shadow_is_as_long_as_the_asset_is_high_over_the_tangent():
+    for elevation, yaw in ((0.3, 0.0), (0.6, 2.0), (0.4, -1.2)):
+        shade = field(sun(elevation, yaw))
+        away = -torch.tensor([math.cos(yaw), math.sin(yaw)])
+        # from the edge of the footprint that the shadow leaves by, along its way
+        start = (CAR.size[:2].float() / 2 / away.abs().clamp_min(1e-6)).min() * away
+        length = 1.5 / math.tan(elevation)
+        inside, outside = start + 0.75 * length * away, start + 1.25 * length * away
+        assert at(shade, *inside.tolist()) > 0.9 and at(shade, *outside.tolist()) < 0.1, (elevation, yaw)
+        assert at(shade, *(-inside).tolist()) < 0.1  # none towards the sun
+
+
+def test_a_shadow_climbs_what_stands_in_it():
+    shade = field(sun(0.4))
+    x = -2.1 - 0.5 * 1.5 / math.tan(0.4)  # half-way along the shadow the ray that grazes the roof is half as high
+    assert at(shade, x, 0, 0.5) > 0.9 and at(shade, x, 0, 1.2) < 0.3
+
+
+def test_a_wide_light_makes_a_soft_edge():
+    length = 2.1 + 1.5 / math.tan(0.5)
+    places = [-length + d for d in (-0.4, -0.2, 0, 0.2, 0.4)]
+    sharp, soft = field(sun(0.5)), field(sun(0.5, radius=0.15))
+    steepest = [max(b - a for a, b in zip(v, v[1:], strict=False)) for v in ([at(f, x, 0) for x in places] for f in (sharp, soft))]
+    assert steepest[0] > 1.5 * steepest[1]
+
+
+def test_a_sunset_casts_a_long_soft_shadow_away_from_the_sun(street, shared):
+    sky = Sky(load_hdr(shared / "envmaps" / "venice_sunset_1k.hdr"))
+    scene = insert(replace(street, sky=sky, actors=()), CAR, Placement("car", 12, 0)).scene
+    light = light_of(scene)
+    shade = field(light.directions.float())
+    away = -torch.nn.functional.normalize(light.sun[:2].float(), dim=0)
+    across = torch.stack([-away[1], away[0]])
+    for far in (3.0, 4.0, 5.0):  # as far again as the car is long
+        there = at(shade, *(far * away).tolist())
+        others = [at(shade, *(far * d).tolist()) for d in (-away, across, -across)]
+        assert there > 0.05 and there > 2 * max(others), (far, there, others)
+    profile = [at(shade, *(d * away).tolist()) for d in torch.linspace(2.5, 7, 10)]
+    assert max(abs(a - b) for a, b in zip(profile, profile[1:], strict=False)) < 0.25  # no hard edge
+
+
+def open_street(street):
+    """The street without houses."""
+    g = street.background.gaussians
+    return replace(street, background=Placed(g.select(g.means[:, 2] < 0.1), street.background.world_from_local))
+
+
+def test_houses_keep_the_sun_off(street):
+    high = torch.full((32, 64, 3), 0.1)
+    high[13, 14] = 2000.0  # 17 degrees high, to the left of the street (+y)
+    for scene, least, most in ((open_street(street), 0.7, 1.0), (street, 0.0, 0.4)):
+        scene = insert(replace(scene, sky=Sky(high)), CAR, Placement("car", 12, 0)).scene
+        caster = shadow_casters(scene, scene.camera("front_camera", START_US))[0]
+        assert least <= at(caster.field(), 0.0, -2.2) <= most
+
+
+def test_only_what_the_light_would_reach_is_darkened(street):
+    """A pixel that sees the ground, a kerb, something higher than the car, the car itself, and nothing at all."""
     camera = street.camera("front_camera", START_US)
-    scene = insert(street, car(), Placement("car", 9, 0)).scene
+    scene = insert(replace(open_street(street), sky=None), CAR, Placement("car", 9, 0)).scene
     (caster,) = shadow_casters(scene, camera)
-    y, x = 40, 48  # 9 m ahead of the body, under the car
+    y, x = 40, 48  # 6 m ahead of the camera, under the car
     down = (y + 0.5 - 27) / 57.6
-    depths = {"ground": 1.5 / down, "kerb": 1.35 / down, "roof": 0.5 / down, "nothing": float("inf")}
+    depths = {"ground": 1.5 / down, "kerb": 1.35 / down, "roof": 0.0, "nothing": float("inf"), "door": 0.9 / down}
     light = {}
     for name, depth in depths.items():
         flat = torch.full((54, 96), depth)
-        frame = Frame(camera, rgb=torch.ones(54, 96, 3), depth=flat, instance=torch.zeros(54, 96, dtype=torch.int32))
-        light[name] = float(cast(frame, [caster])[y, x, 0])
+        instance = torch.full((54, 96), 2 if name == "door" else 0, dtype=torch.int32)
+        light[name] = float(cast(Frame(camera, rgb=torch.ones(54, 96, 3), depth=flat, instance=instance), [caster])[y, x, 0])
     assert light["ground"] == pytest.approx(light["kerb"])
     assert light["ground"] < 0.7
-    assert light["roof"] == light["nothing"] == 1
-
-
-@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (1.0, 0.4), (2.3, 1.0), (0.0, 1.3)])
-def test_the_shadow_is_symmetric(x, y):
-    assert shade(x, y) == shade(-x, y) == shade(x, -y)
+    assert light["roof"] == light["nothing"] == light["door"] == 1
 
 
 def test_assets_out_of_view_cost_nothing(street):
     camera = street.camera("front_camera", START_US)
-    behind = insert(street, car(), Placement("car", -8, 0)).scene
-    assert shadow_casters(behind, camera) == []
-    ahead = insert(street, car(), Placement("car", 12, 0)).scene
-    (caster,) = shadow_casters(ahead, camera)
+    street = replace(street, sky=None)
+    assert shadow_casters(insert(street, CAR, Placement("car", -12, 0)).scene, camera) == []
+    (caster,) = shadow_casters(insert(street, CAR, Placement("car", 14, 0)).scene, camera)
     x0, y0, x1, y1 = caster.window
-    assert 0 <= x0 < 48 < x1 <= 96 and 27 < y1 <= 54
-    assert (x1 - x0) * (y1 - y0) < 96 * 54 / 8
+    assert 0 <= x0 < 48 < x1 <= 96 and 20 < y1 <= 54
+    assert (x1 - x0) * (y1 - y0) < 96 * 54 / 4
 
 
 def test_an_asset_across_the_camera_plane_may_shade_the_whole_image(street):
-    beside = insert(street, car(), Placement("car", 1.5, 2.5)).scene
+    beside = insert(street, CAR, Placement("car", 1.5, 2.5)).scene
     (caster,) = shadow_casters(beside, street.camera("front_camera", START_US))
     assert caster.window == (0, 0, 96, 54)
+
+
+def test_a_clip_traces_a_standing_assets_shadow_once(street, monkeypatch):
+    import render.shadow
+
+    calls = []
+    traced = render.shadow.trace_field
+    monkeypatch.setattr(render.shadow, "trace_field", lambda *a: calls.append(1) or traced(*a))
+    scene = insert(street, CAR, Placement("car", 10, 0)).scene
+    for t in scene.frame_times("front_camera")[:4]:
+        render_frame(scene, scene.camera("front_camera", int(t)))
+    assert len(calls) == 1

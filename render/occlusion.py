@@ -1,0 +1,103 @@
+"""How much of the sky's light an asset keeps from the places around it: traced once, then looked up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from render.tracer import Blockers
+from scenes.gaussians import Gaussians
+from scenes.poses import matrix_from_quat
+
+CELLS = 6000
+"""Of one level of a field: its cell is as coarse as that asks for."""
+
+LEVELS = 4
+"""Heights at which light is traced, from the ground to the asset's own."""
+
+FARTHEST = 30.0
+"""Metres from an asset to the end of its longest shadow."""
+
+BESIDE = 1.5
+"""Metres around a footprint that are traced whatever the light."""
+
+SOLID = 0.3
+"""Opacity from which a splat blocks light."""
+
+SIGMAS = 1.3
+"""Half the side of the square that stands for a splat, in its standard deviations: there it has lost half of its opacity."""
+
+MOST = 20_000
+"""Splats of one asset, or scene, that block light."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """Where a shadow can fall, in the asset's frame: corners low, high `[3]` in metres, the ground at 0."""
+
+    low: torch.Tensor
+    high: torch.Tensor
+
+    def corners(self) -> torch.Tensor:
+        """float64 `[8, 3]`."""
+        axes = torch.stack([self.low, self.high], 1).double()
+        return torch.cartesian_prod(*axes)
+
+
+@dataclass(frozen=True)
+class Field:
+    """The part of the light that is blocked, `[Z, Y, X]` float32, over a box in the asset's frame."""
+
+    blocked: torch.Tensor
+    box: Box
+
+    def at(self, points: torch.Tensor) -> torch.Tensor:
+        """What is blocked `[...]` at points `[..., 3]`: trilinear, nothing beyond the box; below the ground as on it."""
+        low, high = self.box.low.to(points), self.box.high.to(points)
+        where = 2 * (points - low) / (high - low) - 1
+        where = torch.cat([where[..., :2], where[..., 2:].clamp_min(-1)], -1).reshape(1, 1, 1, -1, 3)
+        found = torch.nn.functional.grid_sample(self.blocked[None, None].to(points), where, align_corners=True, padding_mode="zeros")
+        return found.reshape(points.shape[:-1])
+
+
+def shadow_box(size: torch.Tensor, directions: torch.Tensor) -> Box:
+    """Where the shadow of a box `[length, width, height]` falls under light from unit `directions` `[K, 3]`, but for faint outskirts."""
+    height = float(size[2])
+    reach = (-directions[:, :2] / directions[:, 2:].clamp_min(1e-3) * height).float()
+    reach = reach * (FARTHEST / reach.norm(dim=1, keepdim=True).clamp_min(FARTHEST))
+    half = size[:2].float() / 2
+    low = torch.minimum(reach.quantile(0.03, 0) - half, -half - BESIDE)
+    high = torch.maximum(reach.quantile(0.97, 0) + half, half + BESIDE)
+    return Box(torch.cat([low, torch.zeros(1)]), torch.cat([high, torch.tensor([height])]))
+
+
+def trace_field(splats: Gaussians, box: Box, directions: torch.Tensor, weights: torch.Tensor) -> Field:
+    """The light from `directions` `[K, 3]` of `weights` `[K]` that splats keep from the places of a box, all in one frame."""
+    blockers = Blockers(squares(splats))
+    extent = (box.high - box.low)[:2]
+    cell = max(0.08, float(extent.prod() / CELLS) ** 0.5)
+    counts = [max(2, round(float(e) / cell) + 1) for e in extent]
+    axes = [torch.linspace(float(a), float(b), n) for a, b, n in zip(box.low, box.high, [*counts, LEVELS], strict=True)]
+    axes[2][0] = 0.02  # above what is left of the road in an asset
+    z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    points = torch.stack([x, y, z], -1).reshape(-1, 3)
+    blocked = (1 - blockers.open_share(points, directions, weights, FARTHEST)).reshape(z.shape)
+    # towards the box's sides it fades, so that no edge shows where it ends
+    fade = [(torch.minimum(torch.arange(n), torch.arange(n).flip(0)) / 4).clamp_max(1) for n in counts]
+    return Field(blocked * fade[1][:, None] * fade[0], box)
+
+
+def squares(splats: Gaussians) -> np.ndarray:
+    """Triangles `[F, 3, 3]` of three squares, across each other, for every solid splat; of more than `MOST` every few, larger in return."""
+    solid = splats.select(torch.sigmoid(splats.logit_opacities) > SOLID)
+    every = max(1, -(-len(solid) // MOST))
+    solid = solid.select(torch.arange(0, len(solid), every))
+    axes = matrix_from_quat(solid.quats) * (SIGMAS * every**0.5 * solid.log_scales.exp())[:, None]
+    triangles = []
+    for i, j in ((0, 1), (1, 2), (2, 0)):  # of a flat splat two of them have no area, and block nothing
+        a, b = axes[:, :, i], axes[:, :, j]
+        corners = torch.stack([solid.means + s * a + t * b for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1)
+        triangles.append(corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3))
+    return torch.cat(triangles).detach().cpu().numpy()
