@@ -24,7 +24,10 @@ _CHUNK = 256
 _RANGES = [f"{end}_{value}" for kind in ("", "scale_") for end in ("min", "max") for value in (kind + "x", kind + "y", kind + "z")]
 _COLOURS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+_111011, _101010, _8888 = ((21, 11), (11, 10), (0, 11)), ((20, 10), (10, 10), (0, 10)), ((24, 8), (16, 8), (8, 8), (0, 8))
 _LARGEST_LOG_SCALE = 20.0
+_UNPACKED_SH = ((np.arange(256) + 0.5) / 256 * 8 - 4).astype(np.float32)
+_UNPACKED_SH[[0, 255]] = -4, 4
 
 
 def load_compressed_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
@@ -32,21 +35,23 @@ def load_compressed_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str
     path = Path(path)
     chunks, vertices, rest = _tables(path)
     n = len(vertices)
-    low = {name: chunks[:, i : i + 3] for name, i in (("position", 0), ("scale", 6), ("color", 12))}
-    high = {name: chunks[:, i + 3 : i + 6] for name, i in (("position", 0), ("scale", 6), ("color", 12))}
 
-    def between(name: str, share: np.ndarray) -> np.ndarray:
-        """float32 `[n, 3]` values at a share of their chunk's range."""
+    def between(at: int, shares: np.ndarray) -> np.ndarray:
+        """float32 `[n, 3]`: values at shares `[3, n]` of their chunks' ranges, which begin at a column of those."""
+        values = np.empty((n, 3), np.float32)
         with np.errstate(invalid="ignore", over="ignore"):
-            least, most = (np.repeat(ends[name], _CHUNK, 0)[:n] for ends in (low, high))
-            return least * (1 - share) + most * share
+            for i, share in enumerate(shares):
+                least, most = (np.repeat(chunks[:, column], _CHUNK)[:n] for column in (at + i, at + 3 + i))
+                values[:, i] = least * (1 - share) + most * share
+        return values
 
-    rgba = vertices[:, 3].astype(">u4").view(np.uint8).reshape(n, 4)
-    quats = restore_largest(vertices[:, 1] >> 30, (_bits(vertices[:, 1], ((20, 10), (10, 10), (0, 10))) - 0.5) * np.float32(2**0.5))
-    dc = sh_from_rgb(between("color", rgba[:, :3] / np.float32(255)))
-    higher = _UNPACKED_SH[rest].reshape(n, 3, rest.shape[1] // 3).transpose(0, 2, 1)
-    means, log_scales = (between(name, _bits(vertices[:, i], _111011)) for name, i in (("position", 0), ("scale", 2)))
-    return clean(assembled(means, quats, log_scales, BYTE_LOGITS[rgba[:, 3]], np.concatenate([dc[:, None], higher], 1)), str(path))
+    position, rotation, scale, colour = (np.ascontiguousarray(vertices[:, i]) for i in range(4))
+    quats = restore_largest(rotation >> 30, (_fields(rotation, _101010) - np.float32(0.5)) * np.float32(2**0.5))
+    sh = np.empty((n, 1 + rest.shape[1] // 3, 3), np.float32)
+    sh[:, 0] = sh_from_rgb(between(12, _fields(colour, _8888[:3])))
+    sh[:, 1:] = _UNPACKED_SH[rest].reshape(n, 3, rest.shape[1] // 3).transpose(0, 2, 1)
+    means, log_scales = between(0, _fields(position, _111011)), between(6, _fields(scale, _111011))
+    return clean(assembled(means, quats, log_scales, BYTE_LOGITS[colour & 0xFF], sh), str(path))
 
 
 def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
@@ -66,9 +71,9 @@ def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
     which, three = drop_largest(g["quats"])
     packed = np.empty((n, 4), "<u4")
     packed[:, 0], packed[:, 2] = (_packed(share(name), _111011) for name in ("position", "scale"))
-    packed[:, 1] = which.astype(np.uint32) << 30 | _packed(three / 2**0.5 + 0.5, ((20, 10), (10, 10), (0, 10)))
+    packed[:, 1] = which.astype(np.uint32) << 30 | _packed(three / 2**0.5 + 0.5, _101010)
     rgba = np.concatenate([share("color"), opacities_from(g["logit_opacities"])[:, None]], 1)
-    packed[:, 3] = _packed(rgba, ((24, 8), (16, 8), (8, 8), (0, 8)))
+    packed[:, 3] = _packed(rgba, _8888)
     rest = np.floor((g["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1)) / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8)
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
     header += [f"property float {name}" for name in _RANGES + _COLOURS]
@@ -80,14 +85,9 @@ def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
             file.write(table.tobytes())
 
 
-_111011 = ((21, 11), (11, 10), (0, 11))
-_UNPACKED_SH = ((np.arange(256) + 0.5) / 256 * 8 - 4).astype(np.float32)
-_UNPACKED_SH[[0, 255]] = -4, 4
-
-
-def _bits(words: np.ndarray, places: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """float32 `[n, len(places)]` from 0 to 1: the fields of uint32 `[n]` at (shift, width)."""
-    return np.stack([(words >> shift & (1 << width) - 1) / np.float32((1 << width) - 1) for shift, width in places], 1)
+def _fields(words: np.ndarray, places: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """float32 `[len(places), n]` from 0 to 1: the fields of uint32 `[n]` at (shift, width)."""
+    return np.stack([(words >> shift & (1 << width) - 1) / np.float32((1 << width) - 1) for shift, width in places])
 
 
 def _packed(values: np.ndarray, places: tuple[tuple[int, int], ...]) -> np.ndarray:

@@ -59,11 +59,12 @@ def drop_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def restore_largest(which: np.ndarray, three: np.ndarray) -> np.ndarray:
-    """float32 quaternions `[N, 4]` of length one from what `drop_largest` gives."""
+    """float32 quaternions `[N, 4]` of length one from which term is left out `[N]` and the others, columns `[3, N]` in their order."""
     quats = np.empty((len(which), 4), np.float32)
-    largest = np.arange(4) == which[:, None]
-    quats[~largest] = three.ravel()
-    quats[largest] = np.sqrt(np.maximum(0, 1 - np.square(three).sum(1)))
+    largest = np.sqrt(np.maximum(0, 1 - three[0] * three[0] - three[1] * three[1] - three[2] * three[2]))
+    for term in range(4):
+        before, after = three[min(term, 2)], three[max(term - 1, 0)]
+        quats[:, term] = np.where(which == term, largest, np.where(which > term, before, after))
     return quats
 
 

@@ -117,14 +117,18 @@ def _read(path: Path, fetch: Callable[[str], bytes]) -> Gaussians:
         least, most = (np.array([float(v) for v in meta["means"][end]]) for end in ("mins", "maxs"))
         if least.shape != (3,) or most.shape != (3,):
             raise ValueError(f"{path} is corrupt: its meta.json gives {len(least)} and {len(most)} ends of the positions, not 3")
-        fixed = pixels("means", 0)[:, :3].astype(np.uint16) | pixels("means", 1)[:, :3].astype(np.uint16) << 8
+        low, high = pixels("means", 0), pixels("means", 1)
+        means = np.empty((n, 3), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            logs = least + (most - least) * (fixed / 65535)
-            means = np.sign(logs) * np.expm1(np.abs(logs))
+            logs = least + (most - least) * (np.arange(65536)[:, None] / 65535)
+            places = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+        for i in range(3):
+            means[:, i] = places[low[:, i] | high[:, i].astype(np.uint16) << 8, i]
         turns = pixels("quats")
         if (turns[:, 3] < 252).any():
             raise ValueError(f"{path} is corrupt: splat {int((turns[:, 3] < 252).argmax())} has no quaternion: its tag is below 252")
-        quats = restore_largest(turns[:, 3] - 252, (turns[:, :3] / np.float32(255) - np.float32(0.5)) * np.float32(2**0.5))
+        terms = ((np.arange(256) / 255 - 0.5) * 2**0.5).astype(np.float32)
+        quats = restore_largest(turns[:, 3] - 252, terms[turns.T[:3]])
         log_scales = _table(path, meta, "scales")[pixels("scales")[:, :3]]
         colours = pixels("sh0")
         sh = _table(path, meta, "sh0")[colours[:, :3]][:, None]

@@ -45,7 +45,7 @@ def load_spz(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     positions, alphas, colours, scales, rotations, harmonics = (np.frombuffer(block, np.uint8) for block in blocks)
     fixed = np.zeros((n * 3, 4), np.uint8)
     fixed[:, 1:] = positions.reshape(n * 3, 3)  # in the upper bytes of an int32, so that the sign is where it belongs
-    means = fixed.view("<i4").reshape(n, 3) * 2.0 ** -(8 + fraction)
+    means = fixed.view("<i4").reshape(n, 3).astype(np.float32) * np.float32(2.0 ** -(8 + fraction))
     sh = np.empty((n, k, 3), np.float32)
     sh[:, 0] = ((np.arange(256) / 255 - 0.5) / _COLOUR).astype(np.float32)[colours].reshape(n, 3)
     sh[:, 1:] = ((np.arange(256) - 128) / 128).astype(np.float32)[harmonics].reshape(n, k - 1, 3)
@@ -170,9 +170,9 @@ def _pack_first_three(quats: np.ndarray) -> np.ndarray:
 
 
 def _smallest_three(words: np.ndarray) -> np.ndarray:
-    fields = np.stack([words >> shift & 0x3FF for shift in (20, 10, 0)], 1)
-    three = (fields & 0x1FF) * np.float32(0.5**0.5 / 511) * np.where(fields & 0x200, np.float32(-1), np.float32(1))
-    return restore_largest(words >> 30, three)[:, [3, 0, 1, 2]]
+    signed = np.arange(512) * np.float32(0.5**0.5 / 511)
+    terms = np.concatenate([signed, -signed])
+    return restore_largest(words >> 30, np.stack([terms[words >> shift & 0x3FF] for shift in (20, 10, 0)]))[:, [3, 0, 1, 2]]
 
 
 def _pack_smallest_three(quats: np.ndarray) -> np.ndarray:
