@@ -48,6 +48,7 @@ def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None
     """Launch `kernel` over `count` work items, inside a `stage`; its last parameter, `first`, is the index of a band's first item."""
     if count == 0:
         return
+    _ready(kernel, device.type)
     if device.type == "cuda":
         wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
         return
@@ -61,15 +62,28 @@ def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None
     if bands == 1:
         band(0)
     else:
-        _ready(kernel)
         list(_pool(threads).map(band, range(bands)))
 
 
+PATIENCE = 0.7
+"""Seconds that a kernel may take to load before a line says why; loading one that is compiled takes a hundredth of that."""
+
+
 @cache
-def _ready(kernel: wp.Kernel) -> None:
+def _ready(kernel: wp.Kernel, device: str) -> None:
     """Compile before the threads start: they would all wait on one compiler."""
-    wp.init()
-    kernel.module.load("cpu")
+    said = threading.Timer(PATIENCE, _say_compiling)
+    said.daemon = True
+    said.start()
+    try:
+        kernel.module.load(device)
+    finally:
+        said.cancel()
+
+
+@cache
+def _say_compiling() -> None:
+    print(f"sidestep: compiling kernels for this machine, once; they are kept in {wp.config.kernel_cache_dir}", file=sys.stderr, flush=True)
 
 
 def run_blocks(kernel: wp.Kernel, blocks: int, block_dim: int, args: list, device: torch.device) -> None:

@@ -43,7 +43,7 @@ BANDS = (1, 4, 9)
 def cloud(width: int, height: int, count: int = 12_000) -> Preset:
     """All shapes, all opacities, all bands of harmonics, some of it near."""
     g = random_splats(count, 1)
-    g = replace(g, log_scales=g.log_scales - 0.9)
+    g = replace(g, log_scales=g.log_scales - 0.9, logit_opacities=3 * g.logit_opacities)
     camera = Camera(Pinhole(0.9 * width, 0.9 * width, width / 2, height / 2), width, height, STILL)
     return Preset([Placed(g, translation(0, 0, 4))], camera, SplatModel())
 
