@@ -119,14 +119,20 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
         """The share of the readout at which local point x, moved by `shift` in the camera, is seen."""
         s = wp.float64(start)
         if wp.static(rolling):
+            low = wp.float64(0.0)
+            high = wp.float64(1.0)
             for _i in range(steps):
                 y = rotation_at(m, s) * x + translation_at(m, s) + shift
                 v = jacobian(o, y) * (rotation_rate(m, s) * x + translation_rate(m, s))
                 p = pixel(o, y)
-                slope = m.extent - v[m.axis]
-                if slope < wp.float64(0.2) * m.extent:
-                    slope = m.extent
-                s = wp.clamp(s - (s * m.extent - p[m.axis]) / slope, wp.float64(0.0), wp.float64(1.0))
+                early = s * m.extent - p[m.axis]
+                if early < wp.float64(0.0):
+                    low = wp.float64(s)
+                else:
+                    high = wp.float64(s)
+                s = wp.clamp(s - early / (m.extent - v[m.axis]), wp.float64(0.0), wp.float64(1.0))
+                if (s < low and low > wp.float64(0.0)) or (s > high and high < wp.float64(1.0)):
+                    s = wp.float64(0.5) * (low + high)  # past what was looked at already: a point that comes near fast
         return s
 
     @wp.func
@@ -211,7 +217,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 out.v[k, 0] = e[0]
                 out.v[k, 1] = e[1]
         else:
-            s = readout(o, m, x, shift, c.s, 4)
+            s = readout(o, m, x, shift, c.s, 8)
             out.aimed = pixel(o, placed(m, x, shift, s))
             for i in range(6):
                 local = column(axes, i // 2)
@@ -219,7 +225,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     local = -local
                 r = reach(o, c.aim, c.rotation * local, wp.static(depth))
                 point = x + r.tau * local
-                s = readout(o, m, point, shift, c.s, 4)
+                s = readout(o, m, point, shift, c.s, 8)
                 d = pixel(o, placed(m, point, shift, s)) - out.aimed
                 stretch = ROOT3 / r.tau
                 dx = (d[0] - nearest(o, d[0]) * o.period) * stretch
@@ -352,7 +358,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         o = c.rotation * local
                         r = reach(optics, c.aim, o, wp.static(depth))
                         point = x + r.tau * local
-                        s = readout(optics, motion, point, shift, c.s, 4)
+                        s = readout(optics, motion, point, shift, c.s, 8)
                         y = placed(motion, point, shift, s)
                         stretch = ROOT3 / r.tau
                         g_d = (wp.vec2d(g_v[k, 0], g_v[k, 1]) / ROOT6 + g_shared) * stretch
@@ -379,7 +385,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                             g_local += wp.transpose(c.rotation) * back.offset
                         for a in range(3):
                             g_axes[a, k // 2] = g_axes[a, k // 2] + sign * g_local[a]
-                    s = readout(optics, motion, x, shift, c.s, 4)
+                    s = readout(optics, motion, x, shift, c.s, 8)
                     y = placed(motion, x, shift, s)
                     g_p = pixel_backward(optics, motion, x, shift, s, g_aimed, none)
                     g_y = wp.transpose(jacobian(optics, y)) * g_p

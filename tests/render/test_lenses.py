@@ -30,7 +30,7 @@ def camera_of(lens) -> Camera:
     return Camera(lens, WIDTH, HEIGHT, START)
 
 
-def around(seed: int, count: int = 130) -> list[Placed]:
+def around(seed: int, count: int = 60) -> list[Placed]:
     """Two clouds, one ahead and one that surrounds the camera, splats of all shapes."""
     g = random_splats(count, seed)
     wide = random_splats(count // 2, seed + 1, sh_count=4)
@@ -43,8 +43,8 @@ def around(seed: int, count: int = 130) -> list[Placed]:
 
 def stretched(seed: int) -> list[Placed]:
     """Needles and pancakes, some of which reach past the camera and past the lens's edge."""
-    g = random_splats(50, seed)
-    shape = torch.tensor([[0.7, -3.5, -3.5], [0.3, 0.3, -6.0]]).repeat(25, 1)
+    g = random_splats(30, seed)
+    shape = torch.tensor([[0.7, -3.5, -3.5], [0.3, 0.3, -6.0]]).repeat(15, 1)
     return [Placed(replace(g, means=1.5 * g.means, log_scales=shape + 0.2 * g.log_scales), translation(0, 0, 2.5))]
 
 
@@ -52,9 +52,8 @@ def largest(mine: torch.Tensor, reference: torch.Tensor, where: torch.Tensor) ->
     return float((mine.detach().double() - reference.detach()).abs()[where].max())
 
 
-@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize(("make", "model"), [(around, UT), (around, MODELS[1]), (stretched, SMOOTH)], ids=["ut", "ewa", "stretched"])
 @pytest.mark.parametrize("name", LENSES)
-@pytest.mark.parametrize("make", [around, stretched])
 def test_every_lens_draws_what_the_oracle_draws(make, name, model):
     placed, camera = make(1), camera_of(LENSES[name])
     rgb, alpha, depth, instance, unsure = oracle.render(oracle.as_oracle(placed), camera, model, cutoff=1 / 255, alpha_max=0.999)

@@ -1,0 +1,171 @@
+"""Shutters that move: camera and actors change their pose while the image is read out, against the float64 oracle."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import RenderConfig, rasterize
+from scenes import Camera, Equirectangular, Fisheye, OpenCV, Pinhole, Placed, SplatModel
+from scenes.poses import interpolate, matrix_from_quat, pose_from, translation
+from tests import oracle
+from tests.bench.presets import random_splats
+from tests.render.test_lenses import HEIGHT, START, WIDTH, assert_gradient, gradients, largest
+
+PINHOLE = Pinhole(48.0, 50.0, 27.0, 18.0)
+FISHEYE = Fisheye(20.0, 20.5, 28.0, 20.0, -0.02, 0.004)
+READOUT = 1 / 30
+
+
+def turned(degrees: float, axis=(0.2, 1.0, 0.3)) -> torch.Tensor:
+    half = math.radians(degrees) / 2
+    direction = torch.nn.functional.normalize(torch.tensor([float(a) for a in axis]), dim=0) * math.sin(half)
+    return pose_from([math.cos(half), *direction.tolist()], [0.0, 0.0, 0.0])
+
+
+def driven(lens, shutter: str, speed: float = 30.0, rate: float = 100.0) -> Camera:
+    """A camera that drives on at `speed` m/s and turns by `rate` degrees a second while its image is read out."""
+    end = START @ translation(0.1 * speed * READOUT, 0.0, speed * READOUT) @ turned(rate * READOUT)
+    return Camera(lens, WIDTH, HEIGHT, START, end, shutter=shutter)
+
+
+def traffic(seed: int) -> list[Placed]:
+    """A street that stands and a car that comes the other way, turning."""
+    pose = pose_from([0.9, -0.1, 0.2, 0.05], [0.5, -0.2, 6.0])
+    spread = random_splats(70, seed)
+    spread = replace(spread, means=spread.means * torch.tensor([2.0, 1.5, 1.0]))
+    car = Placed(random_splats(30, seed + 1, sh_count=4), pose, translation(0.4, 0.1, -0.9) @ pose @ turned(4, (1, 0, 1)), instance=2)
+    return [Placed(spread, pose_from([1, 0.1, 0.2, 0.05], [0.1, 0.2, 8.0])), car]
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(("lens", "shutter"), [(PINHOLE, "rows"), (FISHEYE, "columns")], ids=["pinhole-rows", "fisheye-columns"])
+def test_a_moving_shutter_draws_what_the_oracle_draws(lens, shutter, antialias):
+    placed, camera, model = traffic(1), driven(lens, shutter), SplatModel(antialias=antialias)
+    ends = [p.world_from_local_end for p in placed]
+    truth = oracle.as_oracle(placed)
+    rgb, alpha, depth, _, unsure = oracle.render(
+        truth, camera, model, cutoff=1 / 255, alpha_max=0.999, world_from_cam_end=camera.world_from_cam_end, ends=ends
+    )
+    frame = rasterize(placed, camera, ("rgb", "alpha", "depth"), model=model, config=RenderConfig(termination=0))
+    sure = ~unsure
+    assert sure.float().mean() > 0.9 and alpha.mean() > 0.05
+    assert largest(frame.rgb, rgb, sure) < 2e-5 * max(1.0, float(rgb.detach().max()))
+    assert largest(frame.alpha, alpha, sure) < 2e-5
+    still = rasterize([replace(p, world_from_local_end=None) for p in placed], replace(camera, world_from_cam_end=None), model=model)
+    assert (still.rgb - frame.rgb).abs().max() > 0.1, "the motion must show"
+
+
+@pytest.mark.parametrize("shutter", ["rows", "columns"])
+@pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=lambda lens: lens.kind)
+def test_a_moving_shutter_has_the_oracles_gradients(lens, shutter):
+    """Of every field, the start and end poses of the camera and of the car, and the lens."""
+    seen = set()
+    for what, mine, reference in gradients(traffic(2), driven(lens, shutter), SplatModel(antialias=shutter == "rows")):
+        assert_gradient(what, mine, reference)
+        seen.add(what)
+    assert {"camera pose", "camera's end pose", "end pose of 1"} <= seen
+
+
+def test_the_oracles_gradients_through_a_shutter_are_its_finite_differences():
+    camera = replace(driven(PINHOLE.scaled(0.25, 0.25), "rows"), width=14, height=10)
+    (fields, pose, instance) = oracle.as_oracle([Placed(random_splats(3, 3, sh_count=1), translation(0, 0, 4))])[0]
+    still = {name: t.detach() for name, t in fields.items()}
+
+    def moved(by, tilt, shift):
+        """A pose that moves along the poses: a matrix that does not rotate is none."""
+        top = torch.cat([matrix_from_quat(torch.cat([torch.ones(1, dtype=torch.float64), tilt])), shift[:, None]], 1)
+        return by @ torch.cat([top, torch.eye(4, dtype=torch.float64)[3:]])
+
+    def total(tilt, shift, means):
+        start, end = moved(camera.world_from_cam, tilt, shift), moved(camera.world_from_cam_end, -tilt, 2 * shift)
+        g = {**still, "means": means}
+        rgb, *_ = oracle.render([(g, pose.detach(), instance)], camera, SplatModel(), start, world_from_cam_end=end)
+        return (rgb.sum(-1) * torch.linspace(-1, 1, 14, dtype=torch.float64)).sum()
+
+    tilt = torch.tensor([0.01, -0.02, 0.005], dtype=torch.float64, requires_grad=True)
+    shift = torch.tensor([0.02, 0.01, -0.03], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(total, (tilt, shift, fields["means"]), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=lambda lens: lens.kind)
+def test_a_shutter_that_does_not_move_is_a_global_one(lens):
+    placed = [replace(p, world_from_local_end=p.world_from_local) for p in traffic(4)]
+    camera = Camera(lens, WIDTH, HEIGHT, START, START, shutter="rows")
+    moving = rasterize(placed, camera, ("rgb", "depth"))
+    still = rasterize(traffic_still(placed), replace(camera, world_from_cam_end=None, shutter="global"), ("rgb", "depth"))
+    assert (moving.rgb - still.rgb).abs().max() < 1e-5
+    near = still.depth < 1e3
+    assert (moving.depth / still.depth - 1).abs()[near].max() < 1e-4
+
+
+def traffic_still(placed: list[Placed]) -> list[Placed]:
+    return [replace(p, world_from_local_end=None) for p in placed]
+
+
+def test_each_row_is_what_a_still_camera_at_its_own_pose_sees():
+    """Small splats, which have no extent in time: a row of the moving shutter is that row of a global one at the row's pose."""
+    g = random_splats(300, 5)
+    placed = [Placed(replace(g, log_scales=torch.full_like(g.log_scales, math.log(0.004))), translation(0, 0, 6))]
+    camera = driven(PINHOLE, "rows")
+    frame = rasterize(placed, camera, config=RenderConfig(termination=0))
+    for row in (3, 20, 36):
+        pose = interpolate(camera.world_from_cam, camera.world_from_cam_end, (row + 0.5) / HEIGHT)
+        still = rasterize(placed, Camera(PINHOLE, WIDTH, HEIGHT, pose), config=RenderConfig(termination=0))
+        # a splat's neighbouring rows are seen a moment later: a 40th of the motion, under a tenth of a pixel
+        assert (frame.rgb[row] - still.rgb[row]).abs().mean() < 0.15 * still.rgb[row].abs().mean()
+
+
+def test_moving_splats_and_camera_by_the_same_motion_shows_nothing_of_it():
+    motion = translation(0.3, -0.2, 1.0) @ turned(1)
+    start = [Placed(random_splats(120, 6), translation(0, 0, 6))]
+    camera = Camera(PINHOLE, WIDTH, HEIGHT, torch.eye(4, dtype=torch.float64), shutter="rows")
+    with_it = [replace(p, world_from_local_end=motion @ p.world_from_local) for p in start]
+    moving = rasterize(with_it, replace(camera, world_from_cam_end=motion)).rgb
+    assert (moving - rasterize(start, camera).rgb).abs().max() < 5e-3  # each is interpolated by itself, about its own origin
+
+
+def test_extreme_motion_leaves_image_and_gradients_finite():
+    g = random_splats(200, 7).map(lambda t: t.requires_grad_())
+    for end in (translation(0, 0, 40), translation(30, 0, 0), translation(0, 0, 5) @ turned(55)):
+        camera = Camera(PINHOLE, WIDTH, HEIGHT, START, START @ end, shutter="rows")
+        frame = rasterize(Placed(g, translation(0, 0, 3)), camera, ("rgb", "alpha"))
+        frame.rgb.square().sum().backward()
+        assert frame.rgb.isfinite().all() and all(t.grad.isfinite().all() for t in g.tensors().values())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shutter": "global"}, "the camera has an end pose, which a global shutter never sees"),
+        ({"lens": Equirectangular.whole(WIDTH, HEIGHT), "shutter": "columns"}, "no time at its seam"),
+        ({"world_from_cam_end": START @ turned(70)}, "the camera turns by 70 degrees"),
+        ({"world_from_cam_end": START * torch.nan}, "the end pose of the camera is not finite"),
+    ],
+    ids=["global", "seam", "turn", "nan"],
+)
+def test_shutters_that_cannot_be_drawn_are_refused_by_name(change, message):
+    with pytest.raises(ValueError, match=message):
+        rasterize(traffic(8), replace(driven(PINHOLE, "rows"), **change))
+
+
+def test_ewa_under_a_moving_shutter_is_refused_by_name():
+    with pytest.raises(ValueError, match='projection "ut" only'):
+        rasterize(traffic(8), driven(PINHOLE, "rows"), model=SplatModel(projection="ewa"))
+
+
+def test_a_distorting_lens_has_a_shutter_too():
+    placed, camera = traffic(9), driven(OpenCV(48.0, 50.0, 27.0, 18.0, -0.2, 0.03), "columns")
+    frame = rasterize(placed, camera)
+    ends = [p.world_from_local_end for p in placed]
+    rgb, *_, unsure = oracle.render(
+        oracle.as_oracle(placed),
+        camera,
+        SplatModel(),
+        cutoff=1 / 255,
+        alpha_max=0.999,
+        world_from_cam_end=camera.world_from_cam_end,
+        ends=ends,
+    )
+    assert largest(frame.rgb, rgb, ~unsure) < 1e-4 * max(1.0, float(rgb.detach().max()))
