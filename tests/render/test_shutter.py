@@ -33,9 +33,9 @@ def driven(lens, shutter: str, speed: float = 30.0, rate: float = 100.0) -> Came
 def traffic(seed: int) -> list[Placed]:
     """A street that stands and a car that comes the other way, turning."""
     pose = pose_from([0.9, -0.1, 0.2, 0.05], [0.5, -0.2, 6.0])
-    spread = random_splats(70, seed)
+    spread = random_splats(110, seed)
     spread = replace(spread, means=spread.means * torch.tensor([2.0, 1.5, 1.0]))
-    car = Placed(random_splats(30, seed + 1, sh_count=4), pose, translation(0.4, 0.1, -0.9) @ pose @ turned(4, (1, 0, 1)), instance=2)
+    car = Placed(random_splats(50, seed + 1, sh_count=4), pose, translation(0.4, 0.1, -0.9) @ pose @ turned(4, (1, 0, 1)), instance=2)
     return [Placed(spread, pose_from([1, 0.1, 0.2, 0.05], [0.1, 0.2, 8.0])), car]
 
 
