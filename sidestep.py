@@ -40,6 +40,7 @@ from scenes.options import (
     Speed,
     Time,
     TimeOrAll,
+    Way,
     names,
     written,
 )
@@ -65,6 +66,8 @@ class Insert:
     """Heading, to the left of the body's, as 5deg."""
     speed: Speed = 0.0
     """Speed along its heading, as 8m/s."""
+    path: Way = "straight"
+    """Straight on, or in a lane beside the recorded path, to which --yaw then is relative; yaw 180deg is oncoming traffic."""
     trajectory: Csv = None
     """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw and --speed: seconds after --start, metres forward and left."""
     start: Time = 0
@@ -80,9 +83,9 @@ class Insert:
         from scenes.usd_edit import add_edit
 
         scene, _ = open_scene(self.scene)
-        placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.trajectory)
+        placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.path, self.trajectory)
         result = insert(scene, Databank(self.databank).load(self.asset), placement, int(scene.ego.times_us[0]) + self.start)
-        about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed}
+        about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}
         add_edit(self.scene, result.actor.track, [result.actor], about)
         warn(result.warnings)
         layer, fix = self.scene / "edits" / f"{result.actor.track}.usda", f"sidestep edit {self.scene} --undo {result.actor.track}"

@@ -13,11 +13,12 @@ import torch.nn.functional as F
 
 from recon.assets import looking_at
 from render import Frame, rasterize
-from render.tracer import Blockers, Mesh, TracedMesh, fibonacci, lit
+from render.tracer import SKY, Blockers, Mesh, TracedMesh, fibonacci, lit
 from scenes.asset import Asset
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, SplatModel
 from scenes.harmonics import sh_from_rgb
+from scenes.match import ASPHALT
 from scenes.poses import matrix_from_quat, quat_from_matrix
 
 AXES = {name: np.eye(3)[i] * sign for i, letter in enumerate("xyz") for name, sign in ((letter, 1.0), (f"-{letter}", -1.0))}
@@ -242,5 +243,6 @@ def asset_of_mesh(
         splats_of_mesh(mesh, config.splats), traced, views_around(size, config.views, config.size), config, report
     )
     whole, own = likeness(splats, traced, views_around(size, 8, config.size, offset=0.37))
-    facts = {"psnr_unseen": round(own, 2), "psnr_unseen_whole_picture": round(whole, 2), "views": config.views}
+    facts: dict = {"psnr_unseen": round(own, 2), "psnr_unseen_whole_picture": round(whole, 2), "views": config.views}
+    facts["ground_linear"] = [ASPHALT * SKY] * 3
     return Asset(splats, torch.from_numpy(np.maximum(size, 1e-3)), label, MODEL, {**meta, **facts})

@@ -1,4 +1,4 @@
-"""An asset of the databank becomes an actor of a scene: on the ground, facing its heading, moving as told."""
+"""An asset of the databank becomes an actor of a scene: on the ground, in its light, facing its heading, moving as told."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from scenes.asset import Actor, Asset
+from scenes.collide import collisions
+from scenes.lane import Lane
+from scenes.match import matched
 from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
@@ -31,7 +34,8 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     """Put an asset into a scene.
 
     start_us: the time of the clip's first frame, to whose body pose the placement is relative; the drive's first by default.
-    The actor gets a track of its own and `inserted` in its asset's meta. ValueError where the time is off the path or the
+    The actor gets a track of its own and `inserted` in its asset's meta; its colours are those of the light at its first place. What it
+    runs into is among the warnings. ValueError where the time is off the path or the
     trajectory file is bad; where the scene is not metric.
     """
     require_metres(scene, f"the place of {placement.asset}")
@@ -42,6 +46,8 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     body = scene.ego.at(start_us)
     if placement.trajectory is not None:
         times, xy, headings = _along(read_waypoints(placement.trajectory), body, start_us)
+    elif placement.path == "lane":
+        times, xy, headings = _in_lane(scene, placement, body, start_us)
     else:
         times, xy, headings = _straight(scene, placement, body, start_us)
 
@@ -55,8 +61,10 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
     if asset.model != scene.model:
         warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
-    marked = replace(asset, meta={**asset.meta, "inserted": True})
+    lit = matched(asset, scene, xy[int((times - start_us).abs().argmin())])
+    marked = replace(lit, meta={**lit.meta, "inserted": True})
     actor = Actor(marked, Trajectory(times, torch.stack(poses)), _track(scene, placement.asset))
+    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor)]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
 
 
@@ -109,12 +117,27 @@ def _straight(scene: Scene, placement: Placement, body: torch.Tensor, start_us: 
     origin = _world(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))
     if placement.speed == 0:
         return torch.tensor([start_us]), origin, heading[None]
-    first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
-    count = max(2, -(-(last - first) // STEP_US) + 1)
-    times = torch.linspace(first, max(last, first + STEP_US), count, dtype=torch.float64).round().long()
+    times = _drive_times(scene)
     gone = placement.speed * (times - start_us).double() / 1e6
     xy = origin + gone[:, None] * torch.stack([torch.cos(heading), torch.sin(heading)])
-    return times, xy, heading.expand(count)
+    return times, xy, heading.expand(len(times))
+
+
+def _in_lane(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Times, world points and headings of an asset that keeps its distance to the recorded path, ahead or, turned round, against it."""
+    lane = Lane(scene.ego)
+    along, left = lane.of(_world(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))[0])
+    times = _drive_times(scene) if placement.speed else torch.tensor([start_us])
+    way = 1.0 if math.cos(placement.yaw) >= 0 else -1.0
+    xy, headings = lane.at(lane.gone(along, left, way * placement.speed * (times - start_us).double() / 1e6), left)
+    return times, xy, headings + placement.yaw
+
+
+def _drive_times(scene: Scene) -> torch.Tensor:
+    """Moments `[T]` over the whole drive, at most STEP_US apart."""
+    first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
+    count = max(2, -(-(last - first) // STEP_US) + 1)
+    return torch.linspace(first, max(last, first + STEP_US), count, dtype=torch.float64).round().long()
 
 
 def _along(points: list[Waypoint], body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from scenes import units
-from scenes.placement import Placement, parse_at, parse_placement
+from scenes.placement import Placement, parse_at, parse_path, parse_placement
 
 
 def written(parse: Callable[[str], Any], metavar: str, default: str) -> Any:
@@ -74,8 +74,9 @@ FitSize = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded, 
 Names = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "all")]
 Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
+Way = Annotated[str, written(parse_path, "straight|lane", "straight")]
 Csv = Annotated[Path | None, written(Path, "FILE", "none")]
-Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V]", "none")]
+Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V][,path=lane]", "none")]
 Shift = Annotated[
     tuple[str, tuple[float, float]], written(lambda text: _of_track(text, parse_at, "veh_3=0m,1.5m"), "ACTOR=FORWARD,LEFT", "none")
 ]

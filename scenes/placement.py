@@ -9,7 +9,8 @@ from pathlib import Path
 from scenes.names import nearest
 from scenes.units import angle, length, speed
 
-KEYS = ("yaw", "speed", "trajectory")
+KEYS = ("yaw", "speed", "path", "trajectory")
+PATHS = ("straight", "lane")
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_deg")
 
 
@@ -18,7 +19,8 @@ class Placement:
     """An asset of the databank and its place, relative to the unshifted body at the clip's first frame.
 
     x, y: metres forward and left of the body; yaw: radians to the left of its heading; speed: metres a second along the
-    asset's own heading; trajectory: a CSV file of the same frame (see `read_waypoints`), in place of all these.
+    asset's own heading; path: "straight" on, or in a "lane" beside the recorded path, to which yaw then is relative; trajectory: a CSV
+    file of the same frame (see `read_waypoints`), in place of all these.
     """
 
     asset: str
@@ -26,6 +28,7 @@ class Placement:
     y: float = 0.0
     yaw: float = 0.0
     speed: float = 0.0
+    path: str = "straight"
     trajectory: Path | None = None
 
 
@@ -48,7 +51,7 @@ def parse_at(text: str) -> tuple[float, float]:
 
 
 def parse_placement(text: str) -> Placement:
-    """"ID@X,Y[,yaw=5deg][,speed=8m/s]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
+    """"ID@X,Y[,yaw=5deg][,speed=8m/s][,path=lane]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
     asset, at, rest = text.rpartition("@")
     if not at or not asset:
         raise ValueError(f'"{text}" does not say what goes where; write ID@X,Y as car/0003@12m,3.5m (metres forward, left)')
@@ -64,7 +67,15 @@ def parse_placement(text: str) -> Placement:
             raise ValueError(f'"{text}" gives a place and a trajectory; a trajectory says it all: {asset}@trajectory={given["trajectory"]}')
         return Placement(asset, trajectory=Path(given["trajectory"]))
     x, y = parse_at(",".join(place))
-    return Placement(asset, x, y, angle(given.get("yaw", "0deg")), speed(given.get("speed", "0m/s")))
+    turn, fast = angle(given.get("yaw", "0deg")), speed(given.get("speed", "0m/s"))
+    return Placement(asset, x, y, turn, fast, parse_path(given.get("path", "straight")))
+
+
+def parse_path(text: str) -> str:
+    """"straight" or "lane". ValueError with the fix otherwise."""
+    if text not in PATHS:
+        raise ValueError(f'"{text}" is not a path; it is one of {", ".join(PATHS)}.{nearest(text, PATHS)}')
+    return text
 
 
 def read_waypoints(path: Path) -> list[Waypoint]:

@@ -18,12 +18,12 @@ def ramp(rise=0.1, bank=0.0):
 
 
 def test_a_parked_asset_stands_where_it_was_put(street):
-    result = insert(street, car(), Placement("car/0001", 12, 3.5, math.radians(5)))
+    result = insert(street, car(), Placement("car/0001", 12, 4.8, math.radians(5)))
     assert result.warnings == ()
     assert result.scene.actors == (*street.actors, result.actor)
     assert result.actor.track == "inserted_car_0001"
     pose = result.actor.trajectory.at(START_US + 123)
-    assert pose[:3, 3].tolist() == pytest.approx([12, 3.5, 0])
+    assert pose[:3, 3].tolist() == pytest.approx([12, 4.8, 0])
     assert float(yaw_of(pose)) == pytest.approx(math.radians(5))
 
 

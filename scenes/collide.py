@@ -1,0 +1,80 @@
+"""What an inserted actor runs into: other actors, and what stands in the background."""
+
+from __future__ import annotations
+
+import torch
+
+from scenes.asset import Actor
+from scenes.poses import inverse
+from scenes.scene import Scene
+
+STEP_US = 100_000
+"""Between the moments that are looked at."""
+
+SLACK = 0.1
+"""Metres by which boxes may overlap: annotators leave that much air."""
+
+CLEARANCE = 0.4
+"""Metres above the ground below which the background is road, kerb and their roughness."""
+
+SOLID = 0.5
+"""Opacity from which a splat is something to run into."""
+
+FEWEST = 12
+"""Splats that make something: floaters come alone."""
+
+
+def collisions(scene: Scene, actor: Actor) -> list[str]:
+    """What an actor of the scene touches during the drive, a sentence each with the first moment; [] where its way is free."""
+    first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
+    times = [t for t in range(first, last + 1, STEP_US) if actor.trajectory.covers(t)]
+    found = []
+    for other in scene.actors:
+        if other.track == actor.track:
+            continue
+        hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
+        if hit is not None:
+            found.append(f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment")
+    still = len(actor.trajectory) == 1
+    splats = scene.background.gaussians
+    solid = splats.means[torch.sigmoid(splats.logit_opacities) > SOLID]
+    for t in times[:1] if still else times:
+        count = _inside(solid, inverse(actor.trajectory.at(t)) @ scene.background.world_from_local, actor.asset.size)
+        if count >= FEWEST:
+            when = "" if still else f" {(t - first) / 1e6:.1f}s after the drive's first moment"
+            found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
+            break
+    return found
+
+
+def boxes_touch(a: Actor, b: Actor, time_us: int) -> bool:
+    """Whether the boxes of two actors overlap at a time, by the separating axes of their footprints (Gottschalk 1996) and their heights."""
+    poses = [x.trajectory.at(time_us) for x in (a, b)]
+    low, high = [], []
+    for x, pose in zip((a, b), poses, strict=True):
+        low.append(float(pose[2, 3]) + SLACK)
+        high.append(float(pose[2, 3] + x.asset.size[2]) - SLACK)
+    if low[0] > high[1] or low[1] > high[0]:
+        return False
+    corners = [_footprint(x, pose) for x, pose in zip((a, b), poses, strict=True)]
+    for pose in poses:
+        for axis in (pose[:2, 0], pose[:2, 1]):
+            axis = axis / axis.norm()
+            spans = [(float((c @ axis).min()), float((c @ axis).max())) for c in corners]
+            if spans[0][0] + SLACK > spans[1][1] or spans[1][0] + SLACK > spans[0][1]:
+                return False
+    return True
+
+
+def _footprint(actor: Actor, pose: torch.Tensor) -> torch.Tensor:
+    length, width, _ = (actor.asset.size / 2).tolist()
+    corners = torch.tensor([[length, width, 0], [length, -width, 0], [-length, width, 0], [-length, -width, 0]], dtype=torch.float64)
+    return (corners @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+
+
+def _inside(means: torch.Tensor, box_from_local: torch.Tensor, size: torch.Tensor) -> int:
+    """How many of the points `[N, 3]` lie in a box, but for its rim and the clearance above the ground."""
+    pose = box_from_local.to(means.dtype)
+    at = means @ pose[:3, :3].T + pose[:3, 3]
+    half = size[:2].to(means.dtype) / 2 - SLACK
+    return int(((at[:, :2].abs() < half).all(1) & (at[:, 2] > CLEARANCE) & (at[:, 2] < float(size[2]) - SLACK)).sum())

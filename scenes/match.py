@@ -1,0 +1,73 @@
+"""An asset takes on the light of the place where it is put: exposure and white balance, in linear light, by the ground beneath.
+
+The ground is the one thing that stands in the same light as an asset and is of much the same grey everywhere. An asset remembers the
+colour of the ground where it was cut out (`ground_linear` in its meta; for a mesh, that of asphalt under the light it was traced in); what
+the ground here has more or less of each channel, so has the asset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from scenes.asset import Asset
+from scenes.gaussians import Gaussians
+from scenes.harmonics import rgb_from_sh, sh_from_rgb
+from scenes.scene import Scene
+from scenes.sky import linear_from_srgb, srgb_from_linear
+
+ASPHALT = 0.13
+"""Albedo of worn asphalt: 0.1 to 0.15."""
+
+AROUND = 6.0
+"""Metres within which the ground is taken."""
+
+FEWEST = 30
+"""Splats that tell the ground's colour."""
+
+LIMIT = 4.0
+"""Times brighter or darker at most: beyond, something else than asphalt was measured."""
+
+
+def ground_linear(scene: Scene, xy: torch.Tensor) -> torch.Tensor | None:
+    """Linear colour `[3]` of the ground around a world point `[2]`, before the cameras' exposures; None where too little is known."""
+    placed = scene.background
+    pose = placed.world_from_local.float()
+    means = placed.gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    near = (means[:, :2] - xy.float()).norm(dim=1) < AROUND
+    near &= torch.sigmoid(placed.gaussians.logit_opacities) > 0.3
+    if int(near.sum()) < FEWEST:
+        return None
+    heights = means[near, 2]
+    ground = scene.ground.height(means[near, :2]).float() if scene.ground is not None else heights.quantile(0.2)
+    low = (heights - ground).abs() < 0.2
+    if int(low.sum()) < FEWEST:
+        return None
+    colours = rgb_from_sh(placed.gaussians.sh[near, 0][low]).clamp(0, 1)
+    return linear_from_srgb(colours).median(0).values
+
+
+def matched(asset: Asset, scene: Scene, xy: torch.Tensor) -> Asset:
+    """The asset in the light of a place `[2]` of a scene; as it is where either ground is unknown."""
+    there, here = asset.meta.get("ground_linear"), ground_linear(scene, xy)
+    if there is None or here is None:
+        return asset
+    gain = (here / torch.tensor(there).clamp_min(1e-3)).clamp(1 / LIMIT, LIMIT)
+    if float((gain - 1).abs().max()) < 0.02:
+        return asset
+    meta = {**asset.meta, "ground_linear": here.tolist(), "light_gain": [round(g, 4) for g in gain.tolist()]}
+    return replace(asset, gaussians=relit(asset.gaussians, gain), meta=meta)
+
+
+def relit(splats: Gaussians, gain: torch.Tensor) -> Gaussians:
+    """Splats whose linear light is multiplied by `gain` `[3]`. What changes with the view changes as the curve to sRGB does there."""
+
+    def change(colour: torch.Tensor) -> torch.Tensor:
+        return srgb_from_linear(linear_from_srgb(colour) * gain)
+
+    base = rgb_from_sh(splats.sh[:, :1])
+    shown = base.clamp(0.01, 1.0)
+    slope = (change(shown + 1e-3) - change(shown - 1e-3)) / 2e-3
+    constant = sh_from_rgb(change(shown) + slope * (base - shown))
+    return replace(splats, sh=torch.cat([constant, splats.sh[:, 1:] * slope], 1))

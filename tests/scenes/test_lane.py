@@ -1,0 +1,140 @@
+"""Lane-parallel paths, what they run into, and the light that an asset takes on."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from street import START_US, STEP_US, box, car
+
+from scenes import Gaussians, Ground, Placed, Trajectory
+from scenes.collide import boxes_touch, collisions
+from scenes.harmonics import evaluate, rgb_from_sh, sh_from_rgb
+from scenes.insert import insert
+from scenes.lane import Lane
+from scenes.match import ground_linear, matched, relit
+from scenes.placement import Placement, parse_placement
+from scenes.poses import translation, yaw, yaw_of
+from scenes.sky import linear_from_srgb, srgb_from_linear
+
+RADIUS = 30.0
+
+
+def bend(step=1.0) -> Trajectory:
+    """A body that stands for a while, shaking, then drives a circle to the left about (0, 30)."""
+    dice = torch.Generator().manual_seed(0)
+    shake = [translation(*(0.02 * torch.randn(2, generator=dice)).tolist()) for _ in range(6)]
+    turn = [translation(0, RADIUS) @ yaw(step * i / RADIUS) @ translation(0, -RADIUS) for i in range(1, 41)]
+    poses = torch.stack([*shake, *turn])
+    return Trajectory(START_US + STEP_US * torch.arange(len(poses)), poses)
+
+
+@pytest.mark.parametrize("left", [-3.5, 0.0, 3.5])
+def test_a_lane_keeps_its_distance_to_the_path(left):
+    lane = Lane(bend())
+    xy, headings = lane.at(torch.linspace(5, 35, 40, dtype=torch.float64), left)
+    away = (xy - torch.tensor([0.0, RADIUS], dtype=torch.float64)).norm(dim=1)
+    torch.testing.assert_close(away, torch.full_like(away, RADIUS - left), atol=0.05, rtol=0)
+    steps = xy.diff(dim=0)
+    torch.testing.assert_close(torch.atan2(steps[:, 1], steps[:, 0]), (headings[1:] + headings[:-1]) / 2, atol=0.03, rtol=0)
+
+
+def test_a_place_in_a_lane_is_found_again():
+    lane = Lane(bend())
+    for along in (-6.0, 0.5, 10.0, 25.0, 38.0, 50.0):
+        for left in (-4.0, 0.0, 2.5):
+            xy, _ = lane.at(torch.tensor([along], dtype=torch.float64), left)
+            assert lane.of(xy[0]) == pytest.approx((along, left), abs=0.05)
+
+
+def test_a_body_that_only_stands_gives_its_heading():
+    lane = Lane(Trajectory(torch.tensor([0, 1]), torch.stack([yaw(0.3), yaw(0.3) @ translation(0.01)])))
+    _, heading = lane.at(torch.tensor([-5.0, 20.0], dtype=torch.float64), 2.0)
+    assert heading.tolist() == pytest.approx([0.3, 0.3])
+
+
+def test_assets_follow_the_lane_and_oncoming_ones_come_back(street):
+    scene = replace(street, ego=bend(), ground=Ground(torch.zeros(200, 200), (-100.0, -100.0), 1.0), actors=())
+    for turn, way in ((0.0, 1), (math.pi, -1)):
+        path = insert(scene, car(), Placement("car", 20, 3.5, turn, 8.0, "lane"), START_US).actor.trajectory
+        now, later = path.at(START_US), path.at(START_US + 1_000_000)
+        moved = later[:2, 3] - now[:2, 3]
+        assert float(moved.norm()) == pytest.approx(8, rel=0.02)
+        assert float(moved @ now[:2, 0]) > 7  # it goes where it faces
+        centre = torch.tensor([0.0, RADIUS], dtype=torch.float64)
+        angle = [math.atan2(*(p[:2, 3] - centre).flip(0).tolist()) for p in (now, later)]
+        assert (angle[1] - angle[0]) * way > 0
+
+
+def test_the_way_is_written_as_a_key():
+    assert parse_placement("car/0003@12m,3.5m,speed=8m/s,path=lane").path == "lane"
+    with pytest.raises(ValueError, match="one of straight, lane. Did you mean lane"):
+        parse_placement("car/0003@12m,3.5m,path=lan")
+
+
+def test_a_way_that_is_free_is_not_complained_of(street):
+    assert insert(street, car(), Placement("car", 12, -2.5)).warnings == ()
+    assert insert(street, car(), Placement("car", 10, -2.5, speed=5.0, path="lane")).warnings == ()
+
+
+def test_running_into_an_actor_is_said_with_the_first_moment(street):
+    # veh_1 comes from x = 22 at 8 m/s on y = 2.5; noses touch when 22 - 8 t - 2.1 < 17 + 2.1 - slack
+    (said,) = insert(street, car(), Placement("car", 17, 2.5)).warnings
+    assert "runs into veh_1 (car) 0.2s after" in said or "runs into veh_1 (car) 0.1s after" in said
+    assert insert(street, car(), Placement("car", 17, -0.5)).warnings == ()
+
+
+def test_boxes_touch_as_the_plane_says(street):
+    other, across = street.actors[0], math.pi / 2
+    for x, y, turn, touch in ((0, 1.6, 0, True), (0, 1.9, 0, False), (0, 2.6, across, True), (0, 3.1, across, False), (4, 0, 0, True)):
+        pose = other.trajectory.at(START_US) @ translation(x, y) @ yaw(turn)
+        mine = replace(other, track="me", trajectory=Trajectory(torch.tensor([START_US]), pose[None]))
+        assert boxes_touch(mine, other, START_US) is boxes_touch(other, mine, START_US) is touch, (x, y)
+    high = replace(mine, trajectory=Trajectory(torch.tensor([START_US]), (pose @ translation(z=5.0))[None]))
+    assert not boxes_touch(high, other, START_US)
+
+
+def test_standing_in_a_house_is_said_and_a_kerb_is_not(street):
+    inside = insert(street, car(), Placement("car", 12, 9))
+    assert any("stands in something of the background" in w for w in inside.warnings)
+    kerb = box((6.0, 3.0, 0.2), (0.5, 0.5, 0.5))
+    kerb = replace(kerb, means=kerb.means + torch.tensor([12.0, -2.5, 0.0]))
+    background = Placed(Gaussians.cat([street.background.gaussians, kerb]), street.background.world_from_local)
+    assert collisions(replace(street, background=background), insert(street, car(), Placement("car", 12, -2.5)).actor) == []
+
+
+def test_relighting_is_a_gain_in_linear_light():
+    dice = torch.Generator().manual_seed(0)
+    colours = 0.1 + 0.6 * torch.rand(100, 3, generator=dice)
+    rest = 0.02 * torch.randn(100, 3, 3, generator=dice)
+    sh = torch.cat([sh_from_rgb(colours)[:, None], rest], 1)
+    g = Gaussians(torch.zeros(100, 3), torch.ones(100, 4), torch.zeros(100, 3), torch.zeros(100), sh)
+    gain = torch.tensor([1.4, 1.0, 0.6])
+    for look in torch.nn.functional.normalize(torch.randn(5, 3, generator=dice), dim=1):
+        before, after = (evaluate(x.sh, look.expand(100, 3)) for x in (g, relit(g, gain)))
+        torch.testing.assert_close(after, srgb_from_linear(linear_from_srgb(before) * gain), atol=2e-3, rtol=0)
+    torch.testing.assert_close(relit(g, torch.ones(3)).sh, g.sh, atol=2e-3, rtol=1e-3)
+
+
+def test_an_asset_from_a_darker_bluer_place_comes_to_the_light_of_this_one(street):
+    here = ground_linear(street, torch.tensor([12.0, 0.0]))
+    assert here.tolist() == pytest.approx([linear_from_srgb(torch.tensor(0.32)).item()] * 3, rel=0.15)
+    there = here * torch.tensor([0.4, 0.5, 0.7])
+    away = replace(car(), gaussians=relit(car().gaussians, there / here), meta={"ground_linear": there.tolist()})
+    back = insert(street, away, Placement("car", 12, 0)).actor.asset
+    wanted, got = (rgb_from_sh(a.gaussians.sh[:, 0]) for a in (car(), back))
+    assert float((wanted - got).abs().mean()) < 0.02
+    assert back.meta["light_gain"] == pytest.approx([2.5, 2.0, 1.4286], rel=1e-3)
+
+
+def test_an_asset_whose_light_is_unknown_is_left_as_it_is(street):
+    assert matched(car(), street, torch.tensor([12.0, 0.0])).gaussians is not None
+    assert "light_gain" not in insert(street, car(), Placement("car", 12, 0)).actor.asset.meta
+    lost = replace(street, background=Placed(Gaussians.empty(), street.background.world_from_local))
+    known = replace(car(), meta={"ground_linear": [0.1, 0.1, 0.1]})
+    assert matched(known, lost, torch.tensor([12.0, 0.0])) is known
+
+
+def test_oncoming_faces_the_other_way(street):
+    pose = insert(street, car(), Placement("car", 12, 3, math.pi, 4.0, "lane")).actor.trajectory.at(START_US)
+    assert abs(float(yaw_of(pose))) == pytest.approx(math.pi, abs=1e-3)
