@@ -17,6 +17,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from scenes.atomic import atomic_file
 from scenes.poses import quat_from_matrix
+from scenes.usd_crate import check_crate
 
 TICKS = 1_000_000  # time codes a second: one a microsecond
 SUFFIXES = (".usdc", ".usda", ".usd")
@@ -45,6 +46,7 @@ def open_stage(path: Path) -> Iterator[Usd.Stage]:
     """The composed stage of a file, fresh from the disk. What USD or the block finds wrong becomes a ValueError that names it."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
+    check_crate(path)
     with _quiet():
         try:
             # USD shares layers within a process, also those that have changed on disk since
