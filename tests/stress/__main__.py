@@ -4,7 +4,8 @@ import argparse
 import sys
 
 from tests.stress.conduct import CONDUCT
-from tests.stress.hazards import HAZARDS, run, run_conduct, table
+from tests.stress.hazards import run, run_conduct, table
+from tests.stress.optics import HAZARDS
 from tests.stress.properties import PROPERTIES, run_property
 
 parser = argparse.ArgumentParser(prog="python -m tests.stress", description=__doc__)

@@ -8,7 +8,8 @@ import torch
 from render import rasterize
 from tests.bench.presets import random_splats
 from tests.stress.conduct import CONDUCT
-from tests.stress.hazards import HAZARDS, SMALL, ahead, run, run_conduct
+from tests.stress.hazards import SMALL, ahead, run, run_conduct
+from tests.stress.optics import HAZARDS
 from tests.stress.properties import PROPERTIES, run_property
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here"))]
