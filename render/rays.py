@@ -8,6 +8,7 @@ import torch
 
 from scenes.camera import Camera
 from scenes.lenses import Orthographic
+from scenes.poses import interpolate
 
 
 def camera_rays(camera: Camera) -> torch.Tensor:
@@ -26,8 +27,14 @@ def camera_origins(camera: Camera) -> torch.Tensor:
 
 
 def world_directions(camera: Camera) -> torch.Tensor:
-    """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length."""
-    return camera_rays(camera) @ camera.world_from_cam[:3, :3].detach().to(torch.float32).T
+    """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length, each as the camera stood when it saw it."""
+    rays, start, end = camera_rays(camera), camera.world_from_cam.detach(), camera.world_from_cam_end
+    if camera.shutter == "global" or end is None:
+        return rays @ start[:3, :3].to(torch.float32).T
+    steps = camera.height if camera.shutter == "rows" else camera.width
+    share = (torch.arange(steps, dtype=torch.float64) + 0.5) / steps
+    turns = interpolate(start.expand(steps, 4, 4), end.detach().expand(steps, 4, 4), share)[:, :3, :3].to(torch.float32)
+    return torch.einsum("hwj,hij->hwi" if camera.shutter == "rows" else "hwj,wij->hwi", rays, turns)
 
 
 @lru_cache(maxsize=16)

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from render import RenderConfig, rasterize
-from scenes import Camera, Equirectangular, Fisheye, OpenCV, Pinhole, Placed, SplatModel
+from render import RenderConfig, rasterize, render_frame
+from render.rays import world_directions
+from scenes import Camera, Equirectangular, Fisheye, OpenCV, Pinhole, Placed, SplatModel, load, save
 from scenes.poses import interpolate, matrix_from_quat, pose_from, translation
 from tests import oracle
 from tests.bench.presets import random_splats
@@ -169,3 +170,34 @@ def test_a_distorting_lens_has_a_shutter_too():
         ends=ends,
     )
     assert largest(frame.rgb, rgb, ~unsure) < 1e-4 * max(1.0, float(rgb.detach().max()))
+
+
+def test_the_sky_turns_with_the_rows():
+    camera = driven(FISHEYE, "rows")
+    directions = world_directions(camera)
+    for row in (0, 17, HEIGHT - 1):
+        pose = interpolate(camera.world_from_cam, camera.world_from_cam_end, (row + 0.5) / HEIGHT)
+        still = world_directions(Camera(FISHEYE, WIDTH, HEIGHT, pose))
+        assert torch.allclose(directions[row], still[row], atol=1e-6)
+    columns = world_directions(replace(camera, shutter="columns"))
+    assert torch.allclose(columns[:, 0], world_directions(Camera(FISHEYE, WIDTH, HEIGHT, START))[:, 0], atol=2e-3)
+
+
+def test_a_recorded_drive_carries_its_shutter(street, tmp_path):
+    """Camera and actors end where they are when the readout ends, and a saved scene keeps it."""
+    front = replace(street.rig["front_camera"], shutter="rows", readout_us=30_000)
+    scene = replace(street, rig={**street.rig, "front_camera": front})
+    save(scene, tmp_path / "s")
+    scene = load(tmp_path / "s")
+    time = int(front.times_us[3])
+    camera = scene.camera("front_camera", time)
+    assert (camera.shutter, camera.readout_us) == ("rows", 30_000)
+    moved = camera.world_from_cam_end[:3, 3] - camera.world_from_cam[:3, 3]
+    assert torch.allclose(moved, torch.tensor([0.15, 0.0, 0.0], dtype=torch.float64), atol=1e-9)  # 5 m/s for 30 ms
+    background, car = scene.placed(time, camera.readout_us)
+    assert background.world_from_local_end is None
+    assert float((car.world_from_local_end - car.world_from_local)[0, 3]) == pytest.approx(-0.24)  # 8 m/s the other way
+    frame = render_frame(scene, camera)
+    assert (frame.rgb - render_frame(street, street.camera("front_camera", time)).rgb).abs().max() > 0.02
+    last = scene.camera("front_camera", int(front.times_us[-1]))
+    assert last.world_from_cam_end is not None
