@@ -1,5 +1,6 @@
 """Every lens and moving shutters, drawn and differentiated, against the float64 oracle."""
 
+import math
 from dataclasses import fields as fields_of
 from dataclasses import replace
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from render import RenderConfig, rasterize
-from scenes import Camera, Equirectangular, Fisheye, FTheta, OpenCV, Orthographic, Placed, SplatModel
+from scenes import Camera, Equirectangular, Fisheye, FTheta, Gaussians, OpenCV, Orthographic, Pinhole, Placed, SplatModel
 from scenes.poses import pose_from, translation
 from tests import oracle
 from tests.bench.presets import random_splats
@@ -132,3 +133,104 @@ def gradients(placed: list[Placed], camera: Camera, model: SplatModel):
 def test_every_lens_has_the_oracles_gradients(make, name, model):
     for what, mine, reference in gradients(make(2), camera_of(LENSES[name]), model):
         assert_gradient(what, mine, reference)
+
+
+def dots(points, scale: float = 0.02) -> Placed:
+    """Small opaque white splats at camera points `[n, 3]` of a camera that stands at the origin."""
+    points = torch.as_tensor(points, dtype=torch.float32)
+    n = len(points)
+    quats, sizes = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), math.log(scale))
+    return Placed(Gaussians(points, quats, sizes, torch.full((n,), 6.0), torch.ones(n, 1, 3)), torch.eye(4, dtype=torch.float64))
+
+
+def at_origin(lens, width: int = 64, height: int = 48) -> Camera:
+    return Camera(lens, width, height, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("projection", ["ut", "ewa"])
+@pytest.mark.parametrize(
+    "lens",
+    [OpenCV(40.0, 40.0, 32.0, 24.0, -0.3), Fisheye(20.0, 20.0, 32.0, 24.0, -0.1), FTheta(32.0, 24.0, 30.0, -7.5)],
+    ids=lambda v: v.kind,
+)
+def test_past_the_fold_over_nothing_is_drawn(lens, projection):
+    """Directions past the fold come back into the image; what lies there must not."""
+    end, model = lens.limit(), SplatModel(projection=projection)
+    beyond = [[math.sin(a) * math.cos(t), math.sin(a) * math.sin(t), math.cos(a)] for a in (end + 0.05, end + 0.3) for t in range(6)]
+    beyond = 3 * torch.tensor(beyond)
+    inside = lens.project(beyond.double())
+    assert ((inside > 0) & (inside < torch.tensor([64, 48]))).all(1).any(), "the formula alone would draw them"
+    assert rasterize(dots(beyond), at_origin(lens), ("alpha",), model=model).alpha.max() == 0
+    before = [[3 * math.sin(end - 0.2), 0.0, 3 * math.cos(end - 0.2)]]
+    assert rasterize(dots(before), at_origin(lens), ("alpha",), model=model).alpha.max() > 0.5
+
+
+@pytest.mark.parametrize("projection", ["ut", "ewa"])
+def test_a_190_degree_fisheye_draws_what_stands_behind_it(projection):
+    lens = Fisheye(19.0, 19.0, 32.0, 32.0)
+    angle = math.radians(95)
+    ring = torch.tensor([[math.sin(angle) * math.cos(t), math.sin(angle) * math.sin(t), math.cos(angle)] for t in (0.3, 2.0, 4.0)]) * 4
+    assert (ring[:, 2] < 0).all()
+    frame = rasterize(dots(ring, 0.1), at_origin(lens, 64, 64), ("alpha", "depth"), model=SplatModel(projection=projection))
+    for u, v in lens.project(ring.double()).tolist():
+        assert frame.alpha[int(v), int(u)] > 0.5
+        assert float(frame.depth[int(v), int(u)]) == pytest.approx(4.0, rel=1e-4), "the distance, since z is negative there"
+
+
+@pytest.mark.parametrize("projection", ["ut", "ewa"])
+def test_a_splat_at_the_seam_is_drawn_on_both_sides(projection):
+    """Turning the camera so that the seam lies elsewhere turns the picture round and changes nothing else."""
+    lens, model = Equirectangular.whole(96, 48), SplatModel(projection=projection)
+    g = random_splats(150, 4)
+    level = torch.tensor([1.0, 0.35, 1.0])  # away from the poles, where a Gaussian on the image is none on the sphere
+    away = torch.linspace(3, 6, 150)[:, None]  # apart, so that rounding does not change the order
+    g = replace(g, means=away * torch.nn.functional.normalize(g.means * level, dim=1), log_scales=g.log_scales.clamp_max(-1.2))
+    camera = at_origin(lens, 96, 48)
+    picture = rasterize(g, camera, model=model).rgb
+    turned = rasterize(g, replace(camera, world_from_cam=pose_from([0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0])), model=model).rgb
+    assert picture[:, [0, -1]].max() > 0.2, "something stands at the seam"
+    assert (picture.roll(48, 1) - turned).abs().max() < 2e-4
+
+
+@pytest.mark.parametrize("projection", ["ut", "ewa"])
+def test_an_opencv_lens_without_distortion_is_a_pinhole(projection):
+    """Splats beside and behind the camera too: the rules for sigma points that go too near are the same."""
+    g = random_splats(200, 5)
+    placed = [Placed(replace(g, means=g.means * torch.tensor([3.0, 2.0, 1.0]), log_scales=g.log_scales + 1), translation(0, 0, 2.5))]
+    camera, model = at_origin(Pinhole(60.0, 62.0, 30.0, 25.0)), SplatModel(projection=projection)
+    pinhole = rasterize(placed, camera, ("rgb", "depth"), model=model)
+    opencv = rasterize(placed, replace(camera, lens=OpenCV(60.0, 62.0, 30.0, 25.0)), ("rgb", "depth"), model=model)
+    assert (pinhole.rgb - opencv.rgb).abs().max() < 2e-5
+
+
+@pytest.mark.parametrize(
+    "change", [{"means": 1e30}, {"means": math.nan}, {"log_scales": 9.2}, {"log_scales": math.inf}, {"quats": 0.0}], ids=str
+)
+@pytest.mark.parametrize("name", ["opencv", "fisheye", "equirectangular"])
+def test_extreme_splats_leave_image_and_gradients_of_any_lens_finite(name, change):
+    ((field, value),) = change.items()
+    placed = around(6, 40)
+    spoilt = getattr(placed[0].gaussians, field).clone()
+    spoilt[7] = value
+    g = replace(placed[0].gaussians, **{field: spoilt}).map(lambda t: t.requires_grad_())
+    for projection in ("ut", "ewa"):
+        frame = rasterize([replace(placed[0], gaussians=g), placed[1]], camera_of(LENSES[name]), model=SplatModel(projection=projection))
+        frame.rgb.sum().backward()
+        assert frame.rgb.isfinite().all() and all(t.grad.isfinite().all() for t in g.tensors().values())
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_the_same_bits_on_any_number_of_threads_for_every_lens(name):
+    def drawn(threads: int):
+        torch.set_num_threads(threads)
+        g = random_splats(150, 7).map(lambda t: t.requires_grad_())
+        frame = rasterize(Placed(g, translation(0, 0, 3)), camera_of(LENSES[name]))
+        frame.rgb.square().sum().backward()
+        return [frame.rgb.detach(), *(t.grad for t in g.tensors().values())]
+
+    before = torch.get_num_threads()
+    try:
+        one, two = drawn(1), drawn(2)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))

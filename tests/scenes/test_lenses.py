@@ -1,12 +1,14 @@
 """Lenses: projection and its inverse, the edge of their domain, and other people's code for the same models."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from scenes import Camera, Equirectangular, Fisheye, FTheta, OpenCV, Orthographic, Pinhole
+from scenes import Camera, Equirectangular, Fisheye, FTheta, OpenCV, Orthographic, Pinhole, load, save
 from scenes.lenses import LENSES
+from tests import randomized
 
 RATIONAL = (0.2, 0.1, 0.001, -0.002, 0.01, 0.3, 0.05, 0.01)
 LENSES_OF_ALL_KINDS = [
@@ -157,3 +159,12 @@ def test_the_sphere_is_whole():
     directions = torch.tensor([[0.0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=torch.float64)
     expected = torch.tensor([[32.0, 16], [48, 16], [16, 16], [32, 32], [32, 0]], dtype=torch.float64)
     assert torch.allclose(lens.project(directions), expected) and float(lens.period()) == pytest.approx(64)
+
+
+@pytest.mark.parametrize("lens", LENSES_OF_ALL_KINDS, ids=lambda lens: lens.kind)
+def test_a_saved_scene_keeps_its_lenses_and_shutters(lens, tmp_path):
+    scene = randomized.scene(sky=False, ground=False)
+    camera = replace(scene.rig["left"], lens=lens, shutter="columns", readout_us=31_000)
+    save(replace(scene, rig={"left": camera}), tmp_path / "s")
+    again = load(tmp_path / "s").rig["left"]
+    assert again.lens == lens and (again.shutter, again.readout_us) == ("columns", 31_000)
