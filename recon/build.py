@@ -23,7 +23,6 @@ from scenes.asset import Actor, Asset
 from scenes.camera import RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
-from scenes.lenses import Pinhole
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 
@@ -101,10 +100,6 @@ def choose(
 ) -> tuple[list[str], tuple[int, int]]:
     """The cameras to fit, the front ones where None, and the span of time in microseconds. ValueError for what the log has not."""
     names = list(cameras or log.front or list(log.cameras)[:1])
-    for name in names:
-        if not isinstance(log.camera(name).lens, Pinhole):
-            fix = "undistort its pictures with: colmap image_undistorter"
-            raise ValueError(f"camera {name} has a {log.camera(name).lens.kind} lens, but pinholes only can be fitted so far; {fix}")
     return names, _span(log, names, start_us, duration_us)
 
 

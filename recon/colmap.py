@@ -32,11 +32,14 @@ def find_model(folder: Path) -> Path | None:
     return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")), default=None)
 
 
-def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
+def read_colmap(
+    path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, pictures: Path | None = None
+) -> Log:
     """The drive in a COLMAP workspace: a model and the pictures it registers.
 
     camera_height: metres of the cameras above the ground; metres_per_unit: of the model's unit; without either the log is not
-    metric. FileNotFoundError and ValueError name the file or lens that is missing or wrong.
+    metric. pictures: their folder, found in the workspace where None. FileNotFoundError and ValueError name the file or lens that is
+    missing or wrong.
     """
     where = find_model(path)
     if where is None:
@@ -52,7 +55,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     mine = [k for k, i in enumerate(model.images) if i.camera == lead]
     order = sorted(mine, key=lambda k: moments[k])
     ego = Trajectory(torch.tensor([moments[k] for k in order]), placed[order] @ torch.from_numpy(CAM_FROM_BODY))
-    pictures = _picture_folder(path, where, model.images[0].name)
+    pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
     for key in sorted(names, key=lambda k: (k != lead, names[k])):
         chosen = [k for k, i in enumerate(model.images) if i.camera == key and ego.covers(moments[k])]
@@ -68,7 +71,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         seen[names[key]] = tuple(model.images[k].points for k in chosen)
     about = path.resolve()
     meta: dict = {
-        "name": about.parent.name if about.name in ("images", "sparse") else about.name,
+        "name": about.parent.name if about.name in ("images", "sparse") else about.name.removesuffix(".sfm"),
         "source": f"COLMAP model of {len(model.images)} pictures in {about.name}",
         "body": f"camera {names[lead]}, turned to x forward, y left, z up",
         "metric": gauge.metric,

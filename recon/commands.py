@@ -17,7 +17,7 @@ class Recon:
     """Reconstruct a recorded drive as a scene: background, movers, sky, exposure; reports its quality on held-out frames."""
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
-    """Folder of one drive, as pandaset/002: PandaSet, nuScenes, Argoverse 2, Waymo, KITTI, or COLMAP's."""
+    """Folder of one drive, as pandaset/002: PandaSet, nuScenes, Argoverse 2, Waymo, KITTI or COLMAP's, or photos, or a video."""
     output: Output
     """Folder of the new scene."""
     cameras: Names = None

@@ -11,11 +11,13 @@ from recon.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, re
 from recon.log import Log
 from recon.nuscenes import is_nuscenes, read_nuscenes
 from recon.pandaset import is_pandaset, read_pandaset
+from recon.photos import is_photos, is_video, read_photos
 from recon.waymo import is_waymo, read_waymo
 
 
 def open_log(path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
-    """The drive in a folder, by the layout of its files; reads no image and no sweep yet.
+    """The drive in a folder, by the layout of its files, or a video; reads no image and no sweep yet, but of photos
+    and videos whose poses must be found first.
 
     camera_height, metres_per_unit: what makes a world that pictures alone made metric: metres of the cameras above the ground, or
     metres a unit of the model. Raises FileNotFoundError where there is no such folder and ValueError where its layout is not known,
@@ -28,10 +30,14 @@ def open_log(path: str | Path, camera_height: float | None = None, metres_per_un
         if given:
             raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
         return read(path)
+    if is_video(path):
+        return read_photos(path, camera_height, metres_per_unit)
     if not path.is_dir():
-        raise FileNotFoundError(f"{path} is not a folder; give the folder of one drive, as pandaset/002")
+        raise FileNotFoundError(f"{path} is neither a folder nor a video; give the folder of one drive, as pandaset/002")
     if find_model(path) is not None:
         return read_colmap(path, camera_height, metres_per_unit)
+    if is_photos(path):
+        return read_photos(path, camera_height, metres_per_unit)
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
     hint = f" Did you mean {inside[0]}?" if inside else ""
     raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")
@@ -55,6 +61,7 @@ LAYOUTS = {
     "KITTI raw": "oxts/ and image_02/",
     "KITTI odometry": "calib.txt and times.txt",
     "COLMAP": "cameras.bin, images.bin and points3D.bin",
+    "a folder of photos": "three .jpg or .png at least",
 }
 
 

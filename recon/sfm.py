@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from render.progress import Progress
+
 PARTS = ("cameras", "images", "points3D")
+EXHAUSTIVE = 40
+"""Pictures of which every pair is matched; of more, those whose names are near."""
+
+FEWEST_PLACED = 3
 FIX = "COLMAP models are read by pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
 
 
@@ -87,6 +94,43 @@ def read_model(folder: Path) -> Model:
     if not np.isfinite(values).all():
         raise ValueError(f"{folder} holds a pose or a point that is not finite; run COLMAP's mapper again")
     return Model(cameras, tuple(images), xyz, any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values()))
+
+
+def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> int:
+    """Find the poses of the named pictures and their common lens; writes `workspace`/sparse/0. Returns how many were placed.
+
+    SIFT features, matched between all pictures, or where they are `ordered` (a video) between near ones, then incremental mapping
+    (Schönberger and Frahm 2016), all on the CPU. The largest of the models is kept. ValueError where it holds too few pictures.
+    """
+    colmap = pycolmap()
+    database, made = workspace / "database.db", workspace / "models"
+    with Progress("structure from motion") as steps:
+        steps.step(note="features")
+        reader = colmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+        single, cpu = colmap.CameraMode.SINGLE, colmap.Device.cpu
+        colmap.extract_features(database, pictures, names, camera_mode=single, reader_options=reader, device=cpu)
+        steps.step(note="matches")
+        if ordered or len(names) > EXHAUSTIVE:
+            colmap.match_sequential(database, device=cpu)
+        else:
+            colmap.match_exhaustive(database, device=cpu)
+        steps.step(note="poses")
+        options = colmap.IncrementalPipelineOptions()
+        options.random_seed = 0
+        # two pictures of a drive lie one behind the other, which the defaults do not begin a world with
+        options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
+        made.mkdir()
+        models = colmap.incremental_mapping(database, pictures, made, options)
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    count = 0 if best is None else best.num_reg_images()
+    if best is None or count < max(FEWEST_PLACED, len(names) // 4):
+        fix = "take them closer together, with more overlap and things that stand still"
+        raise ValueError(f"only {count} of {len(names)} pictures in {pictures} could be placed; {fix}")
+    (workspace / "sparse" / "0").mkdir(parents=True)
+    best.write(workspace / "sparse" / "0")
+    shutil.rmtree(made)
+    database.unlink()
+    return count
 
 
 def _first_line(problem: Exception) -> str:
