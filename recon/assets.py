@@ -6,22 +6,25 @@ import io
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from recon.cleaning import cleaned
 from render import Frame, rasterize
 from scenes.asset import Asset
 from scenes.camera import Camera
 from scenes.databank import Databank
 from scenes.files import load
 from scenes.gaussians import Gaussians
-from scenes.harmonics import turned
+from scenes.harmonics import rgb_from_sh, turned
 from scenes.lenses import Pinhole
+from scenes.match import ground_linear
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene
+from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
 
 FLOOR = 0.06
@@ -34,6 +37,9 @@ FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10
 FULL_SIDE = 0.85
 """Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
+
+SECTORS = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")
+"""From where an object was seen: eighths of the turn about it, counted to the left from its nose."""
 
 FARTHEST = 20.0
 """Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
@@ -77,35 +83,47 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     share = {k: scene.meta[k] for k in ("licence", "attribution") if k in scene.meta}
     share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
     for actor in scene.actors:
-        cut = within_box(actor.asset.gaussians, actor.asset.size)
+        if actor.asset.meta.get("inserted"):
+            continue  # it came from a databank
+        cut = cleaned(within_box(actor.asset.gaussians, actor.asset.size), actor.asset.size)
         sight = seen(scene, actor.trajectory, actor.asset.size)
-        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True}, sight)
+        middle = actor.trajectory.world_from_body[len(actor.trajectory) // 2]
+        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True} | _ground(scene, middle), sight)
     for entry in scene.meta.get("parked", []):
         world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
         size = torch.tensor(entry["size"], dtype=torch.float64)
         if size.max() <= 0:
             continue
-        cut = within_box(moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size), size)
+        near = moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size)
+        cut = cleaned(within_box(near, size), size)
         sight = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), size)
         asset = Asset(cut, size, entry["label"], scene.model)
-        yield _judged(cut, asset, share | {"track": entry["track"], "moved": False}, sight)
+        yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight)
+
+
+def _ground(scene: Scene, pose: torch.Tensor) -> dict:
+    """The light where an object stood, as `ground_linear` for its meta; {} where the ground there is unknown."""
+    colour = ground_linear(scene, pose[:2, 3])
+    return {} if colour is None else {"ground_linear": [round(v, 5) for v in colour.tolist()]}
 
 
 @dataclass(frozen=True)
 class Sight:
     """How an object was seen: frames of all cameras with its middle in view within `FARTHEST`, metres to the nearest camera then,
-    and how large its left and right sides appeared, summed over those frames (solid angle in parts of the side's area)."""
+    how large its left and right sides appeared, summed over those frames (solid angle in parts of the side's area), and in how many
+    frames it was seen from each of `SECTORS`."""
 
     views: int
     nearest: float
     left: float
     right: float
+    sectors: dict[str, int] = field(default_factory=dict)
 
 
 def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
     """How the cameras of a scene saw a box `[length, width, height]`."""
     middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
-    views, nearest, sides = 0, math.inf, [0.0, 0.0]
+    views, nearest, sides, sectors = 0, math.inf, [0.0, 0.0], dict.fromkeys(SECTORS, 0)
     for name, camera in scene.rig.items():
         for t in scene.frame_times(name).tolist():
             if not (box.covers(t) and scene.ego.covers(t)):
@@ -120,9 +138,21 @@ def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
                 nearest = min(nearest, away)
                 if away <= FARTHEST:
                     views += 1
-                    beside = float(inverse(cam_from_box)[1, 3])
+                    ahead, beside = inverse(cam_from_box)[:2, 3].tolist()
+                    sectors[SECTORS[round(math.atan2(beside, ahead) / (2 * math.pi) * len(SECTORS)) % len(SECTORS)]] += 1
                     sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / away**3
-    return Sight(views, nearest, *sides)
+    return Sight(views, nearest, sides[0], sides[1], sectors)
+
+
+def shown_colours(splats: Gaussians) -> dict[str, list[float]]:
+    """Exposure statistics of splats: linear colour, the mean and the 5th and 95th percentile a channel, of what is not faint."""
+    solid = splats.select(torch.sigmoid(splats.logit_opacities) > 0.3)
+    if not len(solid):
+        return {}
+    linear = linear_from_srgb(rgb_from_sh(solid.sh[:, 0]).clamp(0, 1))
+    low, high = linear.quantile(torch.tensor([0.05, 0.95]), 0)
+    rows = {"linear_mean": linear.mean(0), "linear_p5": low, "linear_p95": high}
+    return {name: [round(v, 4) for v in row.tolist()] for name, row in rows.items()}
 
 
 def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate:
@@ -135,7 +165,8 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate
     if not flaw and len(whole) < FEWEST_SPLATS:
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
-    meta = meta | {"views": sight.views, "mirrored": mirrored, "nearest_m": near}
+    meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
+    meta["exposure"] = shown_colours(whole)
     return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw)
 
 

@@ -99,15 +99,25 @@ class Show:
     def run(self) -> None:
         from scenes import Databank
 
-        e = Databank(self.databank).entry(self.id)
+        bank = Databank(self.databank)
+        e, meta = bank.entry(self.id), bank.load(self.id).meta
         thumb = self.databank / e.thumb if e.thumb else "none"
         told = {
             "asset": e.id, "class": e.label, "size": "{:.2f} m long, {:.2f} m wide, {:.2f} m high".format(*e.size), "splats": e.splats,
-            "views": "unknown" if e.views is None else e.views, "licence": e.licence, "attribution": e.attribution, "source": e.source,
+            "views": "unknown" if e.views is None else e.views, **_seen_from(meta),
+            "licence": e.licence, "attribution": e.attribution, "source": e.source,
             "file": self.databank / e.asset, "thumbnail": thumb,
         }  # fmt: skip
         for key, value in told.items():
             print(f"{key:<12} {value}")
+
+
+def _seen_from(meta: dict) -> dict:
+    """Where an asset was seen from, for `assets show`: from how many frames each sector."""
+    sectors = {name: count for name, count in meta.get("sectors", {}).items() if count}
+    seen = ", ".join(f"{name} {count}" for name, count in sectors.items())
+    mirrored = " (the other side is its mirror image)" if meta.get("mirrored") else ""
+    return {"seen from": seen + mirrored} if seen else {}
 
 
 @dataclass
