@@ -27,14 +27,15 @@ def _arrays(fields) -> list:
 class Rasterize(torch.autograd.Function):
     """The kernels behind `rasterize`, which calls this inside a `stage`.
 
-    (settings, poses [P, C, 4, 4] f64 as `projection.poses`, lens parameters f64, features [N, C] of all splats or None, 5 fields of P
-    instances) -> rgb [3, H, W], alpha, sum of w z, sum of w, sums of w features [C, H, W], median depth (0 where there is none), instance.
+    (settings, poses [P, C, 4, 4] f64 as `projection.poses`, lens parameters f64, features [N, C] of all splats or None, canonical frames
+    [N, FRAME] and rays [H, W, 3] or None where pixels do not look along their own rays, 5 fields of P instances) -> rgb [3, H, W], alpha,
+    sum of w z, sum of w, sums of w features [C, H, W], median depth (0 where there is none), instance.
 
     The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
     """
 
     @staticmethod
-    def forward(ctx, settings: Settings, poses, lens, features, *fields):
+    def forward(ctx, settings: Settings, poses, lens, features, frames, rays, *fields):
         ways = projection(settings.lens, settings.rolling)
         groups = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
         draws = [(p, copy) for copy in range(ways.copies) for p in range(len(groups))]
@@ -51,8 +52,8 @@ class Rasterize(torch.autograd.Function):
             told.append([*uniforms(settings, lens_now, still[p], settings.instances[p], group[4].shape[1], copy), base])
             args = [*_arrays(group), *told[-1], view(records, float), view(keys, int), view(counts, int)]
             run(ways.forward, len(group[0]), args, device)
-        per_record = None if features is None else features.contiguous().repeat(ways.copies, 1)
-        scene = Projected(records, counts, depth_order(keys), per_record)
+        per_record, frames = (None if t is None else t.contiguous().repeat(ways.copies, 1) for t in (features, frames))
+        scene = Projected(records, counts, depth_order(keys), per_record, frames, rays)
         picture = draw(settings, scene)
         ctx.settings, ctx.groups, ctx.told, ctx.draws, ctx.scene, ctx.parts = settings, groups, told, draws, scene, picture.parts
         ctx.like_pose, ctx.like_lens = poses.new_empty(0), lens.new_empty(lens.shape)
@@ -87,11 +88,10 @@ class Rasterize(torch.autograd.Function):
                 else:
                     outputs += out
                     g_uniform.append(shared)
-            g_features = slots.channels
-            if g_features is not None:
-                g_features = g_features.view(ways.copies, -1, g_features.shape[1]).sum(0)
+            both_sides = [None if g is None else g.view(ways.copies, -1, g.shape[1]).sum(0) for g in (slots.channels, slots.frames)]
+            more = (*both_sides, slots.rays)
         if not any(ctx.needs_input_grad[1:3]):
-            return None, None, None, g_features, *outputs
+            return None, None, None, *more, *outputs
         shared = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in g_uniform])
         g_lens = ways.lens_gradient(shared, len(ctx.like_lens))
-        return None, ways.pose_gradient(shared).to(ctx.like_pose), g_lens.to(ctx.like_lens), g_features, *outputs
+        return None, ways.pose_gradient(shared).to(ctx.like_pose), g_lens.to(ctx.like_lens), *more, *outputs

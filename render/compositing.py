@@ -13,17 +13,21 @@ from render.kernels.composite_cuda import composite_blocks, composite_blocks_gra
 from render.kernels.types import GRADIENTS, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, view
 from render.order import TileLists, tile_lists
+from render.ray_compositing import add_window, draw_rays, draw_rays_backward, lanes_of
 from render.settings import Settings
 
 
 @dataclass(frozen=True)
 class Projected:
-    """All splats on the image: records `[N, RECORD]`, counts int32 `[N]` of tiles at most, the visible ones' order, features `[N, C]`."""
+    """All splats on the image: records `[N, RECORD]`, counts int32 `[N]` of tiles at most, the visible ones' order, features `[N, C]`;
+    where pixels look along their own rays, canonical frames `[N, FRAME]` and the camera's rays `[H, W, 3]`."""
 
     records: torch.Tensor
     counts: torch.Tensor
     order: torch.Tensor
     features: torch.Tensor | None
+    frames: torch.Tensor | None = None
+    rays: torch.Tensor | None = None
 
     @property
     def channels(self) -> int:
@@ -53,12 +57,15 @@ class Picture:
 
 @dataclass(frozen=True)
 class Slots:
-    """Gradients of the records: those of record j are values[starts[j] : starts[j] + counts[j]], to be summed; channels `[N, C]` are."""
+    """Gradients of the records: those of record j are values[starts[j] : starts[j] + counts[j]], to be summed; the others are summed:
+    channels `[N, C]`, frames `[N, FRAME]`, rays `[H, W, 3]`."""
 
     counts: torch.Tensor
     starts: torch.Tensor
     values: torch.Tensor
     channels: torch.Tensor | None
+    frames: torch.Tensor | None
+    rays: torch.Tensor | None
 
 
 def draw(settings: Settings, scene: Projected) -> Picture:
@@ -94,6 +101,8 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     device = scene.records.device
     sums = Sums(scene.counts) if len(parts) > 1 else None
     g_features = None if scene.features is None else torch.zeros_like(scene.features)
+    g_frames = None if scene.frames is None else torch.zeros_like(scene.frames)
+    g_rays = None if scene.rays is None else torch.zeros_like(scene.rays)
     wanted = [g if g.ndim == 3 else g[None] for g in gradients if g is not None]
     if settings.mask is not None:
         wanted = [g.where(settings.mask[settings.of_image], 0) for g in wanted]
@@ -103,14 +112,21 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
             lists, counts = _lists(settings, scene, part.window, alone=False)
         slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
         channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
-        _composite_backward(settings, part, lists, scene, _of_part(settings, part, wanted), slots, channel_slots)
+        grads = _of_part(settings, part, wanted)
+        if g_frames is not None and g_rays is not None:
+            frame_slots, of_window = draw_rays_backward(settings, part, lists, scene, grads, slots, channel_slots)
+            if len(frame_slots):
+                add_to(g_frames, counts, lists, frame_slots)
+            add_window(g_rays, part.window, of_window)
+        else:
+            _composite_backward(settings, part, lists, scene, grads, slots, channel_slots)
         if g_features is not None:
             add_to(g_features, counts, lists, channel_slots)
         if sums is None:
-            return Slots(counts, lists.first_slot, slots, g_features)
+            return Slots(counts, lists.first_slot, slots, g_features, g_frames, g_rays)
         sums.add(counts, lists, slots)
     assert sums is not None
-    return Slots(sums.counts, sums.starts, sums.slots, g_features)
+    return Slots(sums.counts, sums.starts, sums.slots, g_features, g_frames, g_rays)
 
 
 def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tuple[TileLists, torch.Tensor]:
@@ -151,11 +167,6 @@ def _of_part(settings: Settings, part: Part, gradients: Sequence[torch.Tensor]) 
     return planes
 
 
-def _lanes_of(planes: torch.Tensor):
-    """Planes `[.., rows, pitch * 16]` as lane vectors."""
-    return view(planes.view(*planes.shape[:-1], planes.shape[-1] // TILE, TILE), lanes)
-
-
 def _features(scene: Projected) -> list:
     features = scene.records.new_empty(1, 1) if scene.features is None else scene.features
     return [view(features, float), scene.channels]
@@ -167,6 +178,9 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
     device = scene.records.device
     planes = _planes(w, settings.wanted.first_channel + scene.channels, device)
     picks = _planes(w, 2 if settings.wanted.picks else 0, device)
+    if settings.by_rays:
+        draw_rays(settings, w, lists, scene, planes, picks)
+        return planes, picks, ()
     lists_of = [view(lists.starts, int), view(lists.ids, int)]
     limits = [settings.alpha_max, settings.termination]
     if device.type == "cuda":
@@ -178,7 +192,7 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
     last = torch.empty(planes.shape[1], planes.shape[2] // TILE, dtype=torch.int32)
     dark_at = _planes(w, 1, device)[0]
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels)]
-    out = [_lanes_of(planes), _lanes_of(picks), view(last, int), _lanes_of(dark_at)]
+    out = [lanes_of(planes), lanes_of(picks), view(last, int), lanes_of(dark_at)]
     run(composite(settings.wanted, settings.squarings), BANDS, [*args, *out], device)
     return planes, picks, (last, dark_at)
 
@@ -195,9 +209,9 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene:
         return
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
     sums = view(torch.zeros(BANDS, max(scene.channels, 1), TILE), lanes)
-    ends = [view(part.ends[0], int), _lanes_of(part.ends[1])]
+    ends = [view(part.ends[0], int), lanes_of(part.ends[1])]
     kernel = composite_gradient(settings.wanted, settings.squarings)
-    run(kernel, BANDS, [*args, _lanes_of(part.planes), _lanes_of(grads), *ends, *out, sums], device)
+    run(kernel, BANDS, [*args, lanes_of(part.planes), lanes_of(grads), *ends, *out, sums], device)
 
 
 def _working(channels: int) -> list:

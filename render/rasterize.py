@@ -14,14 +14,17 @@ from render.channels import SUMMED, Features, channel_fields, unit
 from render.cull import differentiated, in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
+from render.frames import canonical_frames
 from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
+from render.rays import camera_rays
 from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
+from scenes.lenses import Orthographic
 
 
 @overload
@@ -79,7 +82,7 @@ def rasterize(
         return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask) for c in camera]
     outputs = check_outputs(outputs)
     placed = _as_placed(splats)
-    _check(placed, camera, outputs, flow_to, model)
+    _check(placed, camera, outputs, flow_to, model, config)
     _check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
         return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features, crop, mask)
@@ -109,7 +112,9 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
     )
     fields = [t for p in seen for t in p.gaussians.tensors().values()]
     channels = torch.cat(list(summed.values()), 1) if summed else None
-    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, camera.lens.params(), channels, *fields)
+    frames, rays = _along_rays(seen, camera, cam_from_local) if settings.by_rays else (None, None)
+    lens = camera.lens.params()
+    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, lens, channels, frames, rays, *fields)
 
     frame: dict[str, torch.Tensor] = {"alpha": alpha, "instance": instance}
     frame["rgb"] = rgb.permute(1, 2, 0)
@@ -138,6 +143,14 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
+def _along_rays(placed: list[Placed], camera: Camera, cam_from_local: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The splats' canonical frames and the camera's rays, which hold all gradients of the lens."""
+    frames = torch.cat([canonical_frames(p.gaussians, pose) for p, pose in zip(placed, cam_from_local[:, 0], strict=True)])
+    if torch.is_grad_enabled() and camera.lens.params().requires_grad:
+        return frames, camera.lens.unproject(camera.pixel_centres()).to(frames)
+    return frames, camera_rays(camera).to(frames)
+
+
 def _as_placed(splats) -> list[Placed]:
     if isinstance(splats, Gaussians):
         splats = Placed(splats, torch.eye(4, dtype=torch.float64))
@@ -157,13 +170,17 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
             raise ValueError(f"crop must be x, y, width, height of a part of the image, which has {size} pixels, got {crop}")
 
 
-def _check(placed, camera, outputs, flow_to, model) -> None:
+def _check(placed, camera, outputs, flow_to, model, config) -> None:
     for name in outputs:
         what, _, way = name.partition("_")
         if what in ("flow", "visible") and way not in (flow_to or {}):
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
-    if model.response != "conic":
-        raise ValueError(f'response "{model.response}" is not drawn yet; use SplatModel(response="conic")')
+    if model.response == "ray" or config.order == "pixel":
+        which = 'response "ray"' if model.response == "ray" else 'order "pixel"'
+        if isinstance(camera.lens, Orthographic) or moves(camera, placed):
+            raise ValueError(f'{which} needs rays from one eye that stands still; use shutter="global" and a lens that has an eye')
+        if placed[0].gaussians.device.type != "cpu":
+            raise ValueError(f"{which} is drawn on the CPU only; move the splats there, or use the default")
     check_projection(camera, placed, model)
     if flow_to and moves(camera, placed):
         raise ValueError('flow is not drawn while a shutter moves; use shutter="global" and no end poses')

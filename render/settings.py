@@ -73,6 +73,11 @@ class Settings:
         return max(self.config.alpha_cutoff, 1e-10)
 
     @property
+    def by_rays(self) -> bool:
+        """Whether pixels look along their own rays."""
+        return self.model.response == "ray" or self.config.order == "pixel"
+
+    @property
     def squarings(self) -> int:
         """How often exp's polynomial is squared, so that its argument stays within 0.75."""
         return max(3, math.ceil(math.log2(-math.log(self.cutoff) / 0.75)))

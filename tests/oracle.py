@@ -133,7 +133,7 @@ def render(
         for pixels in strip:
             # of a part of a large picture only the splats that a float64 could see there
             near = ((mean.detach() - pixels.mean((0, 1))).abs() < reach + 0.5 * pixels.shape[0]).all(1) if len(strip) > 1 else slice(None)
-            shown.append(_composite(pixels, optics, *(t[near] for t in drawn), order, cutoff, alpha_max))
+            shown.append(_composite(pixels, optics, *(t[near] for t in drawn), model.response, order, cutoff, alpha_max))
         rows.append([torch.cat(part, 1) for part in zip(*shown, strict=True)])
     rgb, alpha, depth, instance, jump = (torch.cat(part) for part in zip(*rows, strict=True))
     return rgb, alpha, depth, instance, jump if jumps else jump > SEEN
@@ -182,6 +182,15 @@ def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, ori
     return (d * away).sum(-1) / d.square().sum(-1)
 
 
+def ray_exponents(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, origins: torch.Tensor) -> torch.Tensor:
+    """`[P, N]`: half the squared Mahalanobis distance of each 3D Gaussian's centre from the nearest point of each ray (3DGUT, Wu et al.
+    2025): at its greatest along the ray; of the eye's own place where that lies behind it, which is not seen."""
+    t = ray_depths(points, axes, rays, origins)
+    nearest = origins[:, None] + t[..., None] * rays[:, None] - points
+    away = torch.einsum("nij,pnj->pni", torch.linalg.inv(axes), nearest)
+    return torch.where(t > 0, 0.5 * away.square().sum(-1), torch.inf)
+
+
 def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[torch.Tensor, ...]]:
     """Rows of square parts of the picture's pixels `[H, W, 2]`; all of it where `count` splats times its pixels is not too much."""
     if pixels.shape[0] * pixels.shape[1] * count <= room:
@@ -189,11 +198,13 @@ def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[
     return [strip.split(PART, 1) for strip in pixels.split(PART, 0)]
 
 
-def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, instances, order, cutoff, alpha_max):
+def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, instances, response, order, cutoff, alpha_max):
     """rgb, alpha, depth, instance and jump of some pixels `[h, w, 2]`."""
     shape, pixels = pixels.shape[:2], pixels.reshape(-1, 2)
     d = pixels[:, None] - mean
     s = 0.5 * torch.einsum("pni,nij,pnj->pn", d, conic, d)
+    if response == "ray":
+        s = ray_exponents(points, axes, lens.unproject(pixels), lens.origins(pixels))
     alpha = opacity * torch.exp(-s)
     jump = torch.zeros(len(pixels), dtype=torch.float64)
     if cutoff > 0:

@@ -88,6 +88,7 @@ def write_splat(
     s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
     if opacity <= view.least_opacity:
         s_max = 0.0
+    s_max *= view.widen
     # written so that a NaN anywhere culls the splat instead of spreading
     if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
         k2 = 0.5 * yy / det

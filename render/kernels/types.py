@@ -24,6 +24,12 @@ GRADIENTS = 10
 """Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
 G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i) for i in range(GRADIENTS))
 
+RAY_BOUNDS = 1.5
+"""With response "ray" the conic only bounds a splat, which is no ellipse on the image: S_MAX is so many times its own."""
+
+FRAME = 12
+"""Floats of a splat's canonical frame (`composite_rays.py`): M row major, then q."""
+
 
 class Wanted(NamedTuple):
     """What a composite kernel sums up. One is compiled for every combination that is asked for.
@@ -92,6 +98,7 @@ class View:
     tiles_x: int
     tiles_y: int
     dilation: float
+    widen: float  # exponents to which a splat's bounds reach, of those to which it shows
     near: float
     log_cutoff: float  # ln(1 / alpha cutoff)
     faint: float  # opacity below which a splat's cutoff shrinks with it

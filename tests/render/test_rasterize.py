@@ -288,7 +288,6 @@ def test_depth_far_behind_faint_splats_is_still_divided_by_its_weight():
         (lambda: rasterize(random_splats(3, 0), CAMERA, background=torch.ones(4)), r"background must have shape \(3,\)"),
         (lambda: rasterize(random_splats(3, 0), CAMERA, background=torch.ones(5, 5, 3)), "background must have shape"),
         (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam_end=CAMERA.world_from_cam)), "global shutter"),
-        (lambda: rasterize(random_splats(3, 0), CAMERA, model=SplatModel(response="ray")), "ray"),
         (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=CAMERA.world_from_cam * torch.nan)), "not finite"),
     ],
 )
