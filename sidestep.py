@@ -24,7 +24,7 @@ from recon.commands import Assets, Recon
 from render.outputs import check_outputs
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
-from scenes.opening import UsageError, fresh, open_scene, warn
+from scenes.opening import UsageError, fresh, open_scene, open_view, warn
 from scenes.options import (
     Angle,
     Csv,
@@ -97,9 +97,9 @@ class Render:
     """Render a clip of a scene from a shifted path, with inserted assets, enhanced: an H.264 video and a JSON report."""
 
     scene: ScenePath
-    """Scene folder."""
+    """Scene folder, or a splat file or asset."""
     camera: str
-    """Camera of the rig, as front_camera."""
+    """Camera of the rig, as front_camera; orbit circles the splats of a file, whose z is up."""
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
     lateral_shift: Length = 0.0
@@ -141,7 +141,7 @@ class Render:
         from scenes.insert import insert
 
         check_device(self.device)
-        scene, warnings = open_scene(self.scene, self.drop_invalid)
+        scene, warnings = open_view(self.scene, self.drop_invalid)
         times = clip_times(scene, self.camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, self.camera, self.lateral_shift, times)
         for placement in self.insert:

@@ -37,6 +37,17 @@ def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]
     return replace(thing, meta={**thing.meta, "path": str(path)}), warnings  # errors name the folder that the user named
 
 
+def open_view(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
+    """As `open_scene`; of splats or an asset a scene with the camera `orbit`, which circles them."""
+    from scenes.files import kind_of
+    from scenes.orbit import around
+
+    if kind_of(path) not in ("asset", "splats"):
+        return open_scene(path, drop_invalid)
+    thing, warnings = open_splats(path, drop_invalid)
+    return around(thing, str(path)), warnings
+
+
 def open_splats(path: Path, drop_invalid: bool = False) -> tuple[Asset | Gaussians, list[str]]:
     """The splats or asset of a file, and what was dropped. ValueError where it is a scene or not finite."""
     from scenes import Scene

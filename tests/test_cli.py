@@ -193,7 +193,7 @@ DATA = [
     (["render", "street", "--camera", "frnt", "-o", "x.mp4"], f'camera "frnt" is not in street; {CAMERAS}'),
     (["render", "stret", *SHOOT[2:]], "stret does not exist. Did you mean street?"),
     (["render", "bank", *SHOOT[2:]], "bank is a databank"),
-    (["render", "street/background.usdc", *SHOOT[2:]], "street/background.usdc holds splats, not a scene"),
+    (["render", "street/background.usdc", *SHOOT[2:]], "is not in street/background.usdc; it has orbit"),
     ([*SHOOT[:-1], "clip.mp4"], "clip.mp4 exists; give -w to replace it"),
     ([*SHOOT[:-1], "x.gif"], "must end in .mp4"),
     ([*SHOOT[:-1], "no/x.mp4"], "the folder no does not exist; create it first"),
@@ -277,6 +277,15 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]
     assert "background.usdc" in door(["convert", "street", str(tmp_path / "c.ply")], 1)[1]
     assert 'suffix ".obj"' in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "c.obj")], 1)[1]
+
+
+def test_splats_alone_are_rendered_from_around(door, tmp_path):
+    door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.splat")])
+    words = ["--size", "64x36", "--duration", "100ms", "-o", str(tmp_path / "a.mp4"), "--outputs", "alpha"]
+    door(["render", str(tmp_path / "a.splat"), "--camera", "orbit", *words])
+    alpha = np.load(tmp_path / "a" / "alpha" / "000000.npy")
+    assert alpha[18, 32] > 0.5 and alpha[0, 0] < 0.1
+    assert "it has orbit" in door(["render", str(tmp_path / "a.splat"), "--camera", "front", *words, "-w"], 1)[1]
 
 
 def test_a_converted_asset_stays_one_as_usd(door, tmp_path):
