@@ -38,7 +38,7 @@ class TrainConfig:
 
     autoencoder: float = 0.07
     """Share of the budget for the autoencoder."""
-    colour: float = 0.28
+    colour: float = 0.55
     """Share of the budget for the colour network."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
@@ -170,10 +170,11 @@ def train(
     try:
         _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
         _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
-        if run.step["enhancer"] == 0:
-            run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
-            calibrate_colour(run.net, clean)
-            run.average.load_state_dict(run.net.state_dict())
+        run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+        calibrate_colour(run.net, clean)
+        start = run.net.state_dict()
+        frozen = {k: v for k, v in start.items() if k.startswith((*FROZEN, "shut_colour"))}
+        run.average.load_state_dict(start if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
         perceptual = PatchPerceptual(run.net.encoder)
