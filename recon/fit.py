@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -57,8 +57,11 @@ class FitConfig:
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
 
-SOLID_WEIGHT = 0.03
+SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
+
+ASIDE, ASIDE_EVERY = 3.0, 4
+"""Metres to either side of the path from which the road must be closed too, and every how many steps that is looked at."""
 
 HORIZON = -0.02
 """Rays that fall more than this (1 degree) are below the horizon."""
@@ -144,6 +147,8 @@ class Fit:
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
+        if self.step_count % ASIDE_EVERY == 0:
+            haze = haze + SOLID_WEIGHT * self._gaps_aside(view, camera)
         regular = 1e-4 * self.ego.unrest() + sum(1e-4 * a.unrest() for a in self.actors)
         (loss + haze + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self._follow()
@@ -191,6 +196,17 @@ class Fit:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
         return (world_directions(small)[..., 2] < HORIZON) & ~view.sky
+
+    def _gaps_aside(self, view: View, camera: Camera) -> torch.Tensor:
+        """Mean of 1 - alpha below the horizon, of a small picture taken up to `ASIDE` metres to the left or right of a view."""
+        metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
+        left = self._body[0][self._row[view.camera, view.index]][:3, 1]
+        pose = camera.world_from_cam.detach().clone()
+        pose[:3, 3] += metres * left
+        small = replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
+        placed = placed_groups(self.splats.groups(self.sh_count()), self._actor_poses(view, small))
+        (alpha,) = draw(placed, small, "alpha")
+        return ((1 - alpha) * (world_directions(small)[..., 2] < HORIZON)).mean()
 
     def _sky_behind(self, camera: Camera) -> torch.Tensor:
         """Sky colour `[H, W, 3]` at every pixel: sampled every few pixels, at others each time, or those between would never learn."""
