@@ -29,6 +29,8 @@ from scenes.sky import Sky, linear_from_srgb
 PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""
 HELD_OUT = 8
+PER_PHOTO = 40
+"""Steps that a fit takes a photo."""
 
 
 def reconstruct(
@@ -40,16 +42,17 @@ def reconstruct(
     size: tuple[int, int] | None = None,
     held_out: int = HELD_OUT,
     resume: bool = False,
-    config: FitConfig = FitConfig(),  # noqa: B008 - frozen
+    config: FitConfig | None = None,
     half: bool = False,
     overwrite: bool = False,
 ) -> Scene:
     """Fit a scene to a log's images and write it to the folder `output`.
 
     cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
-    are fitted, `fit_size` where None. Every `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr;
-    neither does every `held_out`th lidar sweep, against which the scene is measured on the path and beside it (`meta["off_path"]`). An
-    interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the same result as if it had never stopped.
+    are fitted, `fit_size` where None; config: `fit_config` where None. Every `held_out`th frame takes no part and is reported in
+    `meta["held_out"]` and on stderr; neither does every `held_out`th lidar sweep, against which the scene is measured on the path and
+    beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the
+    same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
 
     Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
@@ -61,7 +64,7 @@ def reconstruct(
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
-    size = size or fit_size(log, names)
+    size, config = size or fit_size(log, names), config or fit_config(log, names)
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)
@@ -108,6 +111,15 @@ def fit_size(log: Log, names: Sequence[str]) -> tuple[int, int]:
     camera = log.camera(names[0])
     shrink = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
     return round(camera.width * shrink), round(camera.height * shrink)
+
+
+def fit_config(log: Log, names: Sequence[str]) -> FitConfig:
+    """How long to fit. Photos that stand steps apart are learnt by heart long before a drive's pictures are: colours that turn with
+    the view, and more than `PER_PHOTO` steps each, improve the photos and nothing between them."""
+    if log.points is None:
+        return FitConfig()
+    most = FitConfig().steps
+    return FitConfig(steps=min(most, PER_PHOTO * sum(len(log.camera(name)) for name in names)), sh_degree=0)
 
 
 def begin(

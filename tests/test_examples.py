@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import street as made
+from made_colmap import pictures_along, write_colmap
 
 from enhance.net import Net
 from enhance.weights_file import save_net
@@ -63,6 +64,14 @@ def test_a_clip_is_enhanced(data, tmp_path):
     weights = str(data / "weights.safetensors")
     example("04").main(data / "drive002", weights, 2, **SMALL, output=tmp_path / "enhanced.mp4")
     assert len(list(read_video(tmp_path / "enhanced.mp4"))) == 2
+
+
+def test_a_drive_of_ones_own_is_reconstructed_and_shifted(tmp_path, capsys):
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+    workspace = write_colmap(tmp_path / "walk", made.street(), {"": pictures_along(made.street(), count=6)})
+    example("05").main(workspace, tmp_path / "scene", camera_height=1.5, steps=20)
+    assert "camera: 6 pictures of 96x54, pinhole lens" in capsys.readouterr().out
+    assert read_image(tmp_path / "scene.png").shape[1] > 3 * 96
 
 
 def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monkeypatch):

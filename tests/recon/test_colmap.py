@@ -8,6 +8,7 @@ import torch
 from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 
 from recon import open_log, reconstruct
+from recon.build import PER_PHOTO, fit_config, fit_size
 from recon.fit import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
@@ -196,6 +197,13 @@ def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(ValueError, match=r"pip install 'sidestep\[colmap\]'"):
         open_log(workspace)
+
+
+def test_photos_are_not_learnt_by_heart(workspace, drive):
+    log = open_log(workspace)
+    assert fit_config(log, ["camera"]).steps == 12 * PER_PHOTO < FitConfig().steps
+    assert fit_config(open_log(drive), ["front_camera"]) == FitConfig()
+    assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
 
 
 @pytest.fixture(scope="module")
