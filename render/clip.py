@@ -114,7 +114,7 @@ def _evenly(begin: int, end: int, fps: float) -> torch.Tensor:
 def _frames(scene: Scene, cameras: list[Camera], outputs: tuple[str, ...], shadows: bool, config: RenderConfig) -> Iterator[Frame]:
     last = len(cameras) - 1
     for i, camera in enumerate(cameras):
-        wanted = tuple(o for o in outputs if not (o == "flow_prev" and i == 0) and not (o == "flow_next" and i == last))
+        wanted = tuple(o for o in outputs if not (o.endswith("_prev") and i == 0) and not (o.endswith("_next") and i == last))
         previous = cameras[i - 1] if i > 0 else None
         following = cameras[i + 1] if i < last else None
         yield render_frame(scene, camera, wanted, previous, following, shadows, config)

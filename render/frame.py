@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from render.frame_types import Frame, RenderConfig
+from render.need import need_of, support_fields
 from render.outputs import check_outputs
 from render.rasterize import rasterize
 from render.rays import world_directions
@@ -31,38 +32,48 @@ def render_frame(
 ) -> Frame:
     """Background and actors at `camera.time_us`, shadows of inserted assets, the sky, and last the camera's exposure.
 
-    previous, following: the cameras that flow_prev and flow_next lead to; needed exactly where those are asked for.
+    previous, following: the cameras that flow_prev and flow_next lead to, and visible_prev and visible_next; needed exactly where those
+    are asked for.
     Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky.
     Raises ValueError for an output that does not exist and for a flow without its other camera.
     """
     outputs = check_outputs(outputs)
     others = {"prev": previous, "next": following}
-    for way, other in others.items():
-        if f"flow_{way}" in outputs and other is None:
-            raise ValueError(f"flow_{way} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
+    ways = {way: [o for o in (f"flow_{way}", f"visible_{way}") if o in outputs] for way in others}
+    for way, asked in ways.items():
+        if asked and others[way] is None:
+            raise ValueError(f"{asked[0]} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
+    if "features" in outputs:
+        raise ValueError('a scene has no "features"; pass them to rasterize with scene.placed(time)')
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] = {
-        way: (scene.placed(c.time_us, c.readout_us), c) for way, c in others.items() if c is not None and f"flow_{way}" in outputs
+        way: (scene.placed(c.time_us, c.readout_us), c) for way, c in others.items() if c is not None and ways[way]
     }
 
-    casters = shadow_casters(scene, camera) if shadows and "rgb" in outputs else []
-    needed = set(outputs)
+    needed = set(outputs) - {"need"}
+    if "need" in outputs:
+        needed |= {"rgb", "alpha", "depth", "instance", "features"}
+    casters = shadow_casters(scene, camera) if shadows and "rgb" in needed else []
     if "rgb" in needed and scene.sky is not None:
         needed.add("alpha")
     if casters:
         needed |= {"depth", "instance"}
     placed = scene.placed(camera.time_us, camera.readout_us)
-    frame = rasterize(placed, camera, tuple(sorted(needed)), flow_to=flow_to or None, model=scene.model, config=config)
+    features = support_fields(placed, camera) if "need" in outputs else None
+    frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model, config, features)
 
-    rgb = frame.rgb if "rgb" in outputs else None
-    if rgb is not None:
-        if casters:
-            rgb = cast(frame, casters)
+    rgb = cast(frame, casters) if casters else frame.rgb
+    need = None
+    if "need" in outputs:
+        assert rgb is not None and frame.rgb is not None
+        need = need_of(scene, frame, rgb.ne(frame.rgb).any(-1))
+    if "rgb" in outputs:
+        assert rgb is not None
         if scene.sky is not None:
             rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
         if camera.exposure is not None:
             rgb = expose(rgb, camera.exposure)
     wanted = {name: getattr(frame, name) for name in outputs}
-    return Frame(camera, **{**wanted, "rgb": rgb})
+    return Frame(camera, **wanted | {"need": need, "rgb": rgb if "rgb" in outputs else None})
 
 
 def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Camera) -> torch.Tensor:

@@ -55,7 +55,7 @@ class Frame:
     of the light passes, inf where alpha is below 0.5; normal `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
     visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32; instance_alpha `[H, W, P]` what each
-    placed instance adds to alpha.
+    placed instance adds to alpha; need `[H, W]` 0 to 1, how badly the place is supported by photos (`render/need.py`).
     """
 
     camera: Camera
@@ -71,6 +71,7 @@ class Frame:
     visible_next: torch.Tensor | None = None
     instance: torch.Tensor | None = None
     instance_alpha: torch.Tensor | None = None
+    need: torch.Tensor | None = None
 
     def outputs(self) -> dict[str, torch.Tensor]:
         """The outputs that were computed, by name."""

@@ -17,6 +17,7 @@ OUTPUTS = (
     "visible_next",
     "instance",
     "instance_alpha",
+    "need",
 )
 
 

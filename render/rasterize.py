@@ -171,6 +171,8 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
 
 
 def _check(placed, camera, outputs, flow_to, model, config) -> None:
+    if "need" in outputs:
+        raise ValueError('output "need" depends on where a scene\'s photos were taken; ask render_frame for it')
     for name in outputs:
         what, _, way = name.partition("_")
         if what in ("flow", "visible") and way not in (flow_to or {}):
