@@ -19,6 +19,7 @@ from scenes.atomic import atomic_file
 from scenes.gaussians import SH_COUNTS, Gaussians
 
 _MAX_HEADER = 1 << 20
+_ROWS = 4096
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
@@ -51,12 +52,17 @@ def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     order, elements, offset = read_header(path)
     rest = _check_splats(path, elements)
     vertices = _read_vertices(path, order, elements, offset)
-    columns = {name: _columns(vertices, names) for name, names in _FIELDS.items()}
     n, k = len(vertices), 1 + rest // 3
-    higher = _columns(vertices, [f"f_rest_{i}" for i in range(rest)]).reshape(n, 3, k - 1).transpose(0, 2, 1)
-    sh = np.concatenate([columns["dc"][:, None], higher], 1)
-    fields = columns["means"], columns["quats"], columns["scales"], columns["opacity"][:, 0], sh
-    return clean(Gaussians(*(torch.from_numpy(np.ascontiguousarray(f)) for f in fields)), str(path))
+    fields = {name: np.empty((n, len(names)), np.float32) for name, names in _FIELDS.items() if name != "dc"}
+    sh, higher = np.empty((n, k, 3), np.float32), [f"f_rest_{i}" for i in range(rest)]
+    for start in range(0, n, _ROWS):  # one pass over the file, in parts that stay in the processor's cache
+        rows, part = slice(start, start + _ROWS), vertices[start : start + _ROWS]
+        for name, field in fields.items():
+            field[rows] = _columns(part, _FIELDS[name])
+        sh[rows, 0] = _columns(part, _FIELDS["dc"])
+        sh[rows, 1:] = _columns(part, higher).reshape(len(part), 3, k - 1).transpose(0, 2, 1)
+    parts = fields["means"], fields["quats"], fields["scales"], fields["opacity"][:, 0], sh
+    return clean(Gaussians(*(torch.from_numpy(np.ascontiguousarray(f)) for f in parts)), str(path))
 
 
 def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
