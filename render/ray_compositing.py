@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from render.kernels.composite_rays import LISTS, composite_rays, composite_rays_gradient
+from render.kernels.composite_rays import composite_rays, composite_rays_gradient
+from render.kernels.ray_rows import LISTS
 from render.kernels.types import FRAME, TILE, Window, lanes
 from render.launch import BANDS, run, view
 from render.order import TileLists

@@ -28,7 +28,7 @@ RAY_BOUNDS = 1.5
 """With response "ray" the conic only bounds a splat, which is no ellipse on the image: S_MAX is so many times its own."""
 
 FRAME = 12
-"""Floats of a splat's canonical frame (`composite_rays.py`): M row major, then q."""
+"""Floats of a splat's canonical frame (`ray_rows.py`): M row major, then q."""
 
 
 class Wanted(NamedTuple):
