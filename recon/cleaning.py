@@ -30,6 +30,9 @@ PART = 0.05
 ROAD = 0.2
 """Metres above the ground below which a splat that lies flat is road."""
 
+FLAT = 2.5
+"""Times as wide as high from which a splat lies flat."""
+
 
 def cleaned(splats: Gaussians, size: torch.Tensor) -> Gaussians:
     """The splats of an object in a box `[length, width, height]`: without flat ones near the ground, outliers, and clusters of others."""
@@ -39,10 +42,9 @@ def cleaned(splats: Gaussians, size: torch.Tensor) -> Gaussians:
 
 
 def lies_on_road(splats: Gaussians) -> torch.Tensor:
-    """Mask `[N]` of flat, level splats near the ground."""
-    scales, order = splats.log_scales.exp().sort(dim=1)
-    normal_z = matrix_from_quat(splats.quats)[:, 2].gather(1, order[:, :1])[:, 0].abs()
-    return (splats.means[:, 2] < ROAD) & (normal_z > 0.9) & (scales[:, 0] < 0.4 * scales[:, 1])
+    """Mask `[N]` of splats near the ground that are much wider than high: patches of asphalt, and needles that lie on it."""
+    spread = (matrix_from_quat(splats.quats).square() * splats.log_scales.exp().square()[:, None]).sum(2).sqrt()
+    return (splats.means[:, 2] < ROAD) & (spread[:, :2].amax(1) > FLAT * spread[:, 2])
 
 
 def outliers(splats: Gaussians) -> torch.Tensor:

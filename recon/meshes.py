@@ -114,7 +114,7 @@ def _look(part) -> tuple[np.ndarray, np.ndarray]:
 def splats_of_mesh(mesh: Mesh, count: int) -> Gaussians:
     """About `count` splats on what can be seen of a mesh: as dense everywhere, flat on their triangles, coloured as under an even sky."""
     blockers = Blockers(mesh.vertices[mesh.faces])
-    share = float(_in_the_open(_sampled(mesh, 4000), blockers).float().mean())
+    share = float(_in_the_open(_sampled(mesh, 4000), blockers).sum()) / 4000
     splats = _sampled(mesh, round(count / max(share, 0.2)))
     return splats.select(_in_the_open(splats, blockers))
 

@@ -74,6 +74,14 @@ def test_a_drive_of_ones_own_is_reconstructed_and_shifted(tmp_path, capsys):
     assert read_image(tmp_path / "scene.png").shape[1] > 3 * 96
 
 
+def test_an_own_asset_is_put_on_the_street(data, tmp_path, capsys):
+    out = tmp_path / "own.png"
+    example("06").main(scene=data / "drive002", databank=tmp_path / "bank", splats=800, steps=20, width=64, output=out)
+    assert read_image(out).std() > 0.1
+    told = capsys.readouterr().out
+    assert "cone/0001: 0.50 m long, 0.50 m wide, 0.90 m high" in told and "light: the sky's image" in told
+
+
 def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monkeypatch):
     from enhance import demo
 
