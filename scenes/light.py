@@ -8,8 +8,9 @@ from datetime import UTC, datetime, timedelta
 
 import torch
 
+from scenes.harmonics import rgb_from_sh
 from scenes.scene import Scene
-from scenes.sky import Sky
+from scenes.sky import Sky, linear_from_srgb
 
 SUN_RADIUS = math.radians(0.266)
 """Of the sun's disc; haze and coarse images only make it wider."""
@@ -19,6 +20,9 @@ COUNT = 96
 
 LOWEST = math.radians(1.0)
 """Elevation below which the sun is behind something."""
+
+BEYOND = 1.0
+"""Metres beyond a parked vehicle at which its shadow is looked for, and within which."""
 
 GOLDEN = math.pi * (3 - math.sqrt(5))
 
@@ -57,12 +61,14 @@ def light_of(scene: Scene, time_us: int | None = None) -> Light:
     place, clear = scene.meta.get("geodetic_origin"), clearness(scene.sky)
     time = int(scene.ego.times_us[0]) if time_us is None else time_us
     elevation, azimuth = solar_position(time, float(place["lat"]), float(place["long"])) if place else (0.0, 0.0)
+    # a world with a geodetic origin has x east and y north; azimuth counts from north to the east
+    sun = _direction(math.pi / 2 - azimuth, elevation)
     share = clear * clear_sky_share(elevation) if elevation > LOWEST else 0.0
+    if share and (cast := shadows_beside_parked(scene, sun)) is not None:
+        share = min(share, cast)
     count = round(share * COUNT)
     if not count:
         return Light(_drawn(luminance, COUNT), None, "the sky's image")
-    # a world with a geodetic origin has x east and y north; azimuth counts from north to the east
-    sun = _direction(math.pi / 2 - azimuth, elevation)
     high = f"{math.degrees(elevation):.0f} deg"
     told = f"the sky's image, {clear:.0%} clear, and the sun at {high} by time and place, with {share:.0%} of the light"
     return Light(torch.cat([disc(sun, SUN_RADIUS, count), _drawn(luminance, COUNT - count)]), sun, told)
@@ -86,6 +92,32 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
     extra = torch.where(near, (luminance - 4 * around).clamp_min(0), torch.zeros_like(luminance)) * solid
     centre = (extra[..., None] * directions).sum((0, 1))
     return centre / centre.norm()
+
+
+def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
+    """The part of the light that the ground lacks on the far side from the sun of parked vehicles, against the near side: whether the sun
+    reaches the street at all, where the houses that keep it off were never seen. The median; None where fewer than 3 vehicles tell."""
+    background, ground = scene.background, scene.ground
+    if ground is None or not scene.meta.get("parked"):
+        return None
+    pose = background.world_from_local.float()
+    means = background.gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    low = (means[:, 2] - ground.height(means[:, :2]).float()).abs() < 0.3
+    low &= torch.sigmoid(background.gaussians.logit_opacities) > 0.3
+    places = means[low, :2]
+    luminance = linear_from_srgb(rgb_from_sh(background.gaussians.sh[low, 0]).clamp(0, 1)).mean(1)
+    away = -torch.nn.functional.normalize(sun[:2].float(), dim=0)
+    lacking = []
+    for vehicle in scene.meta["parked"]:
+        box, size = torch.tensor(vehicle["world_from_box"]), torch.tensor(vehicle["size"])
+        reach = (box[:2, :2].T @ away).abs() @ size[:2] / 2 + BEYOND
+        sides = [luminance[(places - box[:2, 3] - way * reach * away).norm(dim=1) < BEYOND] for way in (1, -1)]
+        if min(len(s) for s in sides) >= 3:
+            dark, bright = (float(s.median()) for s in sides)
+            lacking.append(1 - dark / max(bright, 1e-6))
+    if len(lacking) < 3:
+        return None
+    return max(0.0, sorted(lacking)[len(lacking) // 2])
 
 
 def disc(middle: torch.Tensor, radius: float, count: int) -> torch.Tensor:

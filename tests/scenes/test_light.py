@@ -7,9 +7,12 @@ from datetime import UTC, datetime
 import pytest
 import torch
 
-from scenes import Sky
+from scenes import Gaussians, Placed, Sky
+from scenes.harmonics import sh_from_rgb
 from scenes.hdr import load_hdr
-from scenes.light import COUNT, clear_sky_share, clearness, disc, light_of, solar_position, sun_of_sky
+from scenes.light import COUNT, clear_sky_share, clearness, disc, light_of, shadows_beside_parked, solar_position, sun_of_sky
+from scenes.poses import translation
+from scenes.sky import srgb_from_linear
 
 
 def at(*when) -> int:
@@ -79,6 +82,25 @@ def test_place_and_time_put_the_sun_into_a_blue_sky_only(street):
     night = replace(noon, times_us=noon.times_us + 12 * 3_600_000_000)
     assert light_of(replace(day, ego=night)).sun is None
     assert 0.75 < clear_sky_share(1.2) < 0.95 and clear_sky_share(0.1) < clear_sky_share(0.5)
+
+
+def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
+    """Cars along a road whose ground is dark on the far side from the sun, or as bright on both."""
+    sun = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
+    boxes = [translation(float(x)).tolist() for x in range(0, 50, 10)]
+    parked = [{"track": "veh", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": box} for box in boxes]
+    ground = street.background.gaussians.select(street.background.gaussians.means[:, 2] == 0)
+    ground = Gaussians.cat([ground.map(lambda t: t)] * 3)
+    for dim, expected in ((0.4, 0.6), (1.0, 0.0), (1.5, 0.0)):
+        shaded = (ground.means[:, 1] < -0.9) & (ground.means[:, 1] > -3.1)
+        colour = srgb_from_linear(torch.where(shaded[:, None], 0.2 * dim, 0.2)).expand(-1, 3)
+        scene = replace(
+            street, meta={**street.meta, "parked": parked},
+            background=Placed(replace(ground, sh=sh_from_rgb(colour)[:, None].contiguous()), street.background.world_from_local),
+        )  # fmt: skip
+        assert shadows_beside_parked(scene, sun) == pytest.approx(expected, abs=0.02)
+    assert shadows_beside_parked(street, sun) is None
+    assert shadows_beside_parked(replace(scene, meta={"parked": parked[:2]}), sun) is None
 
 
 def test_a_disc_stays_within_its_radius_and_fills_it():
