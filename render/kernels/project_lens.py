@@ -45,11 +45,10 @@ STEP = wp.constant(wp.float64(1.0e-5))
 
 
 class LensKernels(NamedTuple):
-    """The kernels of one lens, and how many numbers a row of its g_uniform has: POSE a power of s, then PARAMS."""
+    """The kernels of one lens under one kind of shutter."""
 
     forward: wp.Kernel
     backward: wp.Kernel
-    uniforms: int
 
 
 @wp.struct
@@ -84,6 +83,14 @@ def to_double(m: wp.mat33):
 
 
 @wp.func
+def write_pose(g_uniform: wp.array2d[float], part: int, power: int, rotation: wp.mat33d, translation: wp.vec3d):
+    for a in range(3):
+        for b in range(3):
+            g_uniform[part, power * POSE + a * 3 + b] = float(rotation[a, b])
+        g_uniform[part, power * POSE + 9 + a] = float(translation[a])
+
+
+@wp.func
 def pulled(t: wp.vec3d, view: View):
     """t on the same plane z, no further out than 1.3 times half the view."""
     x = wp.clamp(t[0], wp.float64(view.clamp_left) * t[2], wp.float64(view.clamp_right) * t[2])
@@ -110,9 +117,6 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     """The kernels of a lens under a global or a moving shutter."""
     pixel, jacobian, params_gradient, depth = lens
     planar, around = depth == PLANAR, depth == ROUND
-    powers = 4 if rolling else 1
-    uniforms = POSE * powers + PARAMS
-    vec_uniform = wp.types.vector(length=uniforms, dtype=wp.float64)
 
     @wp.func
     def readout(o: Optics, m: Motion, x: wp.vec3d, shift: wp.vec3d, start: wp.float64, steps: int):
@@ -153,26 +157,6 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     return wp.vec2d(g[0] + through, g[1])
                 return wp.vec2d(g[0], g[1] + through)
         return wp.vec2d(g[0], g[1])
-
-    @wp.func
-    def add_pose(u: vec_uniform, s: wp.float64, g: wp.vec3d, x: wp.vec3d, moved: wp.float64):
-        """u and d loss / d pose coefficients of y = R x + moved T, d loss / d y = g."""
-        out = vec_uniform(u)
-        power = wp.float64(1.0)
-        for k in range(wp.static(powers)):
-            for a in range(3):
-                for b in range(3):
-                    out[k * POSE + a * 3 + b] = out[k * POSE + a * 3 + b] + power * g[a] * x[b]
-                out[k * POSE + 9 + a] = out[k * POSE + 9 + a] + power * moved * g[a]
-            power = power * s
-        return out
-
-    @wp.func
-    def add_params(u: vec_uniform, g: params):
-        out = vec_uniform(u)
-        for k in range(PARAMS):
-            out[wp.static(POSE * powers) + k] = out[wp.static(POSE * powers) + k] + g[k]
-        return out
 
     @wp.func
     def nearest(o: Optics, along: wp.float64):
@@ -305,7 +289,15 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     ):  # fmt: skip
         """As `project_backward`; g_uniform: POSE numbers for each power of s, then the lens's parameters."""
         part = first + wp.tid()
-        u = vec_uniform()
+        g_r0 = wp.mat33d()  # of the pose's coefficients, and of the lens
+        g_r1 = wp.mat33d()
+        g_r2 = wp.mat33d()
+        g_r3 = wp.mat33d()
+        g_t0 = wp.vec3d()
+        g_t1 = wp.vec3d()
+        g_t2 = wp.vec3d()
+        g_t3 = wp.vec3d()
+        g_lens = params()
         one = wp.float64(1.0)
         none = wp.float64(0.0)
         for i in range(part * chunk, wp.min(part * chunk + chunk, n_splats)):
@@ -326,7 +318,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
 
                 g_x = wp.vec3d()
                 g_axes = wp.mat33d()
-                g_rotation = wp.mat33d()  # of the centre's own pose, beyond what add_pose takes
+                g_rotation = wp.mat33d()  # of the centre's own pose, beyond what its point gives
                 g_aim = wp.vec3d()  # explicit
                 g_shift = wp.vec3d()
                 g_turns = turns(optics, motion, q.centre[0] + q.v[6, 0]) * g_mean_px[0]
@@ -346,56 +338,64 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         behind = c.aim - h * o
                         over = one / (wp.float64(2.0) * h)
                         g_aim += over * (wp.transpose(jacobian(optics, ahead)) * g_e - wp.transpose(jacobian(optics, behind)) * g_e)
-                        u = add_params(u, over * (params_gradient(optics, ahead, g_e) - params_gradient(optics, behind, g_e)))
+                        g_lens += over * (params_gradient(optics, ahead, g_e) - params_gradient(optics, behind, g_e))
                 else:
                     g_aimed = wp.vec2d()
                     g_shared = (g_mean_px + wp.vec2d(g_v[6, 0], g_v[6, 1])) / wp.float64(6.0)
-                    for k in range(6):
-                        sign = wp.float64(1.0)
-                        if k % 2 == 1:
-                            sign = wp.float64(-1.0)
-                        local = sign * column(axes, k // 2)
-                        o = c.rotation * local
-                        r = reach(optics, c.aim, o, wp.static(depth))
-                        point = x + r.tau * local
+                    for k in range(7):  # the sigma points, then what they are measured from
+                        local = wp.vec3d()
+                        tau = wp.float64(0.0)
+                        rule = int(0)
+                        stretch = wp.float64(1.0)
+                        if k < 6:
+                            local = column(axes, k // 2)
+                            if k % 2 == 1:
+                                local = -local
+                            r = reach(optics, c.aim, c.rotation * local, wp.static(depth))
+                            tau = wp.float64(r.tau)
+                            rule = int(r.rule)
+                            stretch = ROOT3 / r.tau
+                        point = x + tau * local
                         s = readout(optics, motion, point, shift, c.s, 8)
                         y = placed(motion, point, shift, s)
-                        stretch = ROOT3 / r.tau
-                        g_d = (wp.vec2d(g_v[k, 0], g_v[k, 1]) / ROOT6 + g_shared) * stretch
-                        g_aimed -= g_d
-                        g_turns -= nearest(optics, pixel(optics, y)[0] - q.aimed[0]) * g_d[0]
+                        g_d = wp.vec2d(g_aimed)
+                        if k < 6:
+                            g_d = (wp.vec2d(g_v[k, 0], g_v[k, 1]) / ROOT6 + g_shared) * stretch
+                            g_aimed -= g_d
+                            g_turns -= nearest(optics, pixel(optics, y)[0] - q.aimed[0]) * g_d[0]
                         g_p = pixel_backward(optics, motion, point, shift, s, g_d, none)
                         g_y = wp.transpose(jacobian(optics, y)) * g_p
-                        u = add_params(u, params_gradient(optics, y, g_p))
-                        u = add_pose(u, s, g_y, point, one)
-                        g_shift += g_y
+                        g_lens += params_gradient(optics, y, g_p)
+                        by_pose = wp.outer(g_y, point)
+                        g_r0 += by_pose
+                        g_t0 += g_y
                         turn = wp.mat33d(motion.r0)
                         if wp.static(rolling):
                             turn = rotation_at(motion, s)
+                            g_r1 += s * by_pose
+                            g_t1 += s * g_y
+                            g_r2 += s * s * by_pose
+                            g_t2 += s * s * g_y
+                            g_r3 += s * s * s * by_pose
+                            g_t3 += s * s * s * g_y
+                        g_shift += g_y
                         g_point = wp.transpose(turn) * g_y
                         g_x += g_point
-                        g_local = r.tau * g_point
-                        if r.rule != 0:
-                            # v = d stretch: by tau through the point and through the stretch
-                            moved = wp.vec2d(q.v[k, 0], q.v[k, 1]) * (ROOT6 / stretch)
-                            g_tau = wp.dot(g_point, local) - wp.dot(g_d, moved) / r.tau
-                            back = reach_backward(optics, c.aim, o, wp.static(depth), r, g_tau)
+                        g_local = tau * g_point
+                        if rule != 0:
+                            # d stretch hangs on tau through the point and through the stretch
+                            o = c.rotation * local
+                            d = wp.vec2d(q.v[k, 0], q.v[k, 1]) * (ROOT6 / stretch)
+                            g_tau = wp.dot(g_point, local) - wp.dot(g_d, d) / tau
+                            back = reach_backward(optics, c.aim, o, wp.static(depth), tau, rule, g_tau)
                             g_aim += back.centre
                             g_rotation += wp.outer(back.offset, local)
                             g_local += wp.transpose(c.rotation) * back.offset
-                        for a in range(3):
-                            g_axes[a, k // 2] = g_axes[a, k // 2] + sign * g_local[a]
-                    s = readout(optics, motion, x, shift, c.s, 8)
-                    y = placed(motion, x, shift, s)
-                    g_p = pixel_backward(optics, motion, x, shift, s, g_aimed, none)
-                    g_y = wp.transpose(jacobian(optics, y)) * g_p
-                    u = add_params(u, params_gradient(optics, y, g_p))
-                    u = add_pose(u, s, g_y, x, one)
-                    g_shift += g_y
-                    turn = wp.mat33d(motion.r0)
-                    if wp.static(rolling):
-                        turn = rotation_at(motion, s)
-                    g_x += wp.transpose(turn) * g_y
+                        if k % 2 == 1:
+                            g_local = -g_local
+                        if k < 6:
+                            for a in range(3):
+                                g_axes[a, k // 2] = g_axes[a, k // 2] + g_local[a]
 
                 # the centre: what hangs on t beside its pixel, then the pixel
                 g_aim += g_shift
@@ -415,18 +415,21 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     rate = rotation_rate(motion, c.s)
                     g_s = wp.dot(g_t, rate * x + translation_rate(motion, c.s)) + wp.ddot(g_rotation, rate)
                 g_p = pixel_backward(optics, motion, x, wp.vec3d(), c.s, g_mean_px, g_s)
-                u = add_params(u, params_gradient(optics, c.t, g_p))
+                g_lens += params_gradient(optics, c.t, g_p)
                 g_t += wp.transpose(jacobian(optics, c.t)) * g_p
-                u = add_pose(u, c.s, g_t, x, one)
-                for a in range(3):
-                    row = wp.vec3d(none, none, none)
-                    row[a] = one
-                    u = add_pose(u, c.s, row, wp.vec3d(g_rotation[a, 0], g_rotation[a, 1], g_rotation[a, 2]), none)
+                by_pose = wp.outer(g_t, x) + g_rotation
+                g_r0 += by_pose
+                g_t0 += g_t
+                if wp.static(rolling):
+                    g_r1 += c.s * by_pose
+                    g_t1 += c.s * g_t
+                    g_r2 += c.s * c.s * by_pose
+                    g_t2 += c.s * c.s * g_t
+                    g_r3 += c.s * c.s * c.s * by_pose
+                    g_t3 += c.s * c.s * c.s * g_t
                 g_x += wp.transpose(c.rotation) * g_t
                 if optics.period > none:
-                    whole = params()
-                    whole[0] = TURN * g_turns
-                    u = add_params(u, whole)
+                    g_lens[0] = g_lens[0] + TURN * g_turns
 
                 g_means[i] = wp.vec3(g_x)
                 r_splat = rotation(quats[i])
@@ -435,7 +438,12 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 g_quats[i] = rotation_backward(quats[i], g_local_axes * wp.diag(scale))
                 by_scale = wp.transpose(r_splat) * g_local_axes
                 g_log_scales[i] = wp.vec3(scale[0] * by_scale[0, 0], scale[1] * by_scale[1, 1], scale[2] * by_scale[2, 2])
-        for k in range(wp.static(uniforms)):
-            g_uniform[part, k] = float(u[k])
+        write_pose(g_uniform, part, 0, g_r0, g_t0)
+        if wp.static(rolling):
+            write_pose(g_uniform, part, 1, g_r1, g_t1)
+            write_pose(g_uniform, part, 2, g_r2, g_t2)
+            write_pose(g_uniform, part, 3, g_r3, g_t3)
+        for k in range(PARAMS):
+            g_uniform[part, wp.static(POSE * (4 if rolling else 1)) + k] = float(g_lens[k])
 
-    return LensKernels(project_lens, project_lens_backward, uniforms)
+    return LensKernels(project_lens, project_lens_backward)

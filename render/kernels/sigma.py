@@ -90,24 +90,24 @@ def reach(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int):
 
 
 @wp.func
-def reach_backward(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int, r: Reach, g: wp.float64):
+def reach_backward(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int, tau: wp.float64, rule: int, g: wp.float64):
     out = ReachGradient()
     two = wp.float64(2.0)
     zero = wp.float64(0.0)
-    if r.rule == AT_HALF_DEPTH:
+    if rule == AT_HALF_DEPTH:
         if depth == _PLANAR:
-            out.centre = wp.vec3d(zero, zero, g * r.tau / centre[2])
-            out.offset = wp.vec3d(zero, zero, -g * r.tau / offset[2])
+            out.centre = wp.vec3d(zero, zero, g * tau / centre[2])
+            out.offset = wp.vec3d(zero, zero, -g * tau / offset[2])
         else:
             along = wp.dot(centre, offset)
-            out.centre = (g * r.tau) * (two * centre / wp.dot(centre, centre) - offset / along)
-            out.offset = (-g * r.tau / along) * centre
-    if r.rule == AT_EDGE:
-        edge = centre + r.tau * offset
+            out.centre = (g * tau) * (two * centre / wp.dot(centre, centre) - offset / along)
+            out.offset = (-g * tau / along) * centre
+    if rule == AT_EDGE:
+        edge = centre + tau * offset
         cc = o.cos_limit * o.cos_limit
         n = wp.vec3d(cc * edge[0], cc * edge[1], -o.sin_limit * o.sin_limit * edge[2])
         out.centre = (-g / wp.dot(n, offset)) * n
-        out.offset = r.tau * out.centre
+        out.offset = tau * out.centre
     return out
 
 
