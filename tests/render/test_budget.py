@@ -9,7 +9,7 @@ from render import RenderConfig, rasterize
 from scenes import Camera, Pinhole, Placed, SplatModel
 from scenes.poses import translation
 from tests import oracle
-from tests.bench.presets import random_splats, uniform
+from tests.bench.presets import drive, random_splats, uniform
 
 BUDGETS = (1 / 64, 1 / 255, 1 / 1024, 1 / 4096)
 CAMERA = Camera(Pinhole(40.0, 41.0, 20.0, 15.0), 40, 30, torch.eye(4, dtype=torch.float64))
@@ -65,6 +65,12 @@ def test_the_uniform_preset_keeps_every_budget():
     """As dense as uniform-100k, on 96x64."""
     g, camera, model = uniform(1176, 96, 64)
     assert_kept([Placed(g, torch.eye(4, dtype=torch.float64))], camera, model, "uniform")
+
+
+def test_the_drive_keeps_every_budget():
+    """So small that a hundred splats share a pixel: their tails come together where walls end."""
+    preset = drive(24, 14)
+    assert_kept(preset.placed, preset.camera, preset.model, "drive")
 
 
 @pytest.mark.parametrize("e", [0.0, -1.0, 1.0, 1e-5, float("nan")])
