@@ -40,7 +40,7 @@ def brightest(placed: list[Placed], camera: Camera) -> float:
 
 
 def assert_kept(placed, camera, model, where: str) -> None:
-    rgb, jump = oracle.truth(placed, camera, model, order="tile")
+    rgb, jump = oracle.truth(placed, camera, model)
     unit = brightest(placed, camera)
     for e in BUDGETS:
         drawn = rasterize(placed, camera, ("rgb",), model=model, config=RenderConfig(max_error=e)).rgb
@@ -68,9 +68,10 @@ def test_the_uniform_preset_keeps_every_budget():
 
 
 def test_the_drive_keeps_every_budget():
-    """So small that a hundred splats share a pixel: their tails come together where walls end."""
-    preset = drive(24, 14)
-    assert_kept(preset.placed, preset.camera, preset.model, "drive")
+    """A sixth of its splats on an image so small that dozens share a pixel: their tails come together where walls end."""
+    preset = drive(32, 18)
+    thinned = [replace(p, gaussians=p.gaussians.select(torch.arange(0, len(p.gaussians), 6))) for p in preset.placed]
+    assert_kept(thinned, preset.camera, preset.model, "drive")
 
 
 @pytest.mark.parametrize("e", [0.0, -1.0, 1.0, 1e-5, float("nan")])
@@ -81,6 +82,7 @@ def test_a_budget_that_no_picture_can_keep_is_refused(e):
 
 def test_a_looser_budget_draws_less():
     """Entries of the tiles' lists, which is what time goes with: fewer for every step from strict to loose."""
+    from render.budget import split
     from render.kernels.types import Wanted
     from render.settings import Settings
     from tests.render.test_cuda import keep_forward
@@ -88,7 +90,7 @@ def test_a_looser_budget_draws_less():
     g, camera, model = uniform(3000, 192, 128)
     entries = []
     for e in BUDGETS:
-        settings = Settings(192, 128, model, RenderConfig(max_error=e), Wanted(), (0,))
+        settings = Settings(192, 128, model, RenderConfig(**split(e) | {"order": "tile"}), Wanted(), (0,))
         kept, _ = keep_forward(settings, g, torch.eye(4, dtype=torch.float64), camera.lens)
         entries.append(int(kept.parts[0].lists.starts[-1]))
-    assert entries == sorted(entries) and entries[0] < 0.8 * entries[-1], entries
+    assert entries == sorted(set(entries)), entries
