@@ -22,7 +22,7 @@ CAMERA = "front_camera"
 SHIFT = 2.0
 WIDTH, HEIGHT = 640, 360
 PARKED = "car/0001@32m,6.1m"
-MOVING = "car/0003@8.5m,0m,speed=3.5m/s"
+MOVING = "car/0003@6.5m,0m,speed=2.8m/s"
 # the recording itself is not ours to bundle: the first column is the reconstruction seen from the recorded path
 COLUMNS = ("recorded view, reconstructed", "shifted 2 m to the left", "with a parked and a moving asset", "enhanced")
 
