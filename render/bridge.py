@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from render.compositing import Projected, draw, draw_backward
+from render.compositing import draw, draw_backward
 from render.kernels.types import MEDIAN, RECORD, WHO
 from render.launch import run, stage, view
 from render.order import depth_order
+from render.projected import Projected
 from render.projection import projection, uniforms
 from render.settings import Settings
 

@@ -13,37 +13,9 @@ from render.kernels.composite_cuda import composite_blocks, composite_blocks_gra
 from render.kernels.types import GRADIENTS, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, view
 from render.order import TileLists, tile_lists
+from render.projected import Part, Projected
 from render.ray_compositing import add_window, draw_rays, draw_rays_backward, lanes_of
 from render.settings import Settings
-
-
-@dataclass(frozen=True)
-class Projected:
-    """All splats on the image: records `[N, RECORD]`, counts int32 `[N]` of tiles at most, the visible ones' order, features `[N, C]`;
-    where pixels look along their own rays, canonical frames `[N, FRAME]` and the camera's rays `[H, W, 3]`."""
-
-    records: torch.Tensor
-    counts: torch.Tensor
-    order: torch.Tensor
-    features: torch.Tensor | None
-    frames: torch.Tensor | None = None
-    rays: torch.Tensor | None = None
-
-    @property
-    def channels(self) -> int:
-        return 0 if self.features is None else self.features.shape[1]
-
-
-@dataclass
-class Part:
-    """A window of the image, as drawn: its lists and their exact counts (None where backward shall make them again, to save memory),
-    where compositing ended, and its planes, of which backward reads the final transmittance."""
-
-    window: Window
-    lists: TileLists | None
-    counts: torch.Tensor | None
-    ends: tuple[torch.Tensor, ...]
-    planes: torch.Tensor
 
 
 @dataclass(frozen=True)

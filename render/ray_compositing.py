@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from render.kernels.composite_rays import composite_rays, composite_rays_gradient
@@ -11,10 +9,8 @@ from render.kernels.ray_rows import LISTS
 from render.kernels.types import FRAME, TILE, Window, lanes
 from render.launch import BANDS, run, view
 from render.order import TileLists
+from render.projected import Part, Projected
 from render.settings import Settings
-
-if TYPE_CHECKING:
-    from render.compositing import Part, Projected
 
 MOST_HELD = 1 << 19
 """Entries that the bands' working lists may hold together, at 400 bytes each."""
