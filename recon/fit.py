@@ -32,7 +32,7 @@ POSE_UNITS = {"ego": (1e-3, 1e-2), "extrinsic": (1e-3, 1e-3), "actor": (1e-2, 5e
 class FitConfig:
     """How long and how finely to fit."""
 
-    steps: int = 6000
+    steps: int = 5000
     """Pictures rendered and compared."""
     budget: int = 220_000
     """Splats at most, all groups together."""
