@@ -1,7 +1,7 @@
 """What does not belong to a cut-out object: road, its neighbours' splats, floaters. Splats stand in the frame of its box.
 
-Outliers and clusters are found with scipy's k-d tree: open3d does the same two things, but its package brings a web server, scikit-learn
-and 400 MB along for them.
+Outliers and clusters are found with scipy's k-d tree: open3d does the same two things, but these two alone are
+not worth so large a package.
 """
 
 from __future__ import annotations

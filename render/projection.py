@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -124,7 +124,7 @@ def projection(lens: type[Lens], rolling: bool) -> Projection:
 
 def uniforms(settings: Settings, lens: Lens, pose: torch.Tensor, instance: int, sh_count: int, copy: int) -> list:
     """What the kernels of `projection` are told of one instance with `pose` `[C, 4, 4]`."""
-    view = _view(settings, lens, sh_count)
+    view = _view(replace(settings, mask=None), lens, sh_count)  # a key that is kept must not keep a mask
     if isinstance(lens, Pinhole) and not settings.rolling:
         return [view, _pose(pose[0], instance)]
     optics = Optics()
