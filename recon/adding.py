@@ -13,7 +13,7 @@ from render.progress import Progress
 from scenes.asset import Asset
 from scenes.databank import Databank
 from scenes.files import load
-from scenes.formats import GLB, PLY, found
+from scenes.formats import GLB, PLY, USD, found
 from scenes.gaussians import Gaussians
 from scenes.report import validate
 from scenes.sizes import odd_size
@@ -26,11 +26,11 @@ OFF = 0.12
 
 
 def add_mesh(
-    databank: Path, file: Path, label: str, scale: float, up: str | None, forward: str | None, share: dict, force: bool = False,
+    databank: Path, file: Path, label: str, scale: float | None, up: str | None, forward: str | None, share: dict, force: bool = False,
     config: MeshFit = MeshFit(),  # noqa: B008 - frozen
 ) -> tuple[str, str]:  # fmt: skip
     """Store a mesh file as a splat asset; its id, and what a person should know. ValueError where its size is odd and not `force`d."""
-    mesh = read_mesh(file, up or "y", forward or "z", scale)
+    mesh = read_mesh(file, up or "y", forward or "z", scale or 1.0)
     _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), force)
     with Progress("fit", total=config.steps) as steps:
         meta = {**share, "source": file.name}
@@ -41,20 +41,41 @@ def add_mesh(
 
 
 def add_splats(
-    databank: Path, file: Path, label: str, scale: float, up: str | None, forward: str | None, share: dict, force: bool = False
+    databank: Path, file: Path, label: str, scale: float | None, up: str | None, forward: str | None, share: dict, force: bool = False
 ) -> tuple[str, str]:
-    """Store a file of splats as an asset: turned, scaled, and set down on the ground; returns and raises as `add_mesh`."""
+    """Store a file of splats as an asset: turned, scaled, and set down on the ground; returns and raises as `add_mesh`.
+
+    scale, up, forward: what the file's own axes and unit are where they are not as its format has them (`own_axes`).
+    """
     splats = load(file)
     if not isinstance(splats, Gaussians):
         raise ValueError(f"{file} holds no plain splats; assets and scenes are opened as they are")
     if not len(splats):
         raise ValueError(f"{file} holds no splats")
-    upright = turned_upright(splats, scale, up or "-y", forward or "z")
+    own_up, own_forward, metres = own_axes(file)
+    upright = turned_upright(splats, scale or metres, up or own_up, forward or own_forward)
     low, high = solid_box(upright)
     base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
     asset = Asset(replace(upright, means=upright.means - base), (high - low).double(), label, meta={**share, "source": file.name})
     _check_size(file, label, asset.size.tolist(), force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
+
+
+def own_axes(file: Path) -> tuple[str, str, float]:
+    """The axes up and forward of loaded splats, and metres a unit, by their file's format.
+
+    glTF faces +z with y up, and is turned to z up when it is loaded. A USD stage says which axis is up, and its unit if it is not the
+    metre; y up faces z as glTF does, z up faces x as robots do. All others stand as cameras see them: y down, z ahead.
+    """
+    form = found(file)
+    if form is GLB:
+        return "z", "-y", 1.0
+    if form is USD:
+        from scenes.usd_splats import stage_axes
+
+        up, metres = stage_axes(file)
+        return up, {"y": "z", "z": "x"}[up], metres
+    return "-y", "z", 1.0
 
 
 def turned_upright(splats: Gaussians, scale: float, up: str, forward: str) -> Gaussians:

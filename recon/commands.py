@@ -122,7 +122,7 @@ def _seen_from(meta: dict) -> dict:
 
 @dataclass
 class Add:
-    """Add a textured mesh (.glb) or splats (.ply) of your own to the databank, turned and scaled to its frame."""
+    """Add a textured mesh (.glb) or splats (.ply, .usdc, .glb, ...) of your own to the databank, turned and scaled to its frame."""
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """Mesh, as car.glb, or splats, as car.ply."""
@@ -131,9 +131,10 @@ class Add:
     scale: Ratio = None
     """Metres a unit of the file."""
     up: str | None = None
-    """The file's axis that points up: x, -x, y, ...; a mesh's is y, as in glTF, and splats' -y, as cameras have it."""
+    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, and else -y, as cameras
+    have it."""
     forward: str | None = None
-    """The file's axis that points forward: a mesh's is z, as in glTF, and splats' z."""
+    """The axis that points forward: a mesh's is z, as in glTF; of splats -y in .glb, x in USD with z up, and else z."""
     licence: str = ""
     """Its licence, as "CC BY 3.0"."""
     attribution: str = ""
@@ -148,7 +149,7 @@ class Add:
 
         add = add_splats if holds_splats(self.file) else add_mesh
         share = {"licence": self.licence, "attribution": self.attribution}
-        id, said = add(self.databank, self.file, self.label, self.scale or 1.0, self.up, self.forward, share, self.force)
+        id, said = add(self.databank, self.file, self.label, self.scale, self.up, self.forward, share, self.force)
         print(f"added {self.file} to {self.databank} as {id}: {said}")
 
 

@@ -13,7 +13,7 @@ from recon.log import Log, Sweep
 from recon.seed import project
 from render import render_frame
 from render.rays import world_directions
-from render.warp import visible, warp
+from render.warp import warp
 from scenes.camera import Camera
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -89,20 +89,18 @@ def flicker_along(scene: Scene, shift: float) -> float:
     first = max(0, (len(times) - CALM_FRAMES) // 2)
     path = scene.ego.shifted(lateral=shift)
     cameras = [scene.camera(name, t, path) for t in times[first : first + CALM_FRAMES]]
-    found, last, after = [], None, None
-    for k, camera in enumerate(cameras):
-        following = cameras[k + 1] if k + 1 < len(cameras) else None
-        outputs = ("rgb",) + ("flow_prev",) * (k > 0) + ("flow_next",) * (following is not None)
+    found, last = [], None
+    for previous, camera in zip([None, *cameras], cameras, strict=False):
+        outputs = ("rgb",) if previous is None else ("rgb", "flow_prev", "visible_prev")
         with torch.no_grad():
-            frame = render_frame(scene, camera, outputs, cameras[k - 1] if k else None, following)
+            frame = render_frame(scene, camera, outputs, previous)
         rgb = _planes(frame.rgb)
-        if last is not None and after is not None:
-            flow = _planes(frame.flow_prev)
-            moved, inside = warp(last, flow)
-            both = visible(flow, after) & (inside > 0)
+        if last is not None and frame.visible_prev is not None:
+            moved, inside = warp(last, _planes(frame.flow_prev))
+            both = frame.visible_prev[None, None] & (inside > 0)
             if both.any():
                 found.append(255 * float(((rgb - moved).abs().mean(1, keepdim=True))[both].mean()))
-        last, after = rgb, None if frame.flow_next is None else _planes(frame.flow_next)
+        last = rgb
     return float(np.mean(found)) if found else 0.0
 
 

@@ -44,6 +44,13 @@ def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
         return clean(read_splats(prim), str(path))
 
 
+def stage_axes(path: Path) -> tuple[str, float]:
+    """Which axis of a USD file is up, "y" or "z", and the metres of its unit: 1 where it does not say, as splat tools write it."""
+    with open_stage(path) as stage:
+        metres = UsdGeom.GetStageMetersPerUnit(stage) if UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1.0
+        return UsdGeom.GetStageUpAxis(stage).lower(), metres
+
+
 def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
     """Write an asset as one USD file: its splats under an Xform that carries size, label and metadata."""
     with new_stage(path, "Asset") as stage:

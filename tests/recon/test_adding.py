@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -28,6 +29,21 @@ def test_splats_of_any_axes_and_unit_become_an_asset(tmp_path):
     assert id == "car/0001" and "4.20 m long, 1.80 m wide, 1.50 m high" in said
     torch.testing.assert_close(asset.gaussians.means, upright.means, atol=2e-3, rtol=0)
     assert Databank(tmp_path / "bank").entry(id).thumb and check_databank(tmp_path / "bank") == []
+
+
+@pytest.mark.parametrize(("name", "up", "units"), [("car.glb", None, 1.0), ("z.usda", "Z", 1.0), ("y.usda", "Y", 100.0)])
+def test_splats_in_files_that_say_which_axis_is_up_need_no_axes(tmp_path, name, up, units):
+    """A car that faces as its format has it: glTF along z with y up; USD along x with z up, and along z with y up."""
+    upright, file = box((4.2, 1.8, 1.5), (0.8, 0.2, 0.1)), tmp_path / name
+    turn = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) if up is None else torch.eye(3)
+    turn = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]) if up == "Y" else turn
+    grown = upright.log_scales + torch.tensor(units).log()
+    save(replace(upright, means=units * upright.means @ turn.T, log_scales=grown), file)
+    if up == "Y":
+        text = file.read_text().replace('upAxis = "Z"', 'upAxis = "Y"').replace("metersPerUnit = 1", "metersPerUnit = 0.01")
+        file.write_text(text)
+    id, _ = add_splats(tmp_path / "bank", file, "car", None, None, None, {})
+    torch.testing.assert_close(Databank(tmp_path / "bank").load(id).gaussians.means, upright.means, atol=2e-3, rtol=0)
 
 
 def test_turning_splats_turns_their_axes_and_their_harmonics():
