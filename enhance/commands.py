@@ -10,39 +10,55 @@ from tyro.conf import Positional, arg
 
 from scenes import units
 from scenes.opening import UsageError, fresh
-from scenes.options import Flag, Names, Output, Overwrite, ScenePath, written
+from scenes.options import Flag, Names, Output, Overwrite, written
 
 
 @dataclass
 class Pairs:
-    """Make training pairs for the enhancer from a scene and its recording."""
+    """Make training pairs for the enhancer from scenes and their recordings."""
 
-    scene: ScenePath
-    """Scene folder."""
-    data: Path
-    """The recording that the scene was reconstructed from."""
+    scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE")]]
+    """Scene folders; of several, each gets a folder of its own in the output."""
     output: Output
     """Folder of the pairs; a run that was interrupted goes on where it stopped."""
+    data: tuple[Path, ...] = ()
+    """The recordings that the scenes were reconstructed from, in the same order."""
+    kinds: Names = None
+    """Which damage: sparse, cycle, crossref, underfit, isp, relight, shadow, reinsert, clean."""
     cameras: Names = None
     """Cameras to use; the front camera's pairs are never trained on."""
+    skies: tuple[Path, ...] = ()
+    """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
+    databank: Path | None = None
+    """Assets that shadow puts in, beside those cut out of the scene."""
+    size: Annotated[int, arg(metavar="PIXELS")] = 640
+    """Width of the frames."""
     seed: int = 0
     """Same seed, same pairs."""
 
     def run(self) -> None:
-        from enhance.pairs import make_pairs
-        from recon import open_log, stopped_early
+        from enhance.clips import PairConfig
+        from enhance.pairs import check_kinds, make_pairs, open_reconstruction, prepare_sources
+        from enhance.shards import KINDS
+        from recon import open_log
         from render.progress import Progress
-        from scenes import load
 
-        log, scene = open_log(self.data), load(self.scene)
-        early = stopped_early(log, self.output / "early", [name for name in log.cameras if name in scene.rig])
-        with Progress("pairs") as steps:
+        if not self.scenes or len(self.scenes) != len(self.data):
+            counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
+            raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
+        kinds = self.kinds or KINDS
+        check_kinds(kinds)
+        for path, data in zip(self.scenes, self.data, strict=True):
+            scene, log = open_reconstruction(path), open_log(data)
+            out = self.output if len(self.scenes) == 1 else self.output / path.name
+            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank)
+            with Progress(f"pairs {path.name}") as steps:
 
-            def say(done: int, total: int, name: str) -> None:
-                steps.total = total
-                steps.step(done - steps.done, name)
+                def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
+                    steps.total = total
+                    steps.step(done - steps.done, name)
 
-            make_pairs(scene, log, self.output, cameras=self.cameras, seed=self.seed, progress=say, unfinished=early)
+                make_pairs(scene, log, out, kinds, self.cameras, self.seed, say, sources, PairConfig(width=self.size))
         print(f"wrote {self.output}")
 
 

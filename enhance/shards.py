@@ -8,6 +8,7 @@ region    uint8 `[T, H, W]`       where they were damaged, 0..255
 instance  uint8 `[T, H, W]`       rendered instance id, 255 where none
 flow      float16 `[T, H, W, 2]`  exact flow to the previous frame, pixels; NaN in the first frame and where unknown
 visible   uint8 `[T, H, W]`       1 where the previous frame shows the same point
+depth     float16 `[T, H, W]`     z in metres, inf where nothing is (clips made before it was kept lack it)
 
 and `<name>.json` says kind, split ("train" or "held out"), camera, times, seed and what was done.
 """
@@ -24,7 +25,9 @@ import torch
 from scenes.atomic import atomic_file
 from scenes.checks import check_tensor
 
-KINDS = ("underfit", "isp", "clean")
+KINDS = ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert")
+RENDERED = ("underfit", "sparse", "cycle", "crossref")
+"""Kinds whose whole frame comes from a reconstruction."""
 FIELDS = {
     "input": torch.uint8,
     "target": torch.uint8,
@@ -33,6 +36,7 @@ FIELDS = {
     "flow": torch.float16,
     "visible": torch.uint8,
 }
+STORED = FIELDS | {"depth": torch.float16}
 
 
 @dataclass(frozen=True)
@@ -100,26 +104,27 @@ def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> Non
     """Store one clip; the json file is written last, so a shard without one is unfinished and is made again."""
     from safetensors.torch import save_file
 
-    for name, dtype in FIELDS.items():
+    for name, dtype in STORED.items():
         check_tensor(name, tensors[name], ("T", "H", "W", {"flow": 2}.get(name, 3)) if tensors[name].ndim == 4 else ("T", "H", "W"), dtype)
     path.parent.mkdir(parents=True, exist_ok=True)
     t, h, w = tensors["region"].shape
     with atomic_file(path) as half:
-        save_file({name: tensors[name].contiguous() for name in FIELDS}, str(half))
+        save_file({name: tensors[name].contiguous() for name in STORED}, str(half))
     with atomic_file(path.with_suffix(".json")) as half:
         Path(half).write_text(json.dumps({"frames": t, "height": h, "width": w, **meta}, indent=1))
 
 
 class PairSet:
-    """All finished shards of a pairs folder, or of several."""
+    """All finished shards of a pairs folder, or of several; of a folder with one such folder a scene, all of these."""
 
     def __init__(self, *folders: str | Path):
         self.shards: list[Shard] = []
         for folder in map(Path, folders):
             if not folder.is_dir():
                 raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
-            for file in sorted(folder.glob("*/*.json")):
-                self.shards.append(_read_meta(file))
+            for file in sorted([*folder.glob("*/*.json"), *folder.glob("*/*/*.json")]):
+                if file.parent.name in KINDS:
+                    self.shards.append(_read_meta(file))
         if not self.shards:
             raise ValueError(
                 f"no pairs in {', '.join(map(str, folders))}; "

@@ -2,11 +2,18 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
+from street import car
 
-from enhance.pairs import PairConfig, make_pairs
-from enhance.shards import PairSet
+from enhance.clips import PairConfig
+from enhance.damage import ORDER, Sources
+from enhance.degrade import Underfit, unfinish
+from enhance.lighting import random_sky
+from enhance.pairs import make_pairs, prepare_sources
+from enhance.refits import REFITS, Refit
+from enhance.shards import KINDS, PairSet
 from recon.log import Log, LogCamera
 from render import render_frame
 from render.video import write_image
@@ -29,16 +36,24 @@ def recording(street, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def folder(street, recording, tmp_path_factory):
-    return make_pairs(street, recording, tmp_path_factory.mktemp("made") / "pairs", seed=1, config=CONFIG)
+def sources(street):
+    """Spoilt splats stand in for fits from less, which have tests of their own."""
+    spoilt = Refit(unfinish(street, Underfit(thin=0.5, colour=0.2), 0), ("front_camera", "left_camera"))
+    own = {a.track: a.asset for a in street.actors}
+    return Sources(refits={kind: [spoilt] for kind in REFITS}, skies=[random_sky(np.random.default_rng(3))], own=own, assets=[car()])
+
+
+@pytest.fixture(scope="module")
+def folder(street, recording, sources, tmp_path_factory):
+    return make_pairs(street, recording, tmp_path_factory.mktemp("made") / "pairs", KINDS, seed=1, sources=sources, config=CONFIG)
 
 
 def test_every_clip_of_every_camera_has_every_kind_and_a_sheet(folder):
     pairs = PairSet(folder)
-    assert len(pairs.shards) == 3 * 2 * 2
+    assert len(pairs.shards) == len(KINDS) * 2 * 2
     assert {s.meta["camera"] for s in pairs.of(split="held out")} == {"front_camera"}
     assert {s.meta["camera"] for s in pairs.of(split="train")} == {"left_camera"}
-    assert all((folder / f"{kind}.png").stat().st_size > 1000 for kind in ("underfit", "isp", "clean"))
+    assert all((folder / f"{kind}.png").stat().st_size > 1000 for kind in KINDS)
 
 
 def test_damage_falls_inside_the_region_only(folder):
@@ -47,6 +62,63 @@ def test_damage_falls_inside_the_region_only(folder):
         changed = (w.input != w.target).any(1, keepdim=True)
         assert not (changed & (w.region == 0)).any()
         assert shard.meta["kind"] == "clean" or w.region.max() == 0 or changed.any()
+
+
+def test_every_kind_damages_some_clip_and_says_so(folder):
+    for kind in set(KINDS) - {"clean"}:
+        assert any(s.window().region.max() == 1 for s in PairSet(folder).of(kind)), kind
+
+
+def test_kinds_keep_their_seeds(folder):
+    assert ORDER == KINDS == ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert")
+
+
+def test_a_shadow_only_darkens_and_lies_beside_what_was_put_in(folder, street):
+    shards = [s for s in PairSet(folder).of("shadow") if s.window().region.max() > 0]
+    assert shards
+    for shard in shards:
+        w = shard.window()
+        assert (w.target <= w.input).all() and shard.meta["instances"] == [len(street.actors) + 1]
+        assert (w.instance == len(street.actors) + 1).any() and (w.region[w.instance != len(street.actors) + 1] > 0.5).any()
+
+
+def test_what_is_put_back_leaves_the_photo_as_the_target(folder):
+    photos = {s.path.stem: s.window().target for s in PairSet(folder).of("clean")}
+    shards = [s for s in PairSet(folder).of("reinsert") if s.window().region.max() > 0]
+    assert shards
+    for shard in shards:
+        w = shard.window()
+        assert torch.equal(w.target, photos[shard.path.stem]) and shard.meta["tracks"] == ["veh_1"]
+        assert (w.region[torch.isin(w.instance, torch.tensor(shard.meta["instances"], dtype=torch.int16))] > 0.6).all()
+
+
+def test_depth_is_kept_beside_the_frames(folder):
+    from safetensors import safe_open
+
+    for shard in PairSet(folder).shards:
+        with safe_open(shard.path, "pt") as file:
+            depth = file.get_tensor("depth").float()
+        assert depth.shape == (shard.frames, shard.height, shard.width) and (depth > 0).all()
+        assert torch.isinf(depth).any() and torch.isfinite(depth).any()
+
+
+def test_a_kind_without_what_it_is_made_from_says_what_it_needs(street, recording, tmp_path):
+    for kind, needs in (("sparse", "refits"), ("shadow", "assets")):
+        with pytest.raises(ValueError, match=needs):
+            make_pairs(street, recording, tmp_path / kind, kinds=(kind,), config=CONFIG)
+    with pytest.raises(ValueError, match="Did you mean sparse"):
+        prepare_sources(street, recording, tmp_path, ("spars",))
+
+
+def test_kinds_may_be_added_to_a_folder(street, recording, tmp_path):
+    out = make_pairs(street, recording, tmp_path / "pairs", kinds=("clean",), cameras=["left_camera"], config=CONFIG)
+    make_pairs(street, recording, out, kinds=("isp",), cameras=["left_camera"], config=CONFIG)
+    assert {s.meta["kind"] for s in PairSet(out).shards} == {"clean", "isp"}
+
+
+def test_a_folder_of_scenes_is_one_set(folder, tmp_path):
+    (tmp_path / "one").symlink_to(folder)
+    assert len(PairSet(tmp_path).shards) == len(PairSet(folder).shards)
 
 
 def test_colour_changes_stay_on_instances(folder):

@@ -1,0 +1,105 @@
+"""A recorded clip as pairs are made of it: its photos, the scene's cameras at their moments, and exact geometry."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from recon.log import LogCamera
+from render import render_frame
+from render.frame_types import Frame
+from render.warp import visible
+from scenes.scene import Scene
+
+SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
+HELD_OUT = ("front_camera",)
+NOWHERE = 255  # stored instance where nothing stands, or one beyond what a byte numbers
+
+
+@dataclass(frozen=True)
+class PairConfig:
+    """Sizes of the clips, and what is kept away from training."""
+
+    width: int = 640
+    """Width of the stored frames in pixels; the height follows from the camera."""
+    frames: int = 6
+    """Consecutive frames of a clip."""
+    every: int = 6
+    """Frames from one clip's start to the next's."""
+    held_out: tuple[str, ...] = HELD_OUT
+    """Cameras never trained on."""
+
+
+class Clip:
+    """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there."""
+
+    def __init__(self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, rights: dict):
+        self.scene, self.start = scene, start
+        height = round(config.width * camera.height / camera.width)
+        self.indices = range(start, min(start + config.frames, len(camera)))
+        # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
+        self.cameras = [scene.camera(camera.name, int(camera.times_us[i])).resized(config.width, height) for i in self.indices]
+        self.photos = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in self.indices])
+        # Seeded by name: a clip is the same whichever others are made beside it.
+        digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()
+        self.seed = int.from_bytes(digest[:6], "little")
+        split = "held out" if camera.name in config.held_out else "train"
+        times = [c.time_us for c in self.cameras]
+        self.meta = {"split": split, "camera": camera.name, "start": start, "times_us": times, "seed": seed} | rights
+        self._geometry: dict[str, torch.Tensor] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.meta["camera"]
+
+    def photo(self, t: int) -> torch.Tensor:
+        """Photo `t` as float32 `[H, W, 3]` in 0..1."""
+        return self.photos[t].float() / 255
+
+    def render(self, scene: Scene, *outputs: str, shadows: bool = True) -> list[Frame]:
+        """What a scene shows to the clip's cameras."""
+        with torch.no_grad():
+            return [render_frame(scene, camera, outputs, shadows=shadows) for camera in self.cameras]
+
+    def geometry(self, scene: Scene | None = None) -> dict[str, torch.Tensor]:
+        """Instance, depth, flow and visibility, as stored, of a scene; of the clip's own, rendered once, where None."""
+        if scene is not None:
+            return self._geometry_of(scene)
+        if self._geometry is None:
+            self._geometry = self._geometry_of(self.scene)
+        return self._geometry
+
+    def _geometry_of(self, scene: Scene) -> dict[str, torch.Tensor]:
+        instances, depths, flows, seen, last = [], [], [], [], None
+        for t, camera in enumerate(self.cameras):
+            after = self.cameras[t + 1] if t + 1 < len(self.cameras) else None
+            wanted = ["instance", "depth"] + ["flow_prev"] * (t > 0) + ["flow_next"] * (after is not None)
+            with torch.no_grad():
+                frame = render_frame(scene, camera, tuple(wanted), self.cameras[t - 1] if t else None, after)
+            assert frame.instance is not None and frame.depth is not None
+            none = torch.full((camera.height, camera.width, 2), torch.nan)
+            flow = none if frame.flow_prev is None else frame.flow_prev
+            flows.append(flow)
+            depths.append(frame.depth)
+            instances.append(torch.where((frame.instance < 0) | (frame.instance >= NOWHERE), NOWHERE, frame.instance).to(torch.uint8))
+            both = last is not None and frame.flow_prev is not None
+            seen.append(visible(_first(flow), _first(last))[0, 0] if both and last is not None else torch.zeros(none.shape[:2]).bool())
+            last = frame.flow_next
+        return {
+            "instance": torch.stack(instances),
+            "depth": torch.stack(depths).to(torch.float16),
+            "flow": torch.stack(flows).to(torch.float16),
+            "visible": torch.stack(seen).to(torch.uint8),
+        }
+
+    def large(self) -> list[int]:
+        """Instances that cover enough of the clip to be altered."""
+        instance = self.geometry()["instance"]
+        return [int(i) for i in instance.unique() if 0 < i < NOWHERE and (instance == i).float().mean() > SMALLEST]
+
+
+def _first(flow: torch.Tensor) -> torch.Tensor:
+    return flow.permute(2, 0, 1)[None]

@@ -1,0 +1,156 @@
+"""Assets in photos: put in anywhere with and without their shadow, or back to where they were cut out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.clips import SMALLEST, Clip
+from enhance.isp import Isp, alter
+from render import rasterize, render_frame
+from render.frame import expose
+from render.frame_types import Frame
+from render.shadow import cast, shadow_casters
+from scenes.asset import Actor, Asset
+from scenes.camera import Camera
+from scenes.collide import collisions
+from scenes.gaussians import Placed
+from scenes.insert import outside_ground, standing_pose
+from scenes.match import matched
+from scenes.poses import yaw_of
+from scenes.scene import Scene
+from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.trajectory import Trajectory
+
+TRIES = 40
+NEAR, FAR = 6.0, 28.0
+"""Metres from the camera at which assets are put."""
+
+CLEAR = 3.0
+"""Metres that the recorded car keeps from them."""
+
+DARKENED = 0.02
+"""Share of the light that a pixel must lose to count as shaded."""
+
+HEM = 4
+"""Pixels around an asset that count as changed where it is put back: its edge never lies quite where it was."""
+
+
+class NoPlace(Exception):
+    """There is no free place in view."""
+
+
+def put_in(
+    clip: Clip, scene: Scene, assets: Sequence[Asset], rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Scene, dict]:
+    """The photos `[T, H, W, 3]` with one of the assets in them, without and with its shadow; the shaded region `[T, H, W]`; the scene with
+    the asset, and its place in words. `scene` says by its sky what casts the shadow. Raises NoPlace."""
+    for _ in range(TRIES):
+        asset = assets[int(rng.integers(len(assets)))]
+        actor = _somewhere(clip, scene, asset, rng)
+        if actor is None:
+            continue
+        there = replace(scene, actors=(*scene.actors, actor))
+        mine = len(there.actors)
+        if _share(there, clip.cameras[len(clip.cameras) // 2], mine) < SMALLEST:
+            continue
+        bare, shaded, region = [], [], []
+        for t, frame in enumerate(clip.render(there, "depth", "instance", "instance_alpha")):
+            picture = over_photo(clip.photo(t), frame, actor, scene)
+            light = light_left(frame, there)
+            bare.append(picture)
+            shaded.append(torch.where(light[..., None] < 1, srgb_from_linear(linear_from_srgb(picture) * light[..., None]), picture))
+            region.append(((1 - light) / DARKENED).clamp(0, 1))
+        what = {"asset": asset.label, "instances": [mine], "track": str(asset.meta.get("track", ""))}
+        return torch.stack(bare), torch.stack(shaded), torch.stack(region), there, what
+    raise NoPlace
+
+
+def _somewhere(clip: Clip, scene: Scene, asset: Asset, rng: np.random.Generator) -> Actor | None:
+    """The asset standing at a random place that the clip's middle camera sees; None where it would stand in something."""
+    camera = clip.cameras[len(clip.cameras) // 2]
+    pose = camera.world_from_cam
+    ahead = F.normalize(pose[:2, 2], dim=0)
+    distance = rng.uniform(NEAR, FAR)
+    aside = rng.uniform(-0.8, 0.8) * distance * camera.width / (2 * camera.lens.focal()[0])
+    xy = pose[:2, 3] + distance * ahead + aside * torch.stack([ahead[1], -ahead[0]])
+    path = torch.stack([c.world_from_cam[:2, 3] for c in clip.cameras])
+    if float((path - xy).norm(dim=1).min()) < CLEAR + float(asset.size[:2].norm()) / 2 or outside_ground(scene, xy) > 0:
+        return None
+    heading = float(yaw_of(scene.ego.at(camera.time_us))) + float(rng.choice([0.0, math.pi])) + rng.normal(0, 0.15)
+    stands = Trajectory(torch.tensor([camera.time_us]), standing_pose(scene, xy, heading, asset.size)[None])
+    lit = matched(asset, scene, xy)
+    actor = Actor(replace(lit, meta={**lit.meta, "inserted": True}), stands, "put_in")
+    while_seen = Trajectory(torch.tensor([c.time_us for c in clip.cameras]), torch.stack([c.world_from_cam for c in clip.cameras]))
+    return None if collisions(replace(scene, ego=while_seen), actor) else actor
+
+
+def _share(scene: Scene, camera: Camera, instance: int) -> float:
+    """The part of a view that an instance covers."""
+    with torch.no_grad():
+        frame = render_frame(scene, camera, ("instance",))
+    assert frame.instance is not None
+    return float((frame.instance == instance).float().mean())
+
+
+def over_photo(photo: torch.Tensor, frame: Frame, actor: Actor, scene: Scene) -> torch.Tensor:
+    """A photo `[H, W, 3]` with an actor over it where `frame`, with instance_alpha, says that it is seen: the last one placed."""
+    assert frame.instance_alpha is not None
+    rgb, alpha = _alone(actor, frame.camera, scene)
+    covers = frame.instance_alpha[..., -1:]
+    return torch.where(covers > 1 / 512, photo + covers * (rgb / alpha.clamp_min(1 / 512) - photo), photo).clamp(0, 1)
+
+
+def _alone(actor: Actor, camera: Camera, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    """An actor without anything around it, exposed as the camera exposes: premultiplied rgb `[H, W, 3]` and alpha `[H, W, 1]`."""
+    with torch.no_grad():
+        placed = Placed(actor.asset.gaussians, actor.trajectory.at(camera.time_us))
+        frame = rasterize(placed, camera, ("rgb", "alpha"), model=scene.model)
+    assert frame.rgb is not None and frame.alpha is not None
+    alpha = frame.alpha[..., None]
+    if camera.exposure is None:
+        return frame.rgb, alpha
+    return expose(frame.rgb / alpha.clamp_min(1 / 512), camera.exposure) * alpha, alpha
+
+
+def light_left(frame: Frame, scene: Scene) -> torch.Tensor:
+    """The part of the light `[H, W]`, 0 to 1, that the scene's inserted and edited actors leave: of a frame with depth and instance."""
+    assert frame.depth is not None
+    white = torch.ones(*frame.depth.shape, 3)
+    casters = shadow_casters(scene, frame.camera)
+    if not casters:
+        return white[..., 0]
+    return linear_from_srgb(cast(replace(frame, rgb=white), casters)[..., 0]).clamp(0, 1)
+
+
+def put_back(clip: Clip, scene: Scene, instances: Sequence[int], isp: Isp) -> tuple[torch.Tensor, torch.Tensor]:
+    """The photos `[T, H, W, 3]` with a rendering of `scene` where `instances` and their shadows are, without the shadows, and the
+    instances in other colours; and that region `[T, H, W]` in 0..1."""
+    damaged, regions = [], []
+    wanted = torch.tensor(instances, dtype=torch.int32)
+    for t, frame in enumerate(clip.render(scene, "rgb", "depth", "instance", shadows=False)):
+        assert frame.rgb is not None and frame.instance is not None
+        mine = torch.isin(frame.instance, wanted).float()
+        was = torch.isin(clip.geometry()["instance"][t].int(), wanted).float()
+        around = _grown(torch.maximum(mine, was), HEM)
+        shade = ((1 - light_left(frame, scene)) / (4 * DARKENED)).clamp(0, 1)
+        region = torch.maximum(around, shade)
+        rgb = alter(frame.rgb.clamp(0, 1).permute(2, 0, 1), _soft(mine)[None], isp).permute(1, 2, 0)
+        photo = clip.photo(t)
+        damaged.append(torch.where(region[..., None] > 0, photo + region[..., None] * (rgb - photo), photo))
+        regions.append(region)
+    return torch.stack(damaged), torch.stack(regions)
+
+
+def _soft(mask: torch.Tensor) -> torch.Tensor:
+    return F.avg_pool2d(mask[None, None], 3, 1, 1)[0, 0]
+
+
+def _grown(mask: torch.Tensor, by: int) -> torch.Tensor:
+    """A mask `[H, W]` grown by some pixels, its edge soft."""
+    return _soft(F.max_pool2d(mask[None, None], 2 * by + 1, 1, by)[0, 0])

@@ -1,0 +1,163 @@
+"""The kinds of damage that pairs are made of, a function each: from a clip to frames that are wrong, and what they should be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.clips import Clip
+from enhance.compositing import NoPlace, put_back, put_in
+from enhance.degrade import random_underfit, unfinish
+from enhance.isp import alter, random_isp
+from enhance.lighting import Illumination, random_sky, relit, smoothed, under
+from enhance.refits import Refit
+from enhance.shards import to_bytes
+from scenes.asset import Asset
+from scenes.scene import Scene
+from scenes.sky import Sky
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What damage is made from beside the scene and its photos.
+
+    early   the scene stopped early, for underfit (without any, splats are spoilt by rule instead)
+    refits  by kind the reconstructions from less (`enhance.refits`)
+    skies   HDR skies, for relight and shadow, beside made-up ones
+    own     assets cut out of the scene, by track, for reinsert
+    assets  those that may be put anywhere, for shadow
+    """
+
+    early: Sequence[Scene] = ()
+    refits: Mapping[str, Sequence[Refit]] = field(default_factory=dict)
+    skies: Sequence[Sky] = ()
+    own: Mapping[str, Asset] = field(default_factory=dict)
+    assets: Sequence[Asset] = ()
+
+
+@dataclass(frozen=True)
+class Damage:
+    """uint8 frames `[T, H, W, 3]` as they are and as they should be, the changed region `[T, H, W]` in 0..1, and what was done in words;
+    scene: what the frames show, where that is not the clip's own."""
+
+    input: torch.Tensor
+    target: torch.Tensor
+    region: torch.Tensor
+    what: dict
+    scene: Scene | None = None
+
+
+def make(kind: str, clip: Clip, sources: Sources) -> Damage:
+    """A clip with one kind of damage; the same clip's is always the same."""
+    return MAKERS[kind](clip, np.random.default_rng([clip.seed, ORDER.index(kind)]), sources)
+
+
+def _clean(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """The photos as they are: there is nothing to do."""
+    return Damage(clip.photos.clone(), clip.photos, torch.zeros(clip.photos.shape[:3]), {})
+
+
+def _underfit(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """A reconstruction stopped after 25 to 75 percent of its steps, or spoilt by rule."""
+    what: dict[str, object]
+    if sources.early and rng.random() < 0.7:
+        pick = int(rng.integers(len(sources.early)))
+        scene, what = sources.early[pick], {"underfit": "stopped early", "scene": str(sources.early[pick].meta.get("name", pick))}
+    else:
+        how = random_underfit(rng)
+        scene, what = unfinish(clip.scene, how, int(rng.integers(2**31))), {"underfit": vars(how)}
+    return _rendered(clip, scene, what)
+
+
+def _refitted(kind: str) -> Callable[[Clip, np.random.Generator, Sources], Damage]:
+    def damage(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+        """What a reconstruction from less shows of the clip's views."""
+        fair = [refit.scene for refit in sources.refits.get(kind, ()) if clip.name in refit.cameras]
+        if not fair:
+            raise ValueError(f"{kind} pairs of {clip.name} need a reconstruction from less; pass sources.refits (enhance.refits)")
+        scene = fair[int(rng.integers(len(fair)))]
+        return _rendered(clip, scene, {"scene": str(scene.meta.get("name", kind))})
+
+    return damage
+
+
+def _rendered(clip: Clip, scene: Scene, what: dict) -> Damage:
+    frames = [frame.rgb for frame in clip.render(scene, "rgb")]
+    return Damage(torch.stack([to_bytes(rgb) for rgb in frames if rgb is not None]), clip.photos, torch.ones(clip.photos.shape[:3]), what)
+
+
+def _isp(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """Instances in other colours."""
+    region, chosen = _some(clip, rng)
+    isp = random_isp(rng)
+    rgb = clip.photos.permute(0, 3, 1, 2).float() / 255
+    damaged = to_bytes(alter(rgb, region[:, None], isp).permute(0, 2, 3, 1))
+    return Damage(damaged, clip.photos, region, {"instances": chosen, "isp": vars(isp)})
+
+
+def _relight(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """Instances in the light of another sky, by the normals of their splats."""
+    region, chosen = _some(clip, rng)
+    sky, gain = random_sky(rng, sources.skies), float(2 ** rng.uniform(-0.6, 0.6))
+    damaged = clip.photos.clone()
+    if chosen:
+        before, after = Illumination.of(clip.scene), Illumination.of(under(clip.scene, sky))
+        for t, frame in enumerate(clip.render(clip.scene, "normal")):
+            assert frame.normal is not None
+            normals = smoothed(frame.normal @ frame.camera.world_from_cam[:3, :3].T.float(), (region[t] > 0).float())
+            damaged[t] = to_bytes(relit(clip.photo(t), normals, region[t], before, after, gain))
+    return Damage(damaged, clip.photos, region, {"instances": chosen, "gain": gain})
+
+
+def _shadow(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """An asset that stands in the photo without its shadow; the target has it, of the scene's own sky or of another."""
+    if not sources.assets:
+        raise ValueError("shadow pairs need assets to put in; pass sources.assets, or a databank that has some")
+    sky = random_sky(rng, sources.skies) if rng.random() < 0.5 else None
+    try:
+        bare, shaded, region, scene, what = put_in(clip, under(clip.scene, sky), sources.assets, rng)
+    except NoPlace:
+        return _clean(clip, rng, sources)
+    return Damage(to_bytes(bare), to_bytes(shaded), region, what | {"sky": "the scene's" if sky is None else "another"}, scene)
+
+
+def _reinsert(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """Extracted assets back at their own places, in other colours and without shadow, where the photo has them."""
+    known = [i for i in clip.large() if clip.scene.actors[i - 1].track in sources.own]
+    chosen = [i for i in known if rng.random() < 0.6] or known[:1]
+    if not chosen:
+        return _clean(clip, rng, sources)
+    actors = list(clip.scene.actors)
+    for i in chosen:
+        own = sources.own[actors[i - 1].track]
+        actors[i - 1] = replace(actors[i - 1], asset=replace(own, meta={**own.meta, "edited": True}))
+    isp = random_isp(rng, 0.6)
+    damaged, region = put_back(clip, replace(clip.scene, actors=tuple(actors)), chosen, isp)
+    tracks = [actors[i - 1].track for i in chosen]
+    return Damage(to_bytes(damaged), clip.photos, region, {"instances": chosen, "tracks": tracks, "isp": vars(isp)})
+
+
+def _some(clip: Clip, rng: np.random.Generator) -> tuple[torch.Tensor, list[int]]:
+    """The region `[T, H, W]` of some of the instances that are large enough, their edges soft by a pixel; and their ids."""
+    ids = clip.large()
+    chosen = [i for i in ids if rng.random() < 0.6] or ids[:1]
+    mask = torch.isin(clip.geometry()["instance"], torch.tensor(chosen, dtype=torch.uint8)).float()
+    return F.avg_pool2d(mask[:, None], 3, 1, 1)[:, 0], chosen
+
+
+MAKERS: dict[str, Callable[[Clip, np.random.Generator, Sources], Damage]] = {
+    "underfit": _underfit,
+    "isp": _isp,
+    "clean": _clean,
+    "sparse": _refitted("sparse"),
+    "cycle": _refitted("cycle"),
+    "crossref": _refitted("crossref"),
+    "relight": _relight,
+    "shadow": _shadow,
+    "reinsert": _reinsert,
+}
+ORDER = tuple(MAKERS)  # a kind's place is part of its seed: new kinds go to the end

@@ -1,0 +1,144 @@
+"""Reconstructions from less than was recorded: what they get wrong is the damage that the enhancer learns to undo.
+
+sparse    every fifth frame of every camera: views between are guessed
+cycle     pictures rendered from a path beside the recorded one: the recorded views are then what is off the path
+crossref  every other camera, by direction: each half of the rig is seen through the other half's reconstruction
+
+The poses are those of the finished scene and are not corrected again, so that what is rendered lies where the photos lie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from recon.build import assemble, begin, choose
+from recon.fit import FitConfig
+from recon.log import Log, LogCamera, Track
+from render import render_frame
+from render.progress import Progress
+from render.video import write_image
+from scenes.files import load, save
+from scenes.scene import Scene
+from scenes.usd_scene import is_scene
+
+REFITS = ("sparse", "cycle", "crossref")
+SPARSE = 5
+"""Every how many frames one is kept; cars drive some 3 metres meanwhile."""
+
+ASIDE = 1.5
+"""Metres to the left of the recorded path from which the cycle's pictures are rendered."""
+
+NEVER = 2.0
+SHORT = FitConfig(steps=1500, budget=80_000, poses_from=NEVER)
+SIZE = (480, 270)
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A scene made from less, and the cameras whose recorded views it is fair to render from it."""
+
+    scene: Scene
+    cameras: tuple[str, ...]
+
+
+def refits(
+    kind: str, scene: Scene, log: Log, folder: str | Path, config: FitConfig = SHORT, size: tuple[int, int] = SIZE
+) -> list[Refit]:
+    """The reconstructions of one of REFITS of a `scene` that was made from `log`; kept in `folder`, and read there where they are already.
+
+    A fit takes some minutes. Raises ValueError where the rig has too few cameras or frames.
+    """
+    log = as_reconstructed(log, scene)
+    made = []
+    for name, part, shown in _parts(kind, scene, log, Path(folder), size):
+        path = Path(folder) / name
+        if not is_scene(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _fit(part, path, config, size)
+        loaded = load(path)
+        assert isinstance(loaded, Scene)
+        made.append(Refit(loaded, shown))
+    return made
+
+
+def as_reconstructed(log: Log, scene: Scene) -> Log:
+    """The recording at the poses that the scene's fit corrected, with the scene's cameras only."""
+    cameras = {}
+    for name in scene.rig:
+        camera = log.camera(name)
+        poses = torch.stack([scene.camera(name, int(t)).world_from_cam for t in camera.times_us])
+        cameras[name] = replace(camera, world_from_cam=poses)
+    paths = {actor.track: actor.trajectory for actor in scene.actors}
+
+    def corrected(track: Track) -> Track:
+        path = paths.get(track.name)
+        same = path is not None and torch.equal(path.times_us, torch.from_numpy(track.times_us))
+        return replace(track, world_from_box=path.world_from_body) if same and path is not None else track
+
+    return replace(log, ego=scene.ego, cameras=cameras, tracks=tuple(map(corrected, log.tracks)), front=())
+
+
+def _parts(kind: str, scene: Scene, log: Log, folder: Path, size: tuple[int, int]) -> list[tuple[str, Log, tuple[str, ...]]]:
+    """Name, recording to fit, and cameras to render, of each reconstruction of a kind."""
+    everyone = tuple(log.cameras)
+    if kind == "sparse":
+        few = {name: thinned(camera, SPARSE) for name, camera in log.cameras.items()}
+        return [("sparse", replace(log, cameras=few), everyone)]
+    if kind == "cycle":
+        return [("cycle", rendered_aside(scene, log, folder / "cycle_views", size), everyone)]
+    halves = by_turns(log)
+    if not all(halves):
+        raise ValueError(f"crossref pairs need two cameras at least, and {log.name} has {', '.join(everyone)}; leave out that kind")
+    return [(f"crossref_{i}", replace(log, cameras={n: log.cameras[n] for n in halves[i]}), halves[1 - i]) for i in (0, 1)]
+
+
+def thinned(camera: LogCamera, every: int) -> LogCamera:
+    """Every `every`th frame of a camera."""
+    kept = slice(None, None, every)
+    return replace(camera, files=camera.files[kept], times_us=camera.times_us[kept], world_from_cam=camera.world_from_cam[kept])
+
+
+def by_turns(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The cameras in two halves: by the direction they look in, one for the one, the next for the other."""
+
+    def bearing(name: str) -> float:
+        forward = log.offsets(name)[0][:3, 2]
+        return float(torch.atan2(forward[1], forward[0]))
+
+    order = sorted(log.cameras, key=bearing)
+    return tuple(order[::2]), tuple(order[1::2])
+
+
+def rendered_aside(scene: Scene, log: Log, folder: Path, size: tuple[int, int]) -> Log:
+    """A recording of the scene from ASIDE metres to the left, its pictures rendered into `folder`."""
+    ego = scene.ego.shifted(lateral=ASIDE)
+    cameras = {}
+    with Progress("cycle views", total=sum(map(len, log.cameras.values()))) as steps:
+        for name, camera in log.cameras.items():
+            views = [scene.camera(name, int(t), ego) for t in camera.times_us]
+            files = tuple(folder / f"{name}_{i:04d}.png" for i in range(len(views)))
+            for file, view in zip(files, views, strict=True):
+                if not file.exists():
+                    folder.mkdir(parents=True, exist_ok=True)
+                    with torch.no_grad():
+                        frame = render_frame(scene, view.resized(*size))
+                    assert frame.rgb is not None
+                    write_image(file, frame.rgb)
+                steps.step()
+            lens = camera.lens.scaled(size[0] / camera.width, size[1] / camera.height)
+            poses = torch.stack([v.world_from_cam for v in views])
+            cameras[name] = replace(camera, lens=lens, width=size[0], height=size[1], files=files, world_from_cam=poses)
+    return replace(log, ego=ego, cameras=cameras)
+
+
+def _fit(log: Log, path: Path, config: FitConfig, size: tuple[int, int]) -> None:
+    names, span = choose(log, list(log.cameras))
+    start, fit = begin(log, names, span, size, config, held_out=0)
+    with Progress(f"fit {path.name}", total=config.steps) as steps:
+        while fit.step_count < config.steps:
+            fit.step()
+            steps.step(note=f"loss {fit.recent_loss:.4f}  {len(fit.splats)} splats")
+    save(assemble(fit, start, log, {"name": f"{log.name}, {path.name}"}), path)

@@ -1,0 +1,76 @@
+"""Reconstructions from less than was recorded, of the made-up street."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from made_drive import write_drive
+
+from enhance.refits import ASIDE, SHORT, SPARSE, as_reconstructed, by_turns, refits, rendered_aside, thinned
+from recon import open_log
+from recon.fit import Fit
+from render import render_frame
+from render.compare import psnr
+from scenes.poses import inverse
+
+SIZE = (96, 54)
+QUICK = replace(SHORT, steps=25, budget=4000)
+
+
+@pytest.fixture(scope="module")
+def log(street, tmp_path_factory):
+    return open_log(write_drive(tmp_path_factory.mktemp("drive") / "002", street))
+
+
+def test_every_fifth_frame_is_kept_with_its_moment(log):
+    camera = log.camera("front_camera")
+    few = thinned(camera, SPARSE)
+    assert len(few) == 2 and few.times_us.tolist() == camera.times_us[::SPARSE].tolist() and few.files == camera.files[::SPARSE]
+
+
+def test_neighbouring_cameras_fall_into_different_halves(log):
+    first, second = by_turns(log)
+    assert {*first, *second} == set(log.cameras) and len(first) == len(second) == 1
+
+
+def test_a_recording_gets_the_scenes_poses(log, street):
+    corrected = as_reconstructed(log, street)
+    for name, camera in corrected.cameras.items():
+        for pose, t in zip(camera.world_from_cam, camera.times_us.tolist(), strict=True):
+            assert torch.allclose(pose, street.camera(name, t).world_from_cam)
+
+
+def test_the_cycles_pictures_are_taken_from_beside_the_path(log, street, tmp_path):
+    aside = rendered_aside(street, as_reconstructed(log, street), tmp_path, SIZE)
+    for name, camera in aside.cameras.items():
+        there = street.camera(name, int(camera.times_us[2]))
+        body = street.ego.at(int(camera.times_us[2]))
+        moved = inverse(body)[:3, :3] @ (camera.world_from_cam[2] - there.world_from_cam)[:3, 3]
+        assert torch.allclose(moved, torch.tensor([0.0, ASIDE, 0.0], dtype=torch.float64), atol=1e-6)
+        assert camera.image(2).shape == (SIZE[1], SIZE[0], 3)
+
+
+def test_a_refit_lies_where_the_scene_lies_and_is_kept(log, street, tmp_path, monkeypatch):
+    (made,) = refits("sparse", street, log, tmp_path, QUICK, SIZE)
+    assert made.cameras == tuple(street.rig)
+    camera = street.camera("front_camera", int(street.frame_times("front_camera")[2])).resized(*SIZE)
+    assert psnr(render_frame(made.scene, camera).rgb, render_frame(street, camera).rgb) > 15
+    moved = inverse(made.scene.ego.at(camera.time_us)) @ street.ego.at(camera.time_us)
+    assert torch.allclose(moved, torch.eye(4, dtype=torch.float64), atol=0.02)  # poses were not corrected again
+    monkeypatch.setattr(Fit, "step", None)
+    assert len(refits("sparse", street, log, tmp_path, QUICK, SIZE)) == 1
+
+
+def test_each_half_of_the_rig_shows_the_other_halfs_views(log, street, tmp_path, monkeypatch):
+    monkeypatch.setattr("enhance.refits._fit", lambda part, path, config, size: _instead(street, path))
+    made = refits("crossref", street, log, tmp_path, QUICK, SIZE)
+    assert {r.cameras for r in made} == {("front_camera",), ("left_camera",)}
+    alone = replace(street, rig={"front_camera": street.rig["front_camera"]})
+    with pytest.raises(ValueError, match="two cameras"):
+        refits("crossref", alone, log, tmp_path / "alone", QUICK, SIZE)
+
+
+def _instead(street, path):
+    from scenes.files import save
+
+    save(street, path)
