@@ -76,6 +76,8 @@ class Train:
     """How long to train, as 7200s."""
     seed: int = 0
     """Seed of the first weights and of every sample."""
+    start: str | None = None
+    """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     resume: Flag = False
     """Go on from the folder's checkpoint."""
 
@@ -91,7 +93,14 @@ class Train:
             say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
             try:
                 weights = train(
-                    pairs, self.output, minutes=self.time / 60e6, seed=self.seed, resume=self.resume, progress=say, photos=self.photos
+                    pairs,
+                    self.output,
+                    minutes=self.time / 60e6,
+                    seed=self.seed,
+                    resume=self.resume,
+                    progress=say,
+                    photos=self.photos,
+                    start=self.start,
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None

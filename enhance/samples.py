@@ -11,9 +11,17 @@ from torch.nn import functional as F
 
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
-from enhance.shards import PairSet, Shard, Window
+from enhance.shards import RENDERED, PairSet, Shard, Window
 
-KIND_WEIGHTS = {"underfit": 0.6, "isp": 0.2, "clean": 0.2}
+KIND_WEIGHTS = {
+    "underfit": 0.2, "sparse": 0.1, "cycle": 0.1, "crossref": 0.05,
+    "isp": 0.13, "relight": 0.1, "shadow": 0.14, "reinsert": 0.06, "clean": 0.12,
+}  # fmt: skip
+AFRESH = ("isp", "clean")
+"""Kinds that are made of any clip's targets each time anew; of the others the stored frames are drawn."""
+PLACED = ("relight", "shadow", "reinsert")
+"""Kinds that change a part of the frame; crops look for it."""
+AIMED = 0.8  # how often
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
@@ -81,6 +89,8 @@ class Sampler:
             raise ValueError("there is nothing to train on: give pairs, photos or both")
         self.pairs, self.photos, self.seed = pairs, photos, seed
         self.shards = {kind: pairs.of(kind, "train") if pairs else [] for kind in KIND_WEIGHTS}
+        for kind in PLACED:  # where nothing could be changed, there is nothing to learn
+            self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
         if pairs and not any(self.shards.values()) and photos is None:
             raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')
 
@@ -90,7 +100,8 @@ class Sampler:
     def images(self, step: int, count: int, size: int) -> torch.Tensor:
         """Crops for the autoencoder `[count, 3, size, size]`: targets and inputs, some with other colours."""
         rng = self.rng(step)
-        windows = [self._window(rng, ("clean", "isp", "underfit")[rng.integers(3)], 1, size) for _ in range(count)]
+        kinds = [*AFRESH, *(k for k in RENDERED if self.shards[k])]
+        windows = [self._window(rng, kinds[rng.integers(len(kinds))], 1, size) for _ in range(count)]
         images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
         return torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images])
 
@@ -107,6 +118,8 @@ class Sampler:
         return Thinned(**{f.name: torch.stack([getattr(d, f.name) for d in drawn]) for f in fields(Thinned)})
 
     def _thinned(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
+        if self.shards["relight"] and rng.random() < 0.2:
+            return self._thinned_relit(rng, height, width)
         rgb, instance = self._part(rng, height, width)
         target = random_isp(rng, 0.7)(rgb) if rng.random() < 0.7 else rgb
         objects = ((instance > 0) & (instance < 255)).float()[None]
@@ -128,6 +141,17 @@ class Sampler:
             given, target, region, told = (x.flip(-1) for x in (given, target, region, told))
         return Thinned(given, target, region, told)
 
+    def _thinned_relit(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
+        """Objects in the light of another sky."""
+        shard = self.shards["relight"][rng.integers(len(self.shards["relight"]))]
+        w = shard.window(int(rng.integers(shard.frames)), 1)
+        y, x = _grid(rng, (shard.height, shard.width), height, width)
+        given, target, region, instance = (a[0][:, y, x] for a in (w.input, w.target, w.region, w.instance))
+        told = torch.maximum((region > 0.5).float(), (instance > 0).float())
+        if rng.random() >= MASK_KNOWN:
+            told = torch.full_like(told, torch.nan)
+        return Thinned(given, target, region, told)
+
     def _part(self, rng: np.random.Generator, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Evenly spaced pixels `[3, height, width]` of a picture or a large part of it, and their instances `[height, width]`."""
         stored = [s for of in self.shards.values() for s in of]
@@ -136,18 +160,12 @@ class Sampler:
             instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
         else:
             shard = stored[rng.integers(len(stored))]
-            rgb, instance = shard.frame("input" if shard.meta["kind"] == "underfit" else "target", int(rng.integers(shard.frames)))
-        zoom = 1.0 if rng.random() < 0.4 else rng.uniform(1.0, 2.5)
-        places = []
-        for side, n in zip(instance.shape, (height, width), strict=True):
-            span = (side - 1) / zoom
-            first = rng.uniform(0, side - 1 - span)
-            places.append(torch.linspace(first, first + span, n).round().long())
-        y, x = places
-        return rgb[y[:, None], x].permute(2, 0, 1).float() / 255, instance[y[:, None], x]
+            rgb, instance = shard.frame("input" if shard.meta["kind"] in RENDERED else "target", int(rng.integers(shard.frames)))
+        y, x = _grid(rng, (instance.shape[0], instance.shape[1]), height, width)
+        return rgb[y, x].permute(2, 0, 1).float() / 255, instance[y, x]
 
     def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
-        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k != "underfit" or self.shards["underfit"]]
+        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k in AFRESH or self.shards[k]]
         weights = np.array([KIND_WEIGHTS[k] for k in kinds])
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
@@ -158,11 +176,13 @@ class Sampler:
             damaged, told = alter(w.target, region, random_isp(rng)), torch.maximum((region > 0.5).float(), objects)
             if rng.random() < 0.25:
                 told = (region > 0.5).float()
-        elif kind == "underfit":
+        elif kind in RENDERED:
             damaged, region, told = w.input, torch.ones_like(w.region), objects
             if rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
                 alien = self._moving_mask(rng, w)
                 damaged, told = alter(damaged, alien, random_isp(rng)), torch.maximum((alien > 0.5).float(), objects)
+        elif kind in PLACED:
+            damaged, region, told = w.input, w.region, objects
         else:
             damaged, region = w.target, torch.zeros_like(w.region)
             told = objects if objects.any() and rng.random() < 0.5 else (self._moving_mask(rng, w) > 0.5).float()
@@ -171,14 +191,13 @@ class Sampler:
         return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
 
     def _window(self, rng: np.random.Generator, kind: str, frames: int, size: int) -> Window:
-        # Colour changes are made afresh and clean frames are targets, so any stored clip serves for those two.
-        stored = self.shards["underfit"] if kind == "underfit" else [s for of in self.shards.values() for s in of]
+        stored = [s for of in self.shards.values() for s in of] if kind in AFRESH else self.shards[kind]
         shards = [s for s in stored if s.frames >= frames]
         if not shards and self.photos is None:
             raise ValueError(f"no training clip has {frames} frames; make pairs of longer clips")
-        if self.photos is not None and (not shards or (kind != "underfit" and rng.random() < 0.4)):
+        if self.photos is not None and (not shards or (kind in AFRESH and rng.random() < 0.4)):
             return self.photos.window(rng, frames, size)
-        return _crop(rng, shards[rng.integers(len(shards))], frames, size)
+        return _crop(rng, shards[rng.integers(len(shards))], frames, size, aimed=kind in PLACED and rng.random() < AIMED)
 
     def _moving_mask(self, rng: np.random.Generator, w: Window) -> torch.Tensor:
         """A region `[T, 1, h, w]` that follows the content: instances where there are some, else a shape carried along the flow."""
@@ -196,9 +215,25 @@ class Sampler:
         return torch.cat(masks)
 
 
-def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int) -> Window:
+def _grid(rng: np.random.Generator, sides: tuple[int, int], height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows `[height, 1]` and columns `[width]` evenly over an image of `sides` or a large part of it."""
+    zoom = 1.0 if rng.random() < 0.4 else rng.uniform(1.0, 2.5)
+    places = []
+    for side, n in zip(sides, (height, width), strict=True):
+        span = (side - 1) / zoom
+        first = rng.uniform(0, side - 1 - span)
+        places.append(torch.linspace(first, first + span, n).round().long())
+    return places[0][:, None], places[1]
+
+
+def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed: bool) -> Window:
+    """A crop of a stored clip anywhere, or, when `aimed`, around some pixel of its changed region."""
     h, w = min(size, shard.height), min(size, shard.width)
     start, top, left = (int(rng.integers(n + 1)) for n in (shard.frames - frames, shard.height - h, shard.width - w))
+    changed = shard.changed(start + frames // 2).nonzero() if aimed else torch.zeros(0, 2)
+    if len(changed):
+        y, x = changed[rng.integers(len(changed))].tolist()
+        top, left = (int(np.clip(at - rng.integers(n), 0, side - n)) for at, n, side in ((y, h, shard.height), (x, w, shard.width)))
     window = shard.window(start, frames, top, left, h, w)
     if (h, w) == (size, size):
         return window

@@ -92,6 +92,13 @@ class Shard:
             visible=visible,
         )
 
+    def changed(self, index: int) -> torch.Tensor:
+        """Where a frame was damaged, bool `[H, W]`."""
+        from safetensors import safe_open
+
+        with safe_open(self.path, "pt") as file:
+            return file.get_slice("region")[index] > 127
+
     def frame(self, which: str, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         """One "input" or "target" as stored, uint8 `[H, W, 3]`, and its instances `[H, W]`."""
         from safetensors import safe_open

@@ -25,7 +25,7 @@ from enhance.past import Past
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shards import PairSet
-from enhance.weights_file import save_net
+from enhance.weights_file import BUILTIN, load_net, save_net
 from scenes.atomic import atomic_file
 
 STAGES = ("autoencoder", "colour", "enhancer")
@@ -40,6 +40,8 @@ class TrainConfig:
     """Share of the budget for the autoencoder."""
     colour: float = 0.55
     """Share of the budget for the colour network."""
+    colour_further: float = 0.4
+    """That share where trained weights are trained further, for which the autoencoder stays as it is."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
     images: int = 8
@@ -53,7 +55,7 @@ class TrainConfig:
     temporal_every: int = 4
     """Every how many steps a temporal batch comes; the others are images."""
     rate: float = 8e-4
-    """Highest learning rate."""
+    """Highest learning rate; half of it where trained weights are trained further."""
     latent: float = 0.1
     """Weight of the distance of the enhanced latent to the target's."""
     logarithm: float = 0.1
@@ -75,12 +77,13 @@ class TrainConfig:
 class _Run:
     """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
 
-    def __init__(self, config: TrainConfig, net: NetConfig, minutes: float | None, steps: int | None, seed: int):
+    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, further: bool):
         torch.manual_seed(seed)
-        self.config, self.minutes, self.steps, self.seed = config, minutes, steps, seed
+        self.config, self.minutes, self.steps, self.seed, self.further = config, minutes, steps, seed, further
         self.autoencoder = channels_last(Autoencoder())
-        self.net = channels_last(Net(net))
-        self.average = Net(net)
+        self.average = Net(net.config)
+        self.average.load_state_dict(net.state_dict())
+        self.net = channels_last(net)
         self.step = dict.fromkeys(STAGES, 0)
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.optimiser = {
@@ -115,12 +118,15 @@ class _Run:
 
     def share(self, stage: str) -> float:
         """A stage's share of the budget."""
-        c = self.config
-        return {"autoencoder": c.autoencoder, "colour": c.colour, "enhancer": 1 - c.autoencoder - c.colour}[stage]
+        first = 0.0 if self.further else self.config.autoencoder
+        colour = self.config.colour_further if self.further else self.config.colour
+        return {"autoencoder": first, "colour": colour, "enhancer": 1 - first - colour}[stage]
 
     def done(self, stage: str) -> float:
         """How much of a stage's budget is spent, from 0 to 1."""
         share = self.share(stage)
+        if share <= 0:
+            return 1.0
         if self.steps is not None:
             return min(1.0, self.step[stage] / max(share * self.steps, 1))
         return min(1.0, self.seconds[stage] / 60 / max(share * (self.minutes or 0), 1e-9))
@@ -139,6 +145,7 @@ def train(
     config: TrainConfig | None = None,
     net: NetConfig | None = None,
     save_every: float = 60.0,
+    start: str | Path | None = None,
 ) -> Path:
     """Train on pairs and further photos; returns `out/enhancer.safetensors`.
 
@@ -148,6 +155,7 @@ def train(
     photos    folders of images and videos, for the autoencoder, colour changes and clean frames
     about     written into the weights' header, beside the data's attribution
     progress  called with the share done, 0..1, and a line of words
+    start     weights to train further, "builtin" or a file; their autoencoder is kept
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
     """
@@ -162,7 +170,11 @@ def train(
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed)
     clean = pair_set.of("clean", "train") if pair_set else []
-    run = _Run(config or TrainConfig(), net or NetConfig(), minutes, steps, seed)
+    begun, origin = load_net(BUILTIN if start == "builtin" else start) if start is not None else (None, None)
+    if begun is None:
+        torch.manual_seed(seed)
+        begun = Net(net or NetConfig())
+    run = _Run(config or TrainConfig(), begun, minutes, steps, seed, further=start is not None)
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
@@ -170,11 +182,12 @@ def train(
     try:
         _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
         _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
-        run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+        if not run.further:
+            run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
         calibrate_colour(run.net, clean)
-        start = run.net.state_dict()
-        frozen = {k: v for k, v in start.items() if k.startswith((*FROZEN, "shut_colour"))}
-        run.average.load_state_dict(start if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
+        now = run.net.state_dict()
+        frozen = {k: v for k, v in now.items() if k.startswith((*FROZEN, "shut_colour"))}
+        run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
         perceptual = PatchPerceptual(run.net.encoder)
@@ -188,6 +201,7 @@ def train(
     shards = pair_set.of(split="train") if pair_set else []
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
+    data |= {"further": origin} if origin is not None else {}
     made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
     save_net(run.average, weights, {**(about or {}), **made})
     return weights
@@ -209,7 +223,7 @@ def _stage(run: _Run, name: str, step: Callable[[int], float], checkpoint: Path,
 
 def _set_rate(run: _Run, stage: str) -> None:
     """Warm up over 100 steps, then half a cosine down to a hundredth."""
-    highest = run.config.rate * (2.5 if stage == "autoencoder" else 1)
+    highest = run.config.rate * (2.5 if stage == "autoencoder" else 0.5 if run.further else 1)
     rate = highest * min(1.0, (run.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * run.done(stage)))
     for group in run.optimiser[stage].param_groups:
         group["lr"] = float(rate)

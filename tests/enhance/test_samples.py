@@ -83,3 +83,23 @@ def test_thinned_pictures_are_altered_in_their_region_alone(sampler):
         for mask, region in zip(s.mask, s.region, strict=True):
             assert torch.isnan(mask).all() or (mask >= region).all()
     assert 0 < sum(told) < len(told)
+
+
+def test_crops_look_for_the_changed_place(tmp_path):
+    from enhance.shards import PairSet, to_bytes, write_shard
+
+    target = torch.full((2, 120, 200, 3), 0.5)
+    region = torch.zeros(2, 120, 200)
+    region[:, 100:104, 180:184] = 1
+    tensors = {
+        "input": to_bytes(target + 0.2 * region[..., None]), "target": to_bytes(target), "region": to_bytes(region),
+        "instance": torch.zeros(2, 120, 200, dtype=torch.uint8), "flow": torch.zeros(2, 120, 200, 2, dtype=torch.float16),
+        "visible": torch.ones(2, 120, 200, dtype=torch.uint8), "depth": torch.ones(2, 120, 200, dtype=torch.float16),
+    }  # fmt: skip
+    for name, instances in (("some", [1]), ("none", [])):
+        meta = {"kind": "shadow", "split": "train", "instances": instances}
+        write_shard(tmp_path / "shadow" / f"{name}.safetensors", tensors, meta)
+    sampler = Sampler(PairSet(tmp_path), None, seed=0)
+    assert [s.path.stem for s in sampler.shards["shadow"]] == ["some"]
+    found = torch.cat([sampler.batch(i, 4, 1, 32, kind="shadow").region.flatten(1).amax(1) for i in range(8)])
+    assert found.mean() > 0.6  # of crops anywhere a fifteenth

@@ -34,6 +34,7 @@ def pairs(tmp_path_factory):
             "instance": region.to(torch.uint8),
             "flow": flow,
             "visible": torch.ones(3, 40, 56, dtype=torch.uint8),
+            "depth": torch.ones(3, 40, 56, dtype=torch.float16),
         }
         for i, split in enumerate(("train", "held out")):
             write_shard(folder / kind / f"{i}.safetensors", tensors, {"kind": kind, "split": split})
@@ -86,3 +87,13 @@ def test_training_undoes_a_constant_error(pairs, tmp_path):
     assert by["clean", "identity"].frame == float("inf") and by["isp", "identity"].warp_error > 0
     text = table(rows)
     assert text.count("\n") == 10 and "| clean | identity | - | equal |" in text
+
+
+def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_path):
+    first = train(pairs, tmp_path / "first", steps=6, config=QUICK, net=SMALL)
+    second = train(pairs, tmp_path / "second", steps=4, config=QUICK, start=first)
+    (before, _), (after, about) = load_net(first), load_net(second)
+    assert after.config == before.config and about["steps"]["autoencoder"] == 0 and about["further"]["seed"] == 0
+    for name, value in before.state_dict().items():
+        same = torch.equal(after.state_dict()[name], value)
+        assert same if name.startswith("encoder.") else not (same and name == "decoder.pixels.weight"), name
