@@ -7,37 +7,61 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from enhance.drift import drift, drift_text
 from enhance.enhancer import Enhancer, Memory
+from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.shards import KINDS, PairSet, Shard, Window
-from render.compare import psnr
+from enhance.weights_file import BUILTIN, load_net
+from render.compare import psnr, ssim
 from render.frame_types import Frame
-from render.warp import warp
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
 
 HIGHEST = 60.0
 """PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""
 
+SMALLEST = 200
+"""Pixels that a region must have to be measured by itself."""
+
+METHODS = ("identity", "ours", "ours + instances")
+
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one kind of damage, means over frames: PSNR in dB inside the damaged region and over the frame (at most 60, which
-    is half an 8-bit level, unless all frames are equal), warp error in 8-bit levels (mean absolute difference to the previous frame
-    moved along exact flow, on visible pixels), milliseconds a frame."""
+    """One method on one kind of damage.
+
+    clips         by clip and measure the mean over its frames, NaN where a clip has no region: "region" and "frame", PSNR in dB inside
+                  the damaged region and over the frame, at most 60 (half an 8-bit level) unless all are equal; "ssim in the region",
+                  "ssim"; "features" in the region (`feature_distance`); "warp error" in 8-bit levels along exact flow over visible
+                  pixels; "sharpness" in the region, Laplacian variance to the target's
+    milliseconds  a frame, the median
+    """
 
     kind: str
     method: str
-    region: float
-    frame: float
-    warp_error: float
+    clips: dict[str, list[float]] = field(repr=False)
     milliseconds: float
     frames: int
+
+    def mean(self, measure: str) -> float:
+        """Over the clips that have it; NaN where none has."""
+        values = [v for v in self.clips[measure] if not np.isnan(v)]
+        if not values:
+            return float("nan")
+        if measure in ("region", "frame") and not np.isinf(values).all():
+            values = [min(v, HIGHEST) for v in values]
+        return float(np.mean(values))
+
+    def gain(self, identity: Row, measure: str = "region") -> list[float]:
+        """By clip, how much higher a measure is than the identity's."""
+        both = zip(self.clips[measure], identity.clips[measure], strict=True)
+        return [min(a, HIGHEST) - min(b, HIGHEST) for a, b in both]
 
 
 def evaluate(
@@ -49,23 +73,34 @@ def evaluate(
 ) -> list[Row]:
     """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is.
 
-    For clean frames the reference is the frame itself. `limit` is the most clips of a kind. ValueError where nothing is held out.
+    For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
+    weights are measured alike. `limit` is the most clips of a kind. ValueError where nothing is held out.
     """
+    encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False)
+
+    def features(rgb: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return encoder.features(rgb)[:2]
+
     rows = []
     for kind in KINDS:
         shards = pairs.of(kind, split)[:limit]
-        for method in ("identity", "ours", "ours + instances") if shards else ():
+        for method in METHODS if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
-            rows.append(_row(kind, method, shards, enhancer))
+            rows.append(_row(kind, method, shards, enhancer, features))
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
 
 
-def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Enhancer) -> Row:
-    found: dict[str, list[float]] = defaultdict(list)
+MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
+
+
+def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Enhancer, features: Features) -> Row:
+    clips: dict[str, list[float]] = {m: [] for m in MEASURES}
+    times: list[float] = []
     for shard in shards:
+        found: dict[str, list[float]] = defaultdict(list)
         window = shard.window()
         previous: torch.Tensor | None = None
         memory: Memory | None = None
@@ -76,20 +111,36 @@ def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Enhancer) ->
                 better = window.input[t].permute(1, 2, 0)
             else:
                 better, memory = enhancer.step(frame, memory)
-            found["milliseconds"].append(1000 * (time.perf_counter() - start))
-            target = window.target[t].permute(1, 2, 0)
-            region = window.region[t, 0] > 0.5
-            if region.any():
-                found["region"].append(psnr(better, target, region))
-            found["frame"].append(psnr(better, target))
-            if previous is not None:
-                found["warp_error"] += _warp_error(better, previous, window, t)
+            times.append(1000 * (time.perf_counter() - start))
+            _measure(found, better, window, t, features)
+            error = None if previous is None else warp_error(better, previous, window.flow[t], window.visible[t])
+            if error is not None:
+                found["warp error"].append(error)
             previous = better
-    means = {k: float(np.mean(found[k])) if found[k] else float("nan") for k in ("region", "frame", "warp_error")}
-    for name in ("region", "frame"):
-        if np.isinf(means[name]) and not np.isinf(found[name]).all():
-            means[name] = float(np.minimum(found[name], HIGHEST).mean())
-    return Row(kind, method, **means, milliseconds=float(np.median(found["milliseconds"])), frames=len(found["frame"]))
+        for measure, values in clips.items():
+            values.append(_mean(found[measure], measure))
+    return Row(kind, method, clips, float(np.median(times)), len(times))
+
+
+def _measure(found: dict[str, list[float]], better: torch.Tensor, window: Window, t: int, features: Features) -> None:
+    target = window.target[t].permute(1, 2, 0)
+    region = window.region[t, 0] > 0.5
+    found["frame"].append(psnr(better, target))
+    found["ssim"].append(ssim(better, target))
+    if int(region.sum()) < SMALLEST:
+        return
+    found["region"].append(psnr(better, target, region))
+    found["ssim in the region"].append(region_ssim(better, target, region))
+    found["features"].append(feature_distance(better, target, region, features))
+    found["sharpness"].append(sharpness(better, region) / max(sharpness(target, region), 1e-9))
+
+
+def _mean(values: list[float], measure: str) -> float:
+    if not values:
+        return float("nan")
+    if measure in ("region", "frame") and not np.isinf(values).all():
+        values = [min(v, HIGHEST) for v in values]
+    return float(np.mean(values))
 
 
 def _frame(window: Window, t: int, told: bool) -> Frame:
@@ -100,25 +151,28 @@ def _frame(window: Window, t: int, told: bool) -> Frame:
     return Frame(somewhere, rgb=rgb, flow_prev=flow, instance=window.instance[t, 0] if told else None)
 
 
-def _warp_error(better: torch.Tensor, previous: torch.Tensor, window: Window, t: int) -> list[float]:
-    moved, inside = warp(previous.permute(2, 0, 1)[None], window.flow[t][None])
-    seen = (window.visible[t] * inside[0])[0] > 0.5
-    if not seen.any():
-        return []
-    return [255 * float((better - moved[0].permute(1, 2, 0)).abs().mean(-1)[seen].mean())]
-
-
 def table(rows: Sequence[Row]) -> str:
-    """The rows in Markdown."""
-    lines = [
-        "| damage | method | PSNR in the region, dB | PSNR of the frame, dB | warp error, levels | ms a frame | frames |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips."""
+    measures = ["PSNR in the region", "gain, dB (95 %)", "PSNR of the frame", "SSIM region / frame", "features", "warp error", "sharpness"]
+    names = ["damage", "method", *measures, "ms"]
+    lines = [f"| {' | '.join(names)} |", "|" + len(names) * "---|"]
+    identity: dict[str, Row] = {r.kind: r for r in rows if r.method == "identity"}
     for r in rows:
-        region, frame, error = (f"{x:.2f}" if np.isfinite(x) else "equal" if x > 0 else "-" for x in (r.region, r.frame, r.warp_error))
+        cells = [_written(r.mean("region")), "-", _written(r.mean("frame"))]
+        if r.method != "identity" and r.kind in identity:
+            gains = r.gain(identity[r.kind], "region")
+            low, high = interval(gains)
+            if np.isfinite(low):
+                cells[1] = f"{np.nanmean(gains):+.2f} ({low:+.2f} to {high:+.2f})"
+        cells.append(f"{_written(r.mean('ssim in the region'), 3)} / {_written(r.mean('ssim'), 3)}")
+        cells += [_written(r.mean("features"), 4), _written(r.mean("warp error")), _written(r.mean("sharpness"))]
         spent = "-" if r.method == "identity" else f"{r.milliseconds:.0f}"
-        lines.append(f"| {r.kind} | {r.method} | {region} | {frame} | {error} | {spent} | {r.frames} |")
+        lines.append(f"| {r.kind} | {r.method} | {' | '.join(cells)} | {spent} |")
     return "\n".join(lines)
+
+
+def _written(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "equal" if value > 0 else "-"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,14 +182,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--weights", default="builtin", help="builtin, or a file that sidestep train wrote")
     parser.add_argument("--limit", type=int, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
+    parser.add_argument("--rollout", type=Path, help="a video that is enhanced back and forth for 500 frames: what drifts?")
     options = parser.parse_args(arguments)
     try:
-        pairs = PairSet(*options.pairs)
-        rows = evaluate(pairs, Enhancer.load(options.weights), options.split, options.limit, lambda line: print(line, file=sys.stderr))
+        pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights)
+        rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr))
+        print(table(rows))
+        if options.rollout:
+            print(drift_text(drift(enhancer, options.rollout)))
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1
-    print(table(rows))
     return 0
 
 

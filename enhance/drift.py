@@ -1,0 +1,71 @@
+"""Does a long rollout drift? A video is enhanced forwards and backwards until 500 frames are done, each with what the last ones left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.enhancer import Enhancer
+from enhance.metrics import sharpness
+from render.video import read_video
+
+FRAMES = 500
+PART = 50
+"""Frames at either end that are compared."""
+
+KEPT = 60
+"""Frames of the video that are held in memory."""
+
+WIDTH = 640
+
+
+@dataclass(frozen=True)
+class Drift:
+    """By how much the output against its input changed from the first frames to the last, in percent: mean brightness, the most of the
+    three channels' shares of it, and Laplacian variance."""
+
+    brightness: float
+    colour: float
+    sharpness: float
+
+
+def drift(enhancer: Enhancer, video: str | Path, frames: int = FRAMES) -> Drift:
+    """Of a rollout over `frames` frames of a video, as plain RGB. ValueError where the video has fewer than two."""
+    pictures = [_shrunk(rgb) for rgb, _ in zip(read_video(video), range(KEPT), strict=False)]
+    if len(pictures) < 2:
+        raise ValueError(f"{video} has fewer than two frames; give a longer video")
+    found, memory = [], None
+    everywhere = torch.ones(pictures[0].shape[:2], dtype=torch.bool)
+    for rgb in _back_and_forth(pictures, frames):
+        better, memory = enhancer.step(rgb, memory)
+        before, after = rgb.mean((0, 1)), better.mean((0, 1))
+        colour = (after / after.mean()) / (before / before.mean())
+        sharp = sharpness(better, everywhere) / max(sharpness(rgb, everywhere), 1e-9)
+        found.append([float(after.mean() / before.mean()), *colour.tolist(), sharp])
+    part = min(PART, frames // 2)
+    first, last = (np.mean(x, 0) for x in (found[:part], found[-part:]))
+    change = 100 * np.abs(last / first - 1)
+    return Drift(float(change[0]), float(change[1:4].max()), float(change[4]))
+
+
+def _back_and_forth(pictures: Sequence[torch.Tensor], frames: int) -> Iterator[torch.Tensor]:
+    n = len(pictures)
+    for i in range(frames):
+        j = i % (2 * n - 2)
+        yield pictures[j if j < n else 2 * n - 2 - j]
+
+
+def _shrunk(rgb: torch.Tensor) -> torch.Tensor:
+    h, w = rgb.shape[:2]
+    if w <= WIDTH:
+        return rgb
+    return F.interpolate(rgb.permute(2, 0, 1)[None], (round(h * WIDTH / w), WIDTH), mode="area")[0].permute(1, 2, 0).contiguous()
+
+
+def drift_text(d: Drift) -> str:
+    return f"drift over the rollout: brightness {d.brightness:.2f} %, colour {d.colour:.2f} %, sharpness {d.sharpness:.2f} %"
