@@ -89,7 +89,7 @@ class Edit:
     scene: ScenePath
     """Scene folder."""
     remove: UseAppendAction[tuple[Track, ...]] = ()
-    """An actor to remove, as veh_12."""
+    """An actor or a parked vehicle to remove, as veh_12."""
     shift: UseAppendAction[tuple[Shift, ...]] = ()
     """An actor and the metres forward and left, along its own body, that it moves by, as veh_3=0m,1.5m."""
     replace: UseAppendAction[tuple[Replacement, ...]] = ()

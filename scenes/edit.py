@@ -23,6 +23,9 @@ GHOST_FLOOR = 0.2
 GHOST_MARGIN = 0.1
 """Metres around an actor's box within which the fit left traces of it."""
 
+PARKED_FLOOR, PARKED_MARGIN = 0.08, 0.25
+"""The same of parked vehicles, which are splats of the background: they stand on the street, and lidar boxes cut them close."""
+
 
 @dataclass(frozen=True)
 class Edit:
@@ -50,10 +53,13 @@ class Edit:
 
 def check_edit(edit: Edit, scene: Scene) -> None:
     """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing."""
-    have = {a.track: a for a in scene.actors}
+    have, standing = {a.track: a for a in scene.actors}, parked(scene)
     for track in edit.tracks():
-        if track not in have:
-            raise ValueError(unknown("actor", track, str(scene.meta.get("path", scene.meta.get("name", "the scene"))), have))
+        if track not in have and track not in standing:
+            names = [*have, *standing]
+            raise ValueError(unknown("actor", track, str(scene.meta.get("path", scene.meta.get("name", "the scene"))), names))
+        if track not in have and track not in edit.remove:
+            raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):
             raise ValueError(f"{track} is removed and changed at once; say one of the two")
         if track in edit.retime and len(have[track].trajectory) == 1:
@@ -61,39 +67,48 @@ def check_edit(edit: Edit, scene: Scene) -> None:
 
 
 def edited(scene: Scene, edit: Edit) -> Scene:
-    """The scene after an edit. Traces that the background holds of the actors where they were are hidden."""
+    """The scene after an edit. Traces that the background holds of the actors where they were, and parked vehicles, are hidden."""
     check_edit(edit, scene)
     tracks = edit.tracks()
     actors = tuple(edit.apply(a, scene) if a.track in tracks else a for a in scene.actors if a.track not in edit.remove)
     splats = scene.background.gaussians
     logits = torch.where(ghosts(scene, tracks), splats.logit_opacities.new_tensor(HIDDEN), splats.logit_opacities)
-    return replace(scene, actors=actors, background=replace(scene.background, gaussians=replace(splats, logit_opacities=logits)))
+    hidden = replace(scene.background, gaussians=replace(splats, logit_opacities=logits))
+    left = [p for p in scene.meta.get("parked", []) if p["track"] not in edit.remove]
+    return replace(scene, actors=actors, background=hidden, meta={**scene.meta, **({"parked": left} if "parked" in scene.meta else {})})
+
+
+def parked(scene: Scene) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Parked vehicles that the background holds, by track: pose `[4, 4]` and size `[3]` of their boxes."""
+    entries = [p for p in scene.meta.get("parked", []) if max(p["size"]) > 0]
+    as_tensor = lambda rows: torch.tensor(rows, dtype=torch.float64)  # noqa: E731
+    return {p["track"]: (as_tensor(p["world_from_box"]), as_tensor(p["size"])) for p in entries}
 
 
 def ghosts(scene: Scene, tracks: Iterable[str]) -> torch.Tensor:
-    """Mask `[N]` of background splats inside a box that these actors moved through: nothing else can have stood there.
+    """Mask `[N]` of background splats inside a box that these actors moved through, or in which these vehicles are parked.
 
-    What a fit paints into the background of a mover that its box did not quite explain; seen once the actor has gone.
+    Nothing else can have stood where an actor went: a fit paints into the background what the actor's box did not quite explain of it,
+    and that is seen once the actor has gone.
     """
     splats, world_from_local = scene.background.gaussians, scene.background.world_from_local
-    found = torch.zeros(len(splats), dtype=torch.bool)
+    found, standing = torch.zeros(len(splats), dtype=torch.bool), parked(scene)
     tracks = set(tracks)
     for actor in (a for a in scene.actors if a.track in tracks):
-        found |= _swept(splats, world_from_local, actor)
+        for pose in _dense(actor.trajectory, float(actor.asset.size[0]) / 2):
+            _mark(found, splats, inverse(pose) @ world_from_local, actor.asset.size, GHOST_FLOOR, GHOST_MARGIN)
+    for pose, size in (box for track, box in standing.items() if track in tracks):
+        _mark(found, splats, inverse(pose) @ world_from_local, size, PARKED_FLOOR, PARKED_MARGIN)
     return found
 
 
-def _swept(splats: Gaussians, world_from_local: torch.Tensor, actor: Actor) -> torch.Tensor:
-    half = actor.asset.size[:2].float() / 2 + GHOST_MARGIN
-    top = float(actor.asset.size[2]) + GHOST_MARGIN
-    inside = torch.zeros(len(splats), dtype=torch.bool)
-    for pose in _dense(actor.trajectory, float(actor.asset.size[0]) / 2):
-        box_from_local = (inverse(pose) @ world_from_local).float()
-        centre = inverse(box_from_local)[:3, 3]
-        near = ((splats.means - centre).abs().amax(1) < float(actor.asset.size.norm())).nonzero()[:, 0]
-        at = splats.means[near] @ box_from_local[:3, :3].T + box_from_local[:3, 3]
-        inside[near] |= (at[:, :2].abs() <= half).all(1) & (at[:, 2] > GHOST_FLOOR) & (at[:, 2] < top)
-    return inside
+def _mark(found: torch.Tensor, splats: Gaussians, box_from_local: torch.Tensor, size: torch.Tensor, floor: float, margin: float) -> None:
+    """Set `found` `[N]` where a splat stands in a box grown by `margin` metres, above its base by `floor`."""
+    centre = inverse(box_from_local)[:3, 3].float()
+    near = ((splats.means - centre).abs().amax(1) < float(size.norm()) + margin).nonzero()[:, 0]
+    at = splats.means[near] @ box_from_local[:3, :3].T.float() + box_from_local[:3, 3].float()
+    half = size[:2].float() / 2 + margin
+    found[near] |= (at[:, :2].abs() <= half).all(1) & (at[:, 2] > floor) & (at[:, 2] < float(size[2]) + margin)
 
 
 def _dense(path: Trajectory, step: float) -> torch.Tensor:

@@ -100,6 +100,34 @@ def test_removing_an_actor_leaves_no_ghost_and_harms_nothing_else():
     assert (means[hidden][:, 2] > 0.2).all()
 
 
+def parking() -> Scene:
+    """The street with a car of splats that the background holds, as a log's boxes tell."""
+    scene, place = busy(), translation(20.0, -7.0, 0.0)
+    splats = car().gaussians
+    background = Gaussians.cat([scene.background.gaussians, replace(splats, means=splats.means + place[:3, 3].float())])
+    entry = {"track": "veh_7", "label": "car", "size": car().size.tolist(), "world_from_box": place.tolist()}
+    return replace(scene, background=replace(scene.background, gaussians=background), meta={**scene.meta, "parked": [entry]})
+
+
+def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path):
+    scene = parking()
+    save(scene, tmp_path / "s1")
+    add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(remove=("veh_7",)), {})
+    after = load(tmp_path / "s1")
+    same(after, edited(scene, Edit(remove=("veh_7",))))
+    hidden = edited(scene, Edit(remove=("veh_7",))).background.gaussians.logit_opacities == HIDDEN
+    own = torch.arange(len(hidden)) >= len(busy().background.gaussians)
+    assert (hidden[own] | (scene.background.gaussians.means[own][:, 2] <= 0.08)).all() and not hidden[~own].any()
+    undo(tmp_path / "s1", "mine")
+    same(load(tmp_path / "s1"), scene)
+
+
+def test_a_parked_vehicle_can_only_be_removed():
+    with pytest.raises(ValueError, match="veh_7 is parked.*it can be removed, and another asset inserted"):
+        edited(parking(), Edit(shift={"veh_7": (1.0, 0.0)}))
+    assert edited(parking(), Edit(remove=("veh_7",))).meta["parked"] == []
+
+
 def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
     add_change(saved, "first", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
     add_change(saved, "second", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
