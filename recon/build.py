@@ -11,10 +11,11 @@ from pathlib import Path
 import torch
 
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit import POSE_UNITS, Fit, FitConfig, run
+from recon.fit import Fit, FitConfig, run
 from recon.frames import Frames, load_frames
 from recon.log import Log, Track
-from recon.model import MODEL, Knots, scaled, small_poses
+from recon.model import MODEL, Knots
+from recon.motion import Motion
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.start import Start, prepare
@@ -85,7 +86,7 @@ def reconstruct(
         run(fit, keep, lambda f: steps.step(note=f"loss {f.recent_loss:.4f}  {len(f.splats)} splats"))
     keep()  # the report and the writing below may be interrupted too
     scene = assemble(fit, start, log, {"options": options})
-    rows = held_out_table(scene, fit.frames)
+    rows = held_out_table(scene, fit.frames, start.rig)
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
     print(table_text(rows), file=sys.stderr)
@@ -162,24 +163,22 @@ def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
     actors = [Knots(t.trajectory()) for t in start.tracks]
     boxes = [t.size for t in start.tracks]
     trained = torch.tensor([v.time_us for v in frames.of(0)])
-    return Fit(frames, start.rig, start.splats, start.sky, start.exposures, Knots(start.ego, trained), actors, boxes, config)
+    motion = Motion(frames, start.rig, Knots(start.ego, trained), actors, boxes)
+    return Fit(frames, motion, start.splats, start.sky, start.exposures, config)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
     """The scene that a fit's present state stands for."""
     groups = [g.detach() for g in fit.splats.groups(fit.sh_count())]
-    ego = fit.ego.corrected(*POSE_UNITS["ego"])
     rig = {}
     for c, name in enumerate(fit.frames.names):
+        mount, times = fit.motion.mounted(c, [v.time_us for v in fit.frames.views if v.camera == c])
         r = start.rig[name]
-        correction = small_poses(scaled(fit.extrinsics[c].detach(), *POSE_UNITS["extrinsic"]))
-        span = [v.time_us for v in fit.frames.views if v.camera == c]
-        exposure = fit.exposures[c].detach().clone()
-        rig[name] = RigCamera(r.lens, r.width, r.height, r.body_from_cam @ correction, exposure, torch.tensor(span))
+        rig[name] = RigCamera(r.lens, r.width, r.height, mount, fit.exposures[c].detach().clone(), times)
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
-        trajectory = fit.actors[i].corrected(*POSE_UNITS["actor"])
+        trajectory = fit.motion.trajectory(i)
         meta = {**share, "track": track.name}
         actors.append(Actor(Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta), trajectory, track.name))
     parked = [
@@ -190,7 +189,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     sky = Sky(linear_from_srgb(fit.sky.detach().clamp(0, 1)))
     background = Placed(groups[0], torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
-    return Scene(background, tuple(actors), sky, ego, rig, MODEL, start.ground, meta)
+    return Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
 
 
 def middle_pose(track: Track) -> torch.Tensor:

@@ -8,24 +8,20 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 
 from recon.densify import Growth, adjusted, grow
 from recon.frames import Frames, View
 from recon.losses import PictureLoss
-from recon.model import FIELDS, Knots, Splats, draw, placed_groups, scaled, small_poses
+from recon.model import FIELDS, Splats, draw, placed_groups
+from recon.motion import REFINED, Motion
 from render.rays import world_directions
-from scenes.camera import Camera, RigCamera
-from scenes.poses import inverse
+from scenes.camera import Camera
 from scenes.sky import sample_equirect
 
 SKY_STEP = 8
 """Pixels between sky samples; between them the sky is interpolated. It is smooth, and a lookup a pixel would cost as much as the splats."""
-
-POSE_UNITS = {"ego": (1e-3, 1e-2), "extrinsic": (1e-3, 1e-3), "actor": (1e-2, 5e-2)}
-"""Radians and metres of one unit of a pose correction: the size of the errors found in recorded logs."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +40,8 @@ class FitConfig:
     """Steps between densifications."""
     grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
+    refine: tuple[str, ...] = (*REFINED, "exposures")
+    """What is corrected besides the splats and the sky: poses and clocks by kind, and the cameras' exposures against the first's."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
     dissimilarity: float = 0.2
@@ -79,48 +77,35 @@ class Fit:
     def __init__(
         self,
         frames: Frames,
-        rig: dict[str, RigCamera],
+        motion: Motion,
         splats: Splats,
         sky: torch.Tensor,
         exposures: torch.Tensor,
-        ego: Knots,
-        actors: list[Knots],
-        boxes: list[np.ndarray],
         config: FitConfig,
     ):
-        self.frames, self.rig, self.config = frames, rig, config
+        self.frames, self.motion, self.config = frames, motion, config
         self.splats, self.sky, self.exposures = splats, sky, exposures
-        self.ego, self.actors, self.boxes = ego, actors, boxes
-        self.extrinsics = torch.zeros(len(frames.names), 6)
         self.step_count = 0
         self.training = frames.training()
         self.generator = torch.Generator().manual_seed(config.seed)
         self.growth = Growth.none(len(splats))
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
-        self._tabulate()
+        self._weights = self._chances()
         self._optimise()
 
-    def _tabulate(self) -> None:
-        """Uncorrected poses of the body and of every actor at every view's time, and how often a view is drawn."""
-        views = self.frames.views
-        times = np.array([v.time_us for v in views])
-        self._row = {(v.camera, v.index): i for i, v in enumerate(views)}
-        self._body = self.ego.base(times)
-        self._boxes = [knots.base(times) for knots in self.actors]
-        self._covers = np.array([[k.trajectory.covers(t) for k in self.actors] for t in times]).reshape(len(times), len(self.actors))
-        drawn = [self._row[v.camera, v.index] for v in self.training]
-        before, after = (self.ego.base(times + d)[0][:, :3, 3] for d in (-50_000, 50_000))
-        moving = ((after - before).norm(dim=1) > 0.05)[drawn]
-        self._weights = torch.where(moving, 1.0, self.config.still_weight)
+    def _chances(self) -> torch.Tensor:
+        """How often each training view is drawn: less while the car stands."""
+        drawn = [self.motion.row[v.camera, v.index] for v in self.training]
+        return torch.where(self.motion.speeds()[drawn] > 0.5, 1.0, self.config.still_weight)
 
     def _optimise(self) -> None:
         """Optimisers over the present tensors. The splats' own is made anew whenever their number changes; its moments are carried over."""
-        poses = [self.extrinsics, self.ego.deltas, *(a.deltas for a in self.actors)]
-        for tensor in [*self.splats.fields.values(), self.sky, self.exposures, *poses]:
+        poses, exposures = self.motion.parameters(self.config.refine), [self.exposures] * ("exposures" in self.config.refine)
+        for tensor in [*self.splats.fields.values(), self.sky, *exposures, *poses]:
             tensor.requires_grad_(True)
         self.splat_adam = adam([{"params": [self.splats.fields[k]], "lr": RATES[k]} for k in FIELDS], eps=1e-15)
-        self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": [self.exposures], "lr": 5e-4}], eps=1e-12)
+        self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": exposures, "lr": 5e-4}], eps=1e-12)
         self.pose_adam = adam([{"params": poses, "lr": 0.03}], eps=1e-12)
 
     @property
@@ -141,7 +126,7 @@ class Fit:
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
             self._grow()
         view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
-        camera = self.camera(view).resized(*self._size(self.shrink()))
+        camera = self.motion.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
         rgb, alpha = self.render(view, camera)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
@@ -149,8 +134,7 @@ class Fit:
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if self.step_count % ASIDE_EVERY == 0:
             haze = haze + SOLID_WEIGHT * self._gaps_aside(view, camera)
-        regular = 1e-4 * self.ego.unrest() + sum(1e-4 * a.unrest() for a in self.actors)
-        (loss + haze + regular + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        (loss + haze + self.motion.unrest() + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self._follow()
         self.step_count += 1
         value = float(loss.detach())
@@ -159,38 +143,11 @@ class Fit:
 
     def render(self, view: View, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
         """Picture `[H, W, 3]` and alpha of a view by the present state, exposed as its camera exposes."""
-        placed = placed_groups(self.splats.groups(self.sh_count()), self._actor_poses(view, camera))
-        rgb, alpha = draw(placed, camera, "rgb", "alpha")
+        placed = placed_groups(self.splats.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        rgb, alpha = draw(self.motion.as_read(placed, view, camera), camera, "rgb", "alpha")
         rgb = rgb + (1 - alpha)[..., None] * self._sky_behind(camera)
         exposure = self.exposures[view.camera]
         return rgb @ exposure[:, :3].T + exposure[:, 3], alpha
-
-    def camera(self, view: View) -> Camera:
-        """The view's camera at its corrected pose."""
-        poses, knots, shares = self._body
-        row = self._row[view.camera, view.index]
-        rig = self.rig[self.frames.names[view.camera]]
-        rotation, metres = POSE_UNITS["ego"]
-        body = poses[row] @ small_poses(scaled(self.ego.correction(knots[row], shares[row]), rotation, metres))
-        pose = body @ rig.body_from_cam @ small_poses(scaled(self.extrinsics[view.camera], *POSE_UNITS["extrinsic"]))
-        return Camera(rig.lens, rig.width, rig.height, pose, time_us=view.time_us)
-
-    def _actor_poses(self, view: View, camera: Camera) -> dict[int, torch.Tensor]:
-        """Poses by group of the actors that may be in view."""
-        row = self._row[view.camera, view.index]
-        from_world = inverse(camera.world_from_cam.detach())
-        near, deltas = [], []
-        for i in np.flatnonzero(self._covers[row]):
-            poses, knots, shares = self._boxes[i]
-            x, _, z = (from_world @ poses[row])[:3, 3].tolist()
-            radius = float(np.linalg.norm(self.boxes[i]))
-            if z > -radius and abs(x) - radius * 1.5 < max(z, 0) * camera.width / (1.6 * camera.lens.focal()[0]) + radius:
-                near.append(i)
-                deltas.append(self.actors[i].correction(knots[row], shares[row]))
-        if not near:
-            return {}
-        moved = small_poses(scaled(torch.stack(deltas), *POSE_UNITS["actor"]))
-        return {int(i) + 1: self._boxes[i][0][row] @ m for i, m in zip(near, moved, strict=True)}
 
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
@@ -200,11 +157,10 @@ class Fit:
     def _gaps_aside(self, view: View, camera: Camera) -> torch.Tensor:
         """Mean of 1 - alpha below the horizon, of a small picture taken up to `ASIDE` metres to the left or right of a view."""
         metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
-        left = self._body[0][self._row[view.camera, view.index]][:3, 1]
         pose = camera.world_from_cam.detach().clone()
-        pose[:3, 3] += metres * left
+        pose[:3, 3] += metres * self.motion.left(view)
         small = replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
-        placed = placed_groups(self.splats.groups(self.sh_count()), self._actor_poses(view, small))
+        placed = placed_groups(self.splats.groups(self.sh_count()), self.motion.actor_poses(view, small))
         (alpha,) = draw(placed, small, "alpha")
         return ((1 - alpha) * (world_directions(small)[..., 2] < HORIZON)).mean()
 
@@ -226,7 +182,7 @@ class Fit:
     def _target(self, view: View, shrink: int) -> torch.Tensor:
         if shrink == 1:
             return view.image.float() / 255
-        key = (shrink, self._row[view.camera, view.index])
+        key = (shrink, self.motion.row[view.camera, view.index])
         if key not in self._pyramid:
             width, height = self._size(shrink)
             small = F.interpolate(view.image.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].permute(1, 2, 0)
@@ -276,7 +232,7 @@ class Fit:
         moments = {k: self.splat_adam.state.get(self.splats.fields[k], {}) for k in FIELDS}
         steps = {k: m.get("step") for k, m in moments.items()}
         pairs = {k: (m.get("exp_avg"), m.get("exp_avg_sq")) for k, m in moments.items()}
-        self.splats, carried = grow(self.splats, pairs, self.growth, self.config.budget, left, self.boxes)
+        self.splats, carried = grow(self.splats, pairs, self.growth, self.config.budget, left, self.motion.boxes)
         self.growth = Growth.none(len(self.splats))
         for tensor in self.splats.fields.values():
             tensor.requires_grad_(True)
@@ -296,9 +252,7 @@ class Fit:
             "growth": self.growth.tensors(),
             "sky": self.sky.detach(),
             "exposures": self.exposures.detach(),
-            "extrinsics": self.extrinsics.detach(),
-            "ego": self.ego.deltas.detach(),
-            "actors": [a.deltas.detach() for a in self.actors],
+            "motion": self.motion.tensors(),
             "adam": [o.state_dict() for o in (self.splat_adam, self.rest_adam, self.pose_adam)],
             "generator": self.generator.get_state(),
             "step": self.step_count,
@@ -309,10 +263,8 @@ class Fit:
         """Go on from `tensors()` of another run: the same steps follow as would have followed there."""
         self.splats = Splats(state["fields"], state["sizes"], state["reach"])
         self.growth = Growth(**state["growth"])
-        self.sky, self.exposures, self.extrinsics = state["sky"], state["exposures"], state["extrinsics"]
-        self.ego.deltas = state["ego"]
-        for knots, deltas in zip(self.actors, state["actors"], strict=True):
-            knots.deltas = deltas
+        self.sky, self.exposures = state["sky"], state["exposures"]
+        self.motion.restore(state["motion"])
         self._optimise()
         for optimiser, saved in zip((self.splat_adam, self.rest_adam, self.pose_adam), state["adam"], strict=True):
             optimiser.load_state_dict(saved)

@@ -30,7 +30,11 @@ class Packed:
 
 @dataclass(frozen=True)
 class LogCamera:
-    """A camera of the log: lens and native size, and per frame its file, time (us) and pose `world_from_cam` `[F, 4, 4]`."""
+    """A camera of the log: lens and native size, and per frame its file, time (us) and pose `world_from_cam` `[F, 4, 4]` at that time.
+
+    shutter "rows" or "columns": they are read one after the other, from top (left) to bottom (right) within `readout_us`, the middle one at
+    the frame's time; the other way round where `readout_us` is negative.
+    """
 
     name: str
     lens: Lens
@@ -39,6 +43,8 @@ class LogCamera:
     files: tuple[Path | Packed, ...]
     times_us: torch.Tensor
     world_from_cam: torch.Tensor
+    shutter: str = "global"
+    readout_us: int = 0
 
     def __len__(self) -> int:
         return len(self.files)
@@ -143,7 +149,9 @@ class Log:
         for name in names or list(self.cameras):
             cam = self.camera(name)
             lens = cam.lens.scaled(width / cam.width, height / cam.height)
-            rig[name] = RigCamera(lens, width, height, mean_pose(self.offsets(name)), times_us=cam.times_us)
+            began = cam.times_us - cam.readout_us // 2
+            mount = mean_pose(self.offsets(name))
+            rig[name] = RigCamera(lens, width, height, mount, times_us=began, shutter=cam.shutter, readout_us=cam.readout_us)
         return rig
 
     def offsets(self, name: str) -> torch.Tensor:

@@ -36,6 +36,9 @@ LABELS = {
     "Cones": "cone",
 }
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+READOUT_US, MIDDLE_US = 30_000, -10_000
+"""How long an image is read out, and its middle row against its stamp. PandaSet does not say; SplatAD (Hess et al. 2025) takes these."""
+
 PICKLES = (".pkl.gz", ".pkl")
 FRONT = ("front_camera", "front_left_camera", "front_right_camera")
 
@@ -112,7 +115,14 @@ def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
         pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
     except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
-    return LogCamera(folder.name, pinhole, width, height, files, torch.from_numpy(times_us), home @ poses)
+    return LogCamera(folder.name, pinhole, width, height, files, *_middles(times_us, home @ poses), "rows", READOUT_US)
+
+
+def _middles(times_us: np.ndarray, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Times and poses of the images' middle rows, of those at the stamps."""
+    path = lengthened(times_us, poses)
+    middle = times_us + MIDDLE_US
+    return torch.from_numpy(middle), torch.stack([path.at(t) for t in middle.tolist()])
 
 
 def _pickle(folder: Path, index: int) -> Path | None:

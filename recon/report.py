@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from recon.frames import Frames, View
+from recon.shutter import as_read
 from render import render_frame
 from render.compare import psnr, ssim
+from scenes.camera import Camera, RigCamera
+from scenes.gaussians import Gaussians
+from scenes.poses import inverse
 from scenes.scene import Scene
 
 DRIVING = 0.5
 """Metres a second above which the car counts as driving: while it stands, nearly the same picture has been trained on."""
 
 
-def held_out_table(scene: Scene, frames: Frames) -> list[dict]:
+def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> list[dict]:
     """A row a camera, all held-out frames and those while driving: PSNR and SSIM of the scene and of the mean training image.
+
+    rig: the log's cameras, which say how the photos' rows were read; the scene's take all at once, and are drawn here as those were.
 
     Rows: camera, frames ("0-72" or "driving"), count, psnr, ssim, mean_psnr, mean_ssim; figures are means over frames.
     """
@@ -22,15 +30,39 @@ def held_out_table(scene: Scene, frames: Frames) -> list[dict]:
     for c, name in enumerate(frames.names):
         training = frames.of(c)
         mean = torch.stack([v.image for v in training]).sum(0, dtype=torch.int32).float() / (255 * len(training))
+        began = dict(zip([v.index for v in frames.views if v.camera == c], scene.frame_times(name).tolist(), strict=True))
         scored = []
         for view in frames.of(c, held_out=True):
             recorded = view.image.float() / 255
             with torch.no_grad():
-                rgb = render_frame(scene, scene.camera(name, view.time_us)).rgb
+                camera = scene.camera(name, began[view.index])
+                rgb = render_frame(read_out(scene, camera, rig[name]), camera).rgb
             assert rgb is not None
             scored.append((view, psnr(rgb, recorded), ssim(rgb, recorded), psnr(mean, recorded), ssim(mean, recorded)))
         rows += [_row(name, "all", scored), _row(name, "driving", [s for s in scored if _driving(scene, s[0])])]
     return [r for r in rows if r is not None]
+
+
+def read_out(scene: Scene, camera: Camera, rig: RigCamera) -> Scene:
+    """The scene that a global shutter sees as `rig`'s shutter sees this one, the middle of its readout being the camera's moment."""
+    if not rig.readout_us:
+        return scene
+    first, last = (camera.time_us + sign * rig.readout_us // 2 for sign in (-1, 1))
+    mount = inverse(scene.ego.at(camera.time_us)) @ camera.world_from_cam
+    backs = [inverse(scene.ego.near(t) @ mount) for t in (first, last)]
+
+    def moved(splats: Gaussians, poses: list[torch.Tensor]) -> Gaussians:
+        return as_read(splats, backs[0] @ poses[0], backs[1] @ poses[1], camera, rig.shutter)
+
+    still = scene.background.world_from_local
+    actors = [
+        replace(a, asset=replace(a.asset, gaussians=moved(a.asset.gaussians, [a.trajectory.near(t) for t in (first, last)])))
+        if a.trajectory.covers(camera.time_us)
+        else a
+        for a in scene.actors
+    ]
+    background = replace(scene.background, gaussians=moved(scene.background.gaussians, [still, still]))
+    return replace(scene, background=background, actors=tuple(actors))
 
 
 def _driving(scene: Scene, view: View) -> bool:

@@ -1,6 +1,7 @@
-"""The made-up street as a recorded drive in PandaSet's layout: rendered images, sampled sweeps, pickled cuboids."""
+"""The made-up street as a recorded drive in PandaSet's layout: images read out row by row, sampled sweeps, pickled cuboids."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 from street import START_US, STEP_US
 
-from recon.pandaset import LIDAR_FROM_BODY
+from recon.pandaset import LIDAR_FROM_BODY, MIDDLE_US, READOUT_US
 from render import render_frame
 from scenes.poses import inverse, quat_from_matrix, yaw_of
 
@@ -28,14 +29,15 @@ def write_drive(folder: Path, street, width=96, height=54) -> Path:
     for name in street.rig:
         camera_folder = folder / "camera" / name
         camera_folder.mkdir(parents=True)
-        times = street.frame_times(name).tolist()
+        times = [t - MIDDLE_US for t in street.frame_times(name).tolist()]
+        rolling = replace(street.rig[name], shutter="rows", readout_us=READOUT_US).resized(width, height)
         poses = []
         for i, t in enumerate(times):
-            camera = street.camera(name, t).resized(width, height)
+            camera = rolling.along(street.ego, t + MIDDLE_US - READOUT_US // 2)
             with torch.no_grad():
                 rgb = render_frame(street, camera).rgb
             Image.fromarray((rgb.clamp(0, 1) * 255).round().byte().numpy()).save(camera_folder / f"{i:02d}.jpg", quality=95)
-            poses.append(_pose(camera.world_from_cam))
+            poses.append(_pose(street.camera(name, t).world_from_cam))
         lens = camera.lens
         _write(camera_folder / "intrinsics.json", {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy})
         _write(camera_folder / "poses.json", poses)

@@ -1,0 +1,36 @@
+"""Pictures whose rows were read one after the other, drawn at one go: each splat stands where it was when its row was read.
+
+After SplatAD (Hess et al. 2025, section 3.3), which moves projected splats by their speed in the image; here their centres move in
+space, so that any rasterizer draws them. A shutter of 30 ms turns or deforms no splat by as much as can be told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from scenes.camera import Camera
+from scenes.gaussians import Gaussians
+
+NEAR = 0.2
+"""Metres in front of the camera within which nothing is moved."""
+
+
+def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> Gaussians:
+    """Splats where they were when their row was read, if the middle row's moment is drawn. How far they move counts as given: nothing
+    is differentiated through it.
+
+    first, last: cam_from_local `[4, 4]` when the first and the last row (column) of `camera` is read.
+    """
+    middle, travel = (0.5 * (first + last)).float(), (last - first).float()
+    with torch.no_grad():
+        seen = splats.means @ middle[:3, :3].T + middle[:3, 3]
+        ahead = seen[:, 2:] > NEAR
+        axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
+        share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
+        # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
+        share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
+        local = middle[:3, :3].T @ travel[:3]
+        shift = share * (splats.means @ local[:, :3].T + local[:, 3])
+    return replace(splats, means=splats.means + shift)
