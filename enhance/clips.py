@@ -17,6 +17,7 @@ from scenes.scene import Scene
 SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
 HELD_OUT = ("front_camera",)
 NOWHERE = 255  # stored instance where nothing stands, or one beyond what a byte numbers
+CLOCKS_DIFFER = 20_000  # microseconds at most between a log's and a scene's time of one picture: far less than from picture to picture
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,13 @@ class PairConfig:
     """Cameras never trained on."""
 
 
+def scene_time(scene: Scene, camera: str, time_us: int) -> int:
+    """When a camera took the picture that its log has at a time, by the scene's clock, which reconstruction corrects by milliseconds."""
+    known = scene.frame_times(camera)
+    nearest = int(known[(known - time_us).abs().argmin()])
+    return nearest if abs(nearest - time_us) <= CLOCKS_DIFFER else time_us
+
+
 class Clip:
     """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there."""
 
@@ -41,7 +49,8 @@ class Clip:
         height = round(config.width * camera.height / camera.width)
         self.indices = range(start, min(start + config.frames, len(camera)))
         # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
-        self.cameras = [scene.camera(camera.name, int(camera.times_us[i])).resized(config.width, height) for i in self.indices]
+        times = [scene_time(scene, camera.name, int(camera.times_us[i])) for i in self.indices]
+        self.cameras = [scene.camera(camera.name, t).resized(config.width, height) for t in times]
         self.photos = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in self.indices])
         # Seeded by name: a clip is the same whichever others are made beside it.
         digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()

@@ -56,8 +56,9 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
 def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool = False) -> None:
     """Keep an edit of the actors of `scene`, as loaded from the folder `path`, as the layer edits/<name>.usda.
 
-    A removed actor becomes inactive, and the splats of a removed parked vehicle transparent; another one's path and asset are outweighed; `edited` in their asset's meta names the edit.
-    An edit stands on what it found: of two that change the same actor, the later one counts. Raises as `add_edit` and `check_edit`.
+    A removed actor becomes inactive, and the splats of a removed parked vehicle transparent; another one's path and asset are outweighed;
+    `edited` in their asset's meta names the edit. An edit stands on what it found: of two that change the same actor, the later one counts.
+    Raises as `add_edit` and `check_edit`.
     """
     path = Path(path)
     check_edit(edit, scene)
