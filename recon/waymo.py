@@ -29,6 +29,8 @@ FRONT = ("front", "front_left", "front_right")
 OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 IMAGE = "[CameraImageComponent].image"
 WHEN = "key.frame_timestamp_micros"
+SHUTTERS = {1: ("rows", 1), 2: ("columns", 1), 3: ("rows", -1), 4: ("columns", -1)}
+"""How an image is read out and which way, by the data set's number of the direction; others take all at once."""
 LENS = tuple(f"[CameraCalibrationComponent].intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
 BOX = tuple(f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading"))
 
@@ -54,7 +56,7 @@ def read_waymo(path: Path) -> Log:
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())
     ego = lengthened(times, home @ bodies)
-    cameras = _cameras(component, home)
+    cameras = _cameras(component, home, ego)
     meta: dict = {
         "name": f"waymo-{segment}", "source": f"Waymo Open Dataset segment {segment}", "licence": "Waymo Dataset License Agreement",
         "attribution": "Waymo Open Dataset by Waymo", "body": "vehicle frame, x forward, y left, z up", "world_origin": origin.tolist(),
@@ -83,27 +85,37 @@ def _matrix(values, path: Path) -> torch.Tensor:
     return torch.from_numpy(flat.reshape(4, 4).copy())
 
 
-def _cameras(component, home: torch.Tensor) -> dict[str, LogCamera]:
+def _cameras(component, home: torch.Tensor, ego: Trajectory) -> dict[str, LogCamera]:
     where, mount = component("camera_calibration"), "[CameraCalibrationComponent].extrinsic.transform"
     width, height = (f"[CameraCalibrationComponent].{k}" for k in ("width", "height"))
-    table = read_table(where, ("key.camera_name", mount, width, height, *LENS))
+    direction = "[CameraCalibrationComponent].rolling_shutter_direction"
+    table = read_table(where, ("key.camera_name", mount, width, height, direction, *LENS))
     images = component("camera_image")
     stamp, pose = "[CameraImageComponent].pose_timestamp", "[CameraImageComponent].pose.transform"
-    taken = read_table(images, ("key.camera_name", WHEN, stamp, pose), others=False)  # without the pictures themselves
+    exposure, began, ended = (
+        f"[CameraImageComponent].rolling_shutter_params.{k}" for k in ("shutter", "camera_trigger_time", "camera_readout_done_time")
+    )
+    columns = ("key.camera_name", WHEN, stamp, pose, exposure, began, ended)
+    taken = read_table(images, columns, others=False)  # without the pictures themselves
     cameras = {}
     for row, number in enumerate(table["key.camera_name"].tolist()):
         mine = np.flatnonzero(taken["key.camera_name"] == number)
         mine = mine[np.argsort(taken[WHEN][mine])]
         if not len(mine):
             continue
-        moments = np.round(taken[stamp][mine] * 1e6).astype(np.int64)
+        stamps, middles = (np.round(t[mine] * 1e6).astype(np.int64) for t in (taken[stamp], (taken[began] + taken[ended]) / 2))
+        shutter, way = SHUTTERS.get(int(table[direction][row]), ("global", 0))
+        # a row is exposed for a while: from the middle of the first's exposure to that of the last's
+        readout = way * round(float(np.median((taken[ended] - taken[began] - taken[exposure])[mine])) * 1e6)
         name = CAMERAS.get(int(number), f"camera_{number}")
         lens = OpenCV(*(float(table[k][row]) for k in LENS))
         body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
-        poses = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine]) @ body_from_cam
+        bodies = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine])
+        moved = [inverse(ego.near(t)) @ ego.near(m) for t, m in zip(stamps.tolist(), middles.tolist(), strict=True)]
+        poses = bodies @ torch.stack(moved) @ body_from_cam
         files = tuple(Packed(f"{images}, {name} at {taken[WHEN][i]}", partial(read_cell, images, IMAGE, int(i))) for i in mine)
         size = int(table[width][row]), int(table[height][row])
-        cameras[name] = LogCamera(name, lens, *size, files, torch.from_numpy(moments), poses)
+        cameras[name] = LogCamera(name, lens, *size, files, torch.from_numpy(middles), poses, shutter, readout)
     if not cameras:
         raise ValueError(f"{images} has no picture of the cameras of {where}")
     return dict(sorted(cameras.items(), key=lambda item: (item[0] not in FRONT, item[0])))

@@ -22,8 +22,8 @@ def neutral_exposure() -> torch.Tensor:
 def check_shutter(shutter: str, readout_us: int) -> None:
     if shutter not in SHUTTERS:
         raise ValueError(f"shutter must be one of {', '.join(SHUTTERS)}, got {shutter!r}")
-    if readout_us < 0 or (readout_us and shutter == "global"):
-        raise ValueError(f'readout_us must be 0 with a global shutter and at least 0 with any, got {readout_us} with "{shutter}"')
+    if readout_us and shutter == "global":
+        raise ValueError(f"readout_us must be 0 with a global shutter, got {readout_us}")
 
 
 def check_size(width: int, height: int) -> None:
@@ -36,7 +36,7 @@ class Camera:
     """One exposure: lens, size in pixels, `world_from_cam` float64 `[4, 4]` (OpenCV axes), and time.
 
     With an end pose and shutter "rows" or "columns" the pose moves while the image is read out: from `world_from_cam` at the image's
-    top (left) edge to `world_from_cam_end` at its bottom (right) edge, `readout_us` later; `time_us` is when the readout begins.
+    top (left) edge, at `time_us`, to `world_from_cam_end` at its bottom (right) edge, `readout_us` later, or earlier if that is negative.
     `exposure` is an affine colour `[3, 4]` that `render_frame` applies last: rgb' = E[:, :3] rgb + E[:, 3].
     """
 
@@ -74,7 +74,8 @@ class Camera:
 class RigCamera:
     """A camera fixed to the body: `body_from_cam` float64 `[4, 4]`, affine exposure `[3, 4]`, and when it took its frames.
 
-    shutter "rows" or "columns": an image is read out over `readout_us` from its time on.
+    shutter "rows" or "columns": an image is read out over `readout_us` from its time on, top (left) edge first; negative: that one last, at
+    its time.
     """
 
     lens: Lens

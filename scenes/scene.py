@@ -70,5 +70,5 @@ class Scene:
 
 
 def _end(actor: Actor, time_us: int, readout_us: int) -> torch.Tensor | None:
-    moves = readout_us > 0 and len(actor.trajectory) > 1
+    moves = readout_us != 0 and len(actor.trajectory) > 1
     return actor.trajectory.near(time_us + readout_us) if moves else None

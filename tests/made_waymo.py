@@ -17,6 +17,9 @@ SEGMENT = "10017090168044687777_6380_000_6400_000"
 MAP = translation(-2120.5, 9055.3, 31.0) @ yaw(0.4)
 OPENCV_FROM_WAYMO = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 LENS = {"f_u": "fx", "f_v": "fy", "c_u": "cx", "c_v": "cy"}
+DIRECTIONS = {"front": 1, "right": 4}
+READOUT_US, EXPOSED_US, LATE_US = 24_000, 4_000, 3_000
+"""How long an image is read out, each of its rows exposed, and how much later than the pose the middle row is."""
 COLUMNS = 1800
 """Of a range image: at 25 m half a column is 4 cm."""
 
@@ -35,6 +38,7 @@ def write_waymo(folder: Path, tape: Tape) -> Path:
     rows["camera_calibration"] = [
         {"key.camera_name": NUMBERS[name], **{f"[CameraCalibrationComponent].intrinsic.{k}": v for k, v in intrinsic.items()},
          "[CameraCalibrationComponent].extrinsic.transform": (pose.numpy() @ OPENCV_FROM_WAYMO).ravel().tolist(),
+         "[CameraCalibrationComponent].rolling_shutter_direction": DIRECTIONS[name],
          "[CameraCalibrationComponent].width": SIZE[0], "[CameraCalibrationComponent].height": SIZE[1]}
         for name, pose in tape.cameras.items()
     ]  # fmt: skip
@@ -53,8 +57,9 @@ def write_waymo(folder: Path, tape: Tape) -> Path:
             Image.fromarray(tape.image(name, t + 10_000 * number)).save(packed, "JPEG", quality=95)
             rows["camera_image"].append(
                 {**key, "key.camera_name": number, "[CameraImageComponent].image": packed.getvalue(),
-                 "[CameraImageComponent].pose_timestamp": (t + 10_000 * number) / 1e6,
-                 "[CameraImageComponent].pose.transform": (MAP @ tape.ego.near(t + 10_000 * number)).numpy().ravel().tolist()}
+                 "[CameraImageComponent].pose_timestamp": (t + 10_000 * number - LATE_US) / 1e6,
+                 **{f"[CameraImageComponent].rolling_shutter_params.{k}": v for k, v in _shutter(t + 10_000 * number).items()},
+                 "[CameraImageComponent].pose.transform": (MAP @ tape.ego.near(t + 10_000 * number - LATE_US)).numpy().ravel().tolist()}
             )  # fmt: skip
         for uid, box_pose, size in (("mover", tape.mover(t), MOVER), ("parked", tape.parked(), PARKED)):
             local = inverse(tape.ego.at(t)) @ box_pose @ translation(0.0, 0.0, size[2] / 2)
@@ -70,6 +75,13 @@ def write_waymo(folder: Path, tape: Tape) -> Path:
         (folder / kind).mkdir(parents=True)
         pd.DataFrame(made).to_parquet(folder / kind / f"{SEGMENT}.parquet", row_group_size=4)
     return folder
+
+
+def _shutter(middle_us: int) -> dict[str, float]:
+    half = (READOUT_US + EXPOSED_US) / 2
+    return {
+        "shutter": EXPOSED_US / 1e6, "camera_trigger_time": (middle_us - half) / 1e6, "camera_readout_done_time": (middle_us + half) / 1e6,
+    }  # fmt: skip
 
 
 def _flat(name: str, image: np.ndarray) -> dict:
