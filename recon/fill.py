@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from recon.frames import View
 from recon.seed import Cloud
+from recon.sweep import swept_depth
 from scenes.camera import Camera
 
 FAR = 250.0
@@ -55,12 +56,13 @@ class SkyPicture:
 
 
 def unexplained(
-    view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray, floor: float
-) -> tuple[Cloud, np.ndarray]:
+    view: View, camera: Camera, alpha: np.ndarray, depth: np.ndarray, sky: np.ndarray, gain: np.ndarray, floor: float,
+    others: list[tuple[View, Camera]],
+) -> tuple[Cloud, np.ndarray]:  # fmt: skip
     """World points with colours for pixels that neither splats (`alpha` `[H, W]`) nor sky explain, and their widths in metres.
 
-    One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`;
-    never under the ground at height `floor`.
+    One a `STEP` x `STEP` block, at the depth (`depth` `[H, W]`, z) of the nearest explained pixel below in the column, or `FAR`, or
+    farther where the `others`, views from elsewhere, say so; never under the ground at height `floor`.
     """
     half = STEP // 2
     rows, columns = np.mgrid[half : camera.height : STEP, half : camera.width : STEP]
@@ -69,10 +71,11 @@ def unexplained(
     z = _from_below(np.where(solid, depth[rows, columns], np.nan))
     want = ~solid & ~blocked
     pixels = torch.from_numpy(np.stack([columns[want], rows[want]], 1) + 0.5)
+    z = swept_depth(pixels, z[want], STEP / 3, view, camera, others)
     rays = camera.lens.unproject(pixels).numpy()
     pose = camera.world_from_cam.numpy()
     down = np.minimum(rays @ pose[2, :3], -1e-3)
-    z = np.minimum(z[want], np.maximum(0.5, (floor - pose[2, 3]) / down))
+    z = np.minimum(z, np.maximum(0.5, (floor - pose[2, 3]) / down))
     local = rays * z[:, None]
     colour = ndimage.uniform_filter(view.image.numpy().astype(np.float32) / 255, (STEP, STEP, 1))[rows[want], columns[want]] / gain
     return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / camera.lens.focal()[0]

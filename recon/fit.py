@@ -61,8 +61,8 @@ SOLID_WEIGHT = 0.1
 ASIDE, ASIDE_EVERY = 3.0, 4
 """Metres to either side of the path from which the road must be closed too, and every how many steps that is looked at."""
 
-HORIZON = -0.02
-"""Rays that fall more than this (1 degree) are below the horizon."""
+HORIZON = -0.01
+"""Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
 
 FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
@@ -152,7 +152,7 @@ class Fit:
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
-        return (world_directions(small)[..., 2] < HORIZON) & ~view.sky
+        return (world_directions(small)[..., 2] < 0) & ~view.sky
 
     def _gaps_aside(self, view: View, camera: Camera) -> torch.Tensor:
         """Mean of 1 - alpha below the horizon, of a small picture taken up to `ASIDE` metres to the left or right of a view."""

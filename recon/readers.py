@@ -9,6 +9,7 @@ from recon.argoverse2 import is_argoverse2, read_argoverse2
 from recon.colmap import find_model, read_colmap
 from recon.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from recon.log import Log
+from recon.ncore import is_ncore, read_ncore
 from recon.nuscenes import is_nuscenes, read_nuscenes
 from recon.pandaset import is_pandaset, read_pandaset
 from recon.photos import is_photos, is_video, read_photos
@@ -48,6 +49,7 @@ READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Log]]] = {
     "nuScenes": (is_nuscenes, read_nuscenes),
     "Argoverse 2": (is_argoverse2, read_argoverse2),
     "Waymo": (is_waymo, read_waymo),
+    "NCore": (is_ncore, read_ncore),
     "KITTI raw": (is_kitti_raw, read_kitti_raw),
     "KITTI odometry": (is_kitti_odometry, read_kitti_odometry),
 }
@@ -58,6 +60,7 @@ LAYOUTS = {
     "nuScenes": "samples/ and v1.0-*/ (name a scene, as nuscenes/scene-0061)",
     "Argoverse 2": "city_SE3_egovehicle.feather",
     "Waymo": "camera_image/ and vehicle_pose/ (name a segment in it)",
+    "NCore": "a sequence's .json that names its component stores",
     "KITTI raw": "oxts/ and image_02/",
     "KITTI odometry": "calib.txt and times.txt",
     "COLMAP": "cameras.bin, images.bin and points3D.bin",

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from recon.actors import split_points
 from recon.carpet import carpet
+from recon.densify import LARGEST
 from recon.fill import SkyPicture, unexplained
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
@@ -19,6 +20,7 @@ from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from recon.skies import like_sky, sky_mask
 from recon.sparse import cloud_from_points
+from recon.sweep import companions
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
@@ -31,6 +33,9 @@ SEED_PART = 0.5
 SKY_HEIGHT = 256
 FILL_VIEWS = 6
 """Views a camera that are searched for what lidar does not explain."""
+
+NEAREST = 3.0
+"""Metres from the path within which nothing is seen sharper: the long lens looks ahead, and only wide ones see what is beside the car."""
 
 WIDEST_SEED = 0.012
 """Of its reach: a seed's width at most, 12 pixels."""
@@ -73,7 +78,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
-    reach = sharpest * np.maximum(path.query(cloud.xyz)[0], 1.0)
+    reach = sharpest * np.maximum(path.query(cloud.xyz)[0], NEAREST)
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
     if log.points is None:
         background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
@@ -91,7 +96,9 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
 
     report("filling what lidar missed")
     filled, sky = _fill(log, frames, background, groups, tracks, gains, sh_count, ground)
-    reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], 1.0)).float()
+    reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], NEAREST)).float()
+    # what is seeded wider than the cameras can tell (ground that none of them saw) must not be cut down to leave gaps
+    reach = torch.maximum(reach, filled.log_scales.exp().amax(1) / LARGEST)
     exposures = torch.zeros(len(frames.names), 3, 4)
     exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
     return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig)
@@ -154,8 +161,12 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
     picture = SkyPicture(SKY_HEIGHT)
     world = torch.eye(4, dtype=torch.float64)
     for c, name in enumerate(frames.names):
-        for view in spread(frames.of(c), FILL_VIEWS):
-            camera = log.camera(name).camera(view.index, frames.width, frames.height)
+        views = frames.of(c)
+        cameras = {v.index: log.camera(name).camera(v.index, frames.width, frames.height) for v in views}
+        path = torch.stack([cameras[v.index].world_from_cam[:3, 3] for v in views])
+        places = np.concatenate([[0.0], path.diff(dim=0).norm(dim=1).cumsum(0).numpy()])
+        for view in spread(views, FILL_VIEWS):
+            camera = cameras[view.index]
             placed = [Placed(background, world)]
             hidden = np.isfinite(nearest_box(camera, tracks))
             for track, splats in zip(tracks, actors, strict=True):
@@ -169,7 +180,8 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
             sky = like_sky(view.image.numpy(), sky) & ~covered
             floor = float(ground.height(camera.world_from_cam[:2, 3]))
             depth = np.where(hidden & (alpha < 0.5), np.inf, depth)
-            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c], floor)
+            others = [(v, cameras[v.index]) for v in companions(view, views, places)]
+            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c], floor, others)
             if len(cloud.xyz):
                 more = splats_from(cloud, 3 * width, sh_count, width)  # as wide as their blocks, to close the holes
                 background = Gaussians.cat([background, more])

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from recon.fill import FAR, SkyPicture, unexplained
 from recon.frames import View
 from recon.skies import like_sky, sky_mask
+from recon.sweep import companions, swept_depth
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
 
@@ -55,9 +58,32 @@ def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
     sky = np.zeros((60, 80), bool)
     sky[:25] = True
     view = View(0, 0, 0, image, False, torch.zeros(60, 80, dtype=torch.bool))
-    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3), -40.0)
+    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3), -40.0, [])
     assert len(cloud.xyz) > 10 and np.abs(cloud.xyz[:, 0] - 12).max() < 1e-6 and (cloud.xyz[:, 2] > -2).all()
     assert (width > 0).all()
-    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), -40.0)[0]
+    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), -40.0, [])[0]
     up = nothing.xyz[:, 2] > 0
     assert np.abs(nothing.xyz[up, 0] - FAR).max() < 1e-6 and np.abs(nothing.xyz[:, 2].min() + 40) < 1e-6
+
+
+def test_what_stands_far_behind_a_house_is_found_there_by_other_pictures():
+    """A striped tower 300 m away shows above a house 12 m away: from 8 m nearer it is nearly as large, which the house would not be."""
+
+    def seen_from(x: float) -> tuple[View, Camera]:
+        at = camera()
+        pose = at.world_from_cam.clone()
+        pose[0, 3] = x
+        at = replace(at, world_from_cam=pose)
+        rays = at.lens.unproject(at.pixel_centres())
+        height = -rays[..., 1] * (300 - x)
+        stripes = 128 + 100 * torch.sin(height / 3) * torch.cos(rays[..., 0] * (300 - x) / 4)
+        image = torch.where((height > 20)[..., None], stripes[..., None].expand(-1, -1, 3), torch.tensor(120.0))
+        return View(0, int(x), 0, image.clamp(0, 255).byte(), False, torch.zeros(60, 80, dtype=torch.bool)), at
+
+    views = [seen_from(x) for x in (0.0, 4.0, 8.0)]
+    found = companions(views[0][0], [v for v, _ in views], np.array([0.0, 4.0, 8.0]))
+    assert found == [views[2][0]]
+    pixels = torch.tensor([[x, 14.5] for x in np.arange(20.5, 60, 3)])
+    depth = swept_depth(pixels, np.full(len(pixels), 12.0), 2.0, *views[0], views[2:])
+    assert np.median(depth) > 90
+    assert (swept_depth(pixels, np.full(len(pixels), 12.0), 2.0, *views[0], []) == 12).all()

@@ -1,0 +1,79 @@
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_ncore import NAMES, READOUT_US, Camera, Graph, Lidar, Loader, install, write_ncore
+from made_tape import check, tape
+
+from recon import open_log
+from recon.ncore import lens_of
+from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
+
+
+@pytest.fixture(scope="module")
+def recorded(street):
+    return tape(street)
+
+
+@pytest.fixture
+def sequence(tmp_path, recorded, monkeypatch):
+    install(monkeypatch, recorded)
+    return write_ncore(tmp_path / "sequence")
+
+
+def test_a_sequence_reads_as_it_was_recorded(sequence, recorded):
+    log = open_log(sequence)
+    check(log, recorded, NAMES)
+    assert log.front == (NAMES["front"],) and len(log.tracks) == 2 and log.name == "ncore-made"
+    shutters = {name: (c.shutter, c.readout_us) for name, c in log.cameras.items()}
+    assert shutters == {NAMES["front"]: ("rows", READOUT_US), NAMES["right"]: ("rows", -READOUT_US)}
+    assert open_log(sequence / "made.json").name == log.name
+
+
+def test_every_lens_is_read_in_its_own_convention():
+    plain = {"focal_length": [900.0, 905.0], "principal_point": [640.0, 360.0]}
+
+    def model(kind: str, **more) -> SimpleNamespace:
+        return SimpleNamespace(type=lambda: kind, **plain | more)
+
+    assert lens_of(model("ideal-pinhole"), "x") == Pinhole(900.0, 905.0, 640.0, 360.0)
+    fisheye = lens_of(model("opencv-fisheye", radial_coeffs=[0.1, 0.2, 0.3, 0.4]), "x")
+    assert fisheye == Fisheye(900.0, 905.0, 640.0, 360.0, 0.1, 0.2, 0.3, 0.4)
+    bent = {"radial_coeffs": [1.0, 2, 3, 4, 5, 6], "tangential_coeffs": [0.7, 0.8], "thin_prism_coeffs": [0.1, 0.2, 0.3, 0.4]}
+    lens = lens_of(model("opencv-pinhole", **bent), "x")
+    assert isinstance(lens, OpenCV) and (lens.k2, lens.p1, lens.k3, lens.k6, lens.s4) == (2, 0.7, 3, 6, 0.4)
+    theta = {"angle_to_pixeldist_poly": np.array([0.0, 500, 1, 2, 3, 4]), "linear_cde": [1.01, 0.02, 0.03]}
+    assert lens_of(model("ftheta", **theta), "x") == FTheta(640.5, 360.5, 500, 1, 2, 3, 4, 1.01, 0.02, 0.03)
+    with pytest.raises(ValueError, match="front has the lens mirror; read are ftheta"):
+        lens_of(model("mirror"), "front")
+
+
+def test_without_the_package_the_fix_is_named(sequence, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
+    with pytest.raises(ValueError, match="pip install nvidia-ncore"):
+        open_log(sequence)
+
+
+def test_a_sequence_that_does_not_open_is_named(sequence, monkeypatch):
+    def broken(reader):
+        raise AssertionError("PosesComponent group 'default' not found")
+
+    monkeypatch.setattr(sys.modules["ncore.data.v4"], "SequenceLoaderV4", broken)
+    with pytest.raises(ValueError, match="made.json does not open as an NCore sequence .PosesComponent"):
+        open_log(sequence)
+
+
+def test_other_json_files_are_no_sequence(tmp_path):
+    (tmp_path / "notes.json").write_text('{"component_stores": 1}')
+    with pytest.raises(ValueError, match="not a known layout"):
+        open_log(tmp_path)
+
+
+def test_the_stand_in_has_the_packages_own_names():
+    compat = pytest.importorskip("ncore.impl.data.v4.compat", reason="needs nvidia-ncore: pip install nvidia-ncore")
+    loader = compat.SequenceLoaderV4
+    graph = type("", (), {"evaluate_poses": compat.PoseGraphInterpolator.evaluate_poses})
+    for ours, theirs in ((Loader, loader), (Camera, loader.CameraSensor), (Lidar, loader.LidarSensor), (Graph, graph)):
+        missing = {name for name in dir(ours) if not name.startswith("_")} - set(dir(theirs)) - {"tape", "name", "stamps"}
+        assert not missing, (ours, missing)
