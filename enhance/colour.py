@@ -64,7 +64,7 @@ class ColourNet(nn.Module):
 
 def colour_change(rgb: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
     """What the first 12 of `fields` `[B, 13, h, w]` add to `rgb` `[B, 3, H, W]`: per channel a + b x + c x^2 + d (luma - x)."""
-    coefficients = F.interpolate(fields[:, :COEFFICIENTS], rgb.shape[-2:], mode="bilinear", align_corners=False)
+    coefficients = enlarged(fields[:, :COEFFICIENTS], rgb.shape[-2:])
     a, b, c, d = coefficients.chunk(4, 1)
     luma = LUMA[0] * rgb[:, :1] + LUMA[1] * rgb[:, 1:2] + LUMA[2] * rgb[:, 2:]
     return torch.addcmul(a, rgb, b + c * rgb) + d * (luma - rgb)
@@ -72,4 +72,11 @@ def colour_change(rgb: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
 
 def altered_logits(fields: torch.Tensor, size: torch.Size | tuple[int, int]) -> torch.Tensor:
     """The last of `fields` `[B, 13, h, w]` at a picture's size: logits `[B, 1, H, W]` of where colours are altered."""
-    return F.interpolate(fields[:, COEFFICIENTS:], size, mode="bilinear", align_corners=False)
+    return enlarged(fields[:, COEFFICIENTS:], size)
+
+
+def enlarged(fields: torch.Tensor, size: torch.Size | tuple[int, int]) -> torch.Tensor:
+    """Fields `[B, C, h, w]` at a picture's `size`; as they are where they have it."""
+    if tuple(fields.shape[-2:]) == tuple(size):
+        return fields
+    return F.interpolate(fields, size, mode="bilinear", align_corners=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -10,84 +10,149 @@ from torch.nn import functional as F
 
 from enhance.net import MULTIPLE, Net
 from enhance.past import Past
-from enhance.precision import autocast, channels_last
+from enhance.precision import channels_last, has_bfloat16
+from enhance.tiles import Tiles
 from enhance.weights_file import BUILTIN, load_net
 from render.frame_types import Frame
 from scenes.checks import check_tensor
 
+LONGEST = 4
+"""Frames that needed nothing after which the past is given up: each that is followed blurs it."""
+
 
 @dataclass(frozen=True)
 class Memory:
-    """What is remembered between the frames of a clip: their past, the frames' height and width in pixels, and whether they had flow."""
+    """What is remembered between the frames of a clip.
 
-    past: Past
+    past   of the last frame that was worked on; None where that is too long ago
+    size   height and width of the frames in pixels
+    flow   whether they had flow
+    since  `[1, 2, H, W]` each: flows of the frames since then, that needed nothing and cost nothing
+    """
+
+    past: Past | None
     size: tuple[int, int]
     flow: bool
+    since: tuple[torch.Tensor, ...] = ()
 
 
 class Enhancer:
     """A trained network behind the call that every enhancer has: `better, memory = enhancer.step(frame, memory)`."""
 
-    def __init__(self, net: Net, about: dict | None = None, device: str | torch.device = "cpu"):
+    def __init__(
+        self,
+        net: Net,
+        about: dict | None = None,
+        device: str | torch.device = "cpu",
+        bfloat16: bool | None = None,
+        history: int | None = None,
+    ):
+        """bfloat16: whether to compute in it; where that is fast, if None. history: how many frames are looked back to, at most the
+        network's own number, if None."""
         self.device = torch.device(device)
         self.net = channels_last(net.eval().requires_grad_(False).to(self.device))
         self.about = about or {}
+        self.bfloat16 = has_bfloat16(self.device) if bfloat16 is None else bfloat16
+        self.history = net.config.history if history is None else history
+        if not 0 <= self.history <= net.config.history:
+            raise ValueError(f"history must be 0 to {net.config.history}, as the network was trained, got {history}")
 
     @classmethod
-    def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu") -> Enhancer:
+    def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Enhancer:
         """The shipped weights ("builtin") or those of a safetensors file. FileNotFoundError, ValueError as `load_net`."""
         net, about = load_net(BUILTIN if weights == "builtin" else weights)
-        return cls(net, about, device)
+        return cls(net, about, device, **how)
 
     @torch.inference_mode()
     def step(self, frame: Frame | torch.Tensor, memory: Memory | None = None) -> tuple[torch.Tensor, Memory]:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 
-        frame   rgb `[H, W, 3]` display-referred, of any size, or a rendered Frame: its flow_prev then moves the memory exactly
-                and its instance says where objects were put, both optional. Without flow the memory stays in place.
-        memory  of the frame before; None at the start of a clip. It is dropped where the size changed, and where a frame lacks
-                the flow that the frames before it had.
+        frame   rgb `[H, W, 3]` display-referred, of any size, or a rendered Frame: its flow_prev then moves the memory exactly,
+                its instance says where objects were put, and its need where there is anything to do at all, all three optional.
+                Without flow the memory stays in place.
+        memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
+                the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Pixels whose gate is 0 come back exactly as they went in (clamped to 0..1). Raises ValueError for values that are not finite.
+        Pixels whose gate is 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame
+        that needs nothing costs nothing. Raises ValueError for values that are not finite.
         """
-        rgb, flow, mask = _inputs(frame)
-        height, width = rgb.shape[:2]
-        if memory is not None and (memory.size != (height, width) or (memory.flow and flow is None)):
+        given = _inputs(frame)
+        height, width = given.rgb.shape[:2]
+        if memory is not None and (memory.size != (height, width) or (memory.flow and given.flow is None)):
             memory = None
-        rgb = rgb.to(self.device, torch.float32).clamp(0, 1)
+        rgb = given.rgb.to(self.device, torch.float32).clamp(0, 1)
+        flow = None
+        if given.flow is not None and memory is not None:
+            flow = _pad(given.flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan)
+        tiles = None if given.need is None else Tiles.of(given.need)
+        if tiles is not None and tiles.nothing():
+            return rgb, self._skipped(memory, (height, width), flow)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
-        mask = None if mask is None else _pad(mask.to(self.device, torch.float32)[None, None], value=0)
-        past = None if memory is None else memory.past
-        if past is not None and flow is not None:
-            past = past.moved(_pad(flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan))
-        with autocast(self.device):
-            out = self.net(padded, mask, past)
-        better = out.rgb[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
-        return better, Memory(out.past, (height, width), flow is not None)
+        mask = None if given.mask is None else _pad(given.mask.to(self.device, torch.float32)[None, None], value=0)
+        past = None if memory is None else self._brought(memory, flow, padded)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+            if tiles is None or tiles.everything():
+                out = self.net(padded, mask, past)
+                better, after = out.rgb, out.past
+            else:
+                better, after = self.net.parts(padded, mask, past, tiles)
+        better = better[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
+        return better, Memory(after, (height, width), given.flow is not None)
+
+    def _brought(self, memory: Memory, flow: torch.Tensor | None, rgb: torch.Tensor) -> Past | None:
+        """The past of a memory as it would look in the frame `rgb`."""
+        past = memory.past
+        if past is None:
+            return None
+        past = replace(past, latents=past.latents[:, : self.history], valid=past.valid[:, : self.history])
+        for step in (*memory.since, *(() if flow is None else (flow,))):
+            past = past.moved(step)
+        return past.fitting(rgb)
+
+    def _skipped(self, memory: Memory | None, size: tuple[int, int], flow: torch.Tensor | None) -> Memory:
+        """The memory after a frame that needed nothing: its flow is followed when a frame needs the past, unless that is too far back."""
+        if memory is None:
+            return Memory(None, size, flow is not None)
+        since = memory.since if flow is None else (*memory.since, flow)
+        if memory.past is None or len(since) > LONGEST:
+            return Memory(None, size, memory.flow or flow is not None)
+        return Memory(memory.past, size, memory.flow or flow is not None, since)
 
 
-def _inputs(frame: Frame | torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-    """Colour `[H, W, 3]`, flow `[H, W, 2]` and object mask `[H, W]` of a frame; the latter two None where it has none."""
+@dataclass(frozen=True)
+class _Given:
+    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, object mask and need `[H, W]`; None where it has none."""
+
+    rgb: torch.Tensor
+    flow: torch.Tensor | None = None
+    mask: torch.Tensor | None = None
+    need: torch.Tensor | None = None
+
+
+def _inputs(frame: Frame | torch.Tensor) -> _Given:
+    """What a frame gives, checked."""
     if isinstance(frame, Frame):
         if frame.rgb is None:
             raise ValueError("the frame has no rgb; render it with outputs=('rgb', ...)")
-        rgb, flow, instance = frame.rgb, frame.flow_prev, frame.instance
+        rgb, flow, instance, need = frame.rgb, frame.flow_prev, frame.instance, frame.need
     else:
-        rgb, flow, instance = frame, None, None
+        rgb, flow, instance, need = frame, None, None, None
     check_tensor("rgb", rgb, ("H", "W", 3))
     height, width = rgb.shape[:2]
     if height == 0 or width == 0:
         raise ValueError(f"rgb must hold pixels, got {width}x{height}")
     if not rgb.is_floating_point():
         raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
-    if not torch.isfinite(rgb).all():
+    if not torch.isfinite(rgb.sum()) and not torch.isfinite(rgb).all():  # a sum is read once, and finite unless some value is not
         bad = (~torch.isfinite(rgb)).any(-1).nonzero()[0].tolist()
         raise ValueError(f"rgb holds a value that is not finite at row {bad[0]}, column {bad[1]}; enhance finite frames only")
     if flow is not None:
         check_tensor("flow_prev", flow, (height, width, 2))
     if instance is not None:
         check_tensor("instance", instance, (height, width))
-    return rgb, flow, None if instance is None else instance > 0
+    if need is not None:
+        check_tensor("need", need, (height, width))
+    return _Given(rgb, flow, None if instance is None else instance > 0, need)
 
 
 def _pad(image: torch.Tensor, **how) -> torch.Tensor:

@@ -22,8 +22,9 @@ from torch.nn import functional as F
 
 from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
-from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, thin
+from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
 from enhance.past import Past
+from enhance.tiles import Tiles, coarser, sampled, within
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
@@ -49,6 +50,13 @@ class NetConfig:
     """Channels at quarter size."""
     eighth: int = 96
     """Channels at an eighth."""
+
+
+def told_of(rgb: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """A mask `[B, 1, H, W]`, NaN or None where unknown, as the network takes it: its values, and whether they are known `[B, 2, H, W]`."""
+    if mask is None:
+        return rgb.new_zeros(rgb.shape[0], 2, *rgb.shape[-2:])
+    return torch.cat([torch.nan_to_num(mask), torch.isfinite(mask).to(rgb.dtype)], 1)
 
 
 class Stem(nn.Module):
@@ -90,7 +98,7 @@ class FrameDecoder(nn.Module):
     def forward(self, tokens, latent, fields, half, quarter, eighth) -> tuple[torch.Tensor, ...]:
         """Residual `[B, 3, H, W]`, and logits of gate and blend `[B, 1, H, W]`."""
         # Normalised, because a channel that drifts far below zero here is dead for good behind the next activation.
-        fields = F.interpolate(fields, eighth.shape[-2:], mode="bilinear", align_corners=False)
+        fields = enlarged(fields, eighth.shape[-2:])
         x = self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + self.fields(fields) + eighth)
         x = self.eighth(x)
         x = self.quarter(F.pixel_shuffle(self.up_quarter(F.silu(x)), 2) + quarter)
@@ -174,15 +182,24 @@ class Net(nn.Module):
         past  of the frames before, already moved to this one; None at the start
         """
         past = past or Past.none(rgb)
-        if mask is None:
-            mask = rgb.new_full((rgb.shape[0], 1, *rgb.shape[-2:]), torch.nan)
-        known = torch.isfinite(mask).to(rgb.dtype)
-        told = torch.cat([torch.nan_to_num(mask), known], 1)
+        told = told_of(rgb, mask)
+        fields, count = self.look(rgb, told, past)
+        better, base, logits, ungated, latent = self.repair(rgb, told, past, fields)
+        after = past.followed(better, latent, fields, count, self.config.history)
+        return Enhanced(better, base, logits, ungated, latent, after)
+
+    def look(self, rgb: torch.Tensor, told: torch.Tensor, past: Past) -> tuple[torch.Tensor, torch.Tensor]:
+        """The colour fields of a whole frame, averaged with those of the past, and of how many frames."""
+        with torch.no_grad():
+            return past.averaged(self.colour(thin(rgb), thin(told)))
+
+    def repair(self, rgb: torch.Tensor, told: torch.Tensor, past: Past, fields: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """A frame or a window of it by its colour fields: picture, base, logits, ungated and latent, as in `Enhanced`."""
+        known = told[:, 1:]
         last = past.rgb * past.seen
         frame = torch.cat([rgb * 2 - 1, told, last * 2 - past.seen, past.seen], 1).contiguous(memory_format=torch.channels_last)
         with torch.no_grad():
             latent = self.encoder(rgb.contiguous(memory_format=torch.channels_last))
-            fields, count = past.averaged(self.colour(thin(rgb), thin(told)))
         half, quarter, eighth, seen = self.stem(frame)
         history, inside = self._history(past)
         x = (self.embed(latent) + seen).permute(0, 2, 3, 1)
@@ -196,8 +213,27 @@ class Net(nn.Module):
         ungated = base + residual + hard_gate(blend, 1.0) * past.seen * (last - base)
         shut = SHUT_TRAINING if torch.is_grad_enabled() else of_mask(self.shut, known)
         better = base + hard_gate(logits, shut) * (ungated - base)
-        after = past.followed(better, enhanced, fields, count, self.config.history)
-        return Enhanced(better, base, logits, ungated, enhanced, after)
+        return better, base, logits, ungated, enhanced
+
+    @torch.no_grad()
+    def parts(self, rgb: torch.Tensor, mask: torch.Tensor | None, past: Past | None, tiles: Tiles) -> tuple[torch.Tensor, Past]:
+        """One frame `[1, 3, H, W]`, worked on in the windows around `tiles` only: the picture and its past. Other tiles stay exactly as
+        they are, and nothing of them is remembered but the picture."""
+        past = past or Past.none(rgb)
+        told = told_of(rgb, mask)
+        fields, count = self.look(rgb, told, past)
+        height, width = rgb.shape[-2:]
+        better, pixels = rgb.clone(), F.pad(tiles.pixels(), (0, width - tiles.width, 0, height - tiles.height))
+        latent = rgb.new_zeros(1, LATENT, height // STRIDE, width // STRIDE)
+        known = latent[:, :1].clone()
+        for window in tiles.windows():
+            y, x = within(window, height, width)
+            local = sampled(fields, (y, x), height, width)
+            picture, _, _, _, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)), local)
+            better[..., y, x] = torch.where(pixels[y, x].to(rgb.device), picture, rgb[..., y, x])
+            rows, columns = coarser((y, x), STRIDE)
+            latent[..., rows, columns], known[..., rows, columns] = found, 1
+        return better, past.followed(better, latent, fields, count, self.config.history, known)
 
     def _history(self, past: Past) -> tuple[torch.Tensor, torch.Tensor]:
         """Tokens of the latents `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""

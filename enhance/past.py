@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from torch.nn import functional as F
 
 from enhance.autoencoder import LATENT, STRIDE
-from enhance.colour import FIELDS
+from enhance.colour import FIELDS, thin
 from enhance.flow import shrink_flow
+from enhance.tiles import Window, coarser
 from render.warp import warp
+
+BLOCKS = (18, 32)
+CUT = 0.5
+"""Mean difference of pictures shrunk to BLOCKS, against how much those vary within themselves, from which they do not show the same place.
+Measured on 480 frames of drives: up to 0.29 from a frame to the next, 0.75 and more between places."""
 
 STEADY = 3
 """Frames whose colour fields are averaged with a new one's, at most."""
@@ -62,15 +69,42 @@ class Past:
             valid = ((both[:, -1:] > 0.5) * inside_coarse).unflatten(0, (b, k))
         return Past(latents, valid, rgb[:, :3], (rgb[:, 3:] > 0.99) * inside, mean[:, :-1], mean[:, -1:].round() * inside_grid)
 
+    def fitting(self, rgb: torch.Tensor) -> Past:
+        """What of it belongs to the coming frame `[B, 3, H, W]`: nothing after a cut or a jump, where the two do not look alike."""
+        now, last, seen = thin(rgb), thin(self.rgb), thin(self.seen)
+        last = torch.lerp(now, last, seen)
+        now, last = F.adaptive_avg_pool2d(now, BLOCKS), F.adaptive_avg_pool2d(last, BLOCKS)
+        apart = (now - last).abs().mean((1, 2, 3)) / seen.mean((1, 2, 3)).clamp_min(1e-3)
+        varies = torch.stack([(x - x.mean((2, 3), keepdim=True)).abs().mean((1, 2, 3)) for x in (now, last)]).mean(0)
+        fits = (apart < CUT * (varies + 0.02)).to(rgb.dtype)[:, None, None, None]
+        return replace(self, valid=self.valid * fits[:, None], seen=self.seen * fits, count=self.count * fits)
+
+    def cropped(self, window: Window) -> Past:
+        """In a window of the frame; its sides are multiples of STRIDE."""
+        rows, columns = coarser(window, STRIDE)
+        y, x = window
+        latents, valid = self.latents[..., rows, columns], self.valid[..., rows, columns]
+        return replace(self, latents=latents, valid=valid, rgb=self.rgb[..., y, x], seen=self.seen[..., y, x])
+
     def averaged(self, fields: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A new frame's `fields` averaged with those so far, and the count after it."""
         if self.fields.shape[-2:] != fields.shape[-2:]:
             return fields, torch.ones_like(fields[:, :1])
         return (fields + self.count * self.fields) / (1 + self.count), (self.count + 1).clamp_max(STEADY)
 
-    def followed(self, rgb: torch.Tensor, latent: torch.Tensor, fields: torch.Tensor, count: torch.Tensor, longest: int) -> Past:
-        """The past after one more frame, at most `longest` latents long; holds no graph."""
+    def followed(
+        self,
+        rgb: torch.Tensor,
+        latent: torch.Tensor,
+        fields: torch.Tensor,
+        count: torch.Tensor,
+        longest: int,
+        known: torch.Tensor | None = None,
+    ) -> Past:
+        """The past after one more frame, at most `longest` latents long; holds no graph. `known` `[B, 1, H/8, W/8]`: 1 where `latent` is
+        known; everywhere where None."""
         rgb, latent = rgb.detach(), latent.detach()
+        known = torch.ones_like(latent[:, :1]) if known is None else known
         latents = torch.cat([latent[:, None], self.latents], 1)[:, :longest]
-        valid = torch.cat([torch.ones_like(latent[:, None, :1]), self.valid], 1)[:, :longest]
+        valid = torch.cat([known[:, None], self.valid], 1)[:, :longest]
         return Past(latents, valid, rgb, torch.ones_like(rgb[:, :1]), fields.detach(), count.detach())

@@ -54,7 +54,7 @@ def refits(
     log = as_reconstructed(log, scene)
     made = []
     for name, part, shown in _parts(kind, scene, log, Path(folder), size):
-        path = Path(folder) / name
+        path = Path(folder) / f"{name}_scene"
         if not is_scene(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _fit(part, path, config, size)

@@ -40,7 +40,7 @@ class TrainConfig:
     """Share of the budget for the autoencoder."""
     colour: float = 0.55
     """Share of the budget for the colour network."""
-    colour_further: float = 0.4
+    colour_further: float = 0.3
     """That share where trained weights are trained further, for which the autoencoder stays as it is."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
