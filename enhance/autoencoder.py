@@ -10,6 +10,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.precision import lower
+
 LATENT = 16
 STRIDE = 8
 
@@ -46,7 +48,8 @@ class Encoder(nn.Module):
 
     def features(self, rgb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Features at a quarter `[B, 48, H/4, W/4]` and an eighth `[B, 96, H/8, W/8]` of the size, and the latents."""
-        quarter = self.quarter(self.stem(F.pixel_unshuffle(rgb * 2 - 1, 4)))
+        blocks = F.pixel_unshuffle(lower(rgb * 2 - 1), 4).contiguous(memory_format=torch.channels_last)
+        quarter = self.quarter(self.stem(blocks))
         eighth = self.eighth(self.down(F.silu(quarter)))
         return quarter, eighth, self.head(eighth)
 

@@ -24,6 +24,7 @@ from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
 from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
 from enhance.past import Past
+from enhance.precision import lower
 from enhance.tiles import Tiles, coarser, sampled, within
 
 PATCH = 2  # latents per token side
@@ -72,7 +73,7 @@ class Stem(nn.Module):
         self.token = nn.Conv2d(c.eighth, c.width, 2, stride=2)
 
     def forward(self, frame: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        half = F.silu(self.fine(F.pixel_unshuffle(frame, 2)))
+        half = F.silu(self.fine(F.pixel_unshuffle(frame, 2).contiguous(memory_format=torch.channels_last)))
         quarter = self.quarter_block(self.quarter(half))
         eighth = self.eighth_block(self.eighth(F.silu(quarter)))
         return half, quarter, eighth, self.token(F.silu(eighth))
@@ -126,6 +127,8 @@ def recoloured(rgb: torch.Tensor, told: torch.Tensor, fields: torch.Tensor, shut
     a mask and with one) and, where told `[B, 2, H, W]` (the mask and whether it is known) knows, within the mask."""
     mask, known = told.split(1, 1)
     altered = hard_gate(altered_logits(fields, rgb.shape[-2:]), of_mask(shut, known))
+    if rgb.device.type == "cpu" and not altered.any():  # on CUDA, asking would cost more than it saves
+        return rgb
     return rgb + altered * (1 - known + mask) * colour_change(rgb, fields)
 
 
@@ -197,9 +200,10 @@ class Net(nn.Module):
         """A frame or a window of it by its colour fields: picture, base, logits, ungated and latent, as in `Enhanced`."""
         known = told[:, 1:]
         last = past.rgb * past.seen
-        frame = torch.cat([rgb * 2 - 1, told, last * 2 - past.seen, past.seen], 1).contiguous(memory_format=torch.channels_last)
+        # the convolutions round their input to their own precision anyway: once before it is shuffled is less to move
+        frame = torch.cat([lower(x) for x in (rgb * 2 - 1, told, last * 2 - past.seen, past.seen)], 1)
         with torch.no_grad():
-            latent = self.encoder(rgb.contiguous(memory_format=torch.channels_last))
+            latent = self.encoder(rgb)
         half, quarter, eighth, seen = self.stem(frame)
         history, inside = self._history(past)
         x = (self.embed(latent) + seen).permute(0, 2, 3, 1)

@@ -21,6 +21,12 @@ def autocast(device: torch.device):
     return torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device))
 
 
+def lower(x: torch.Tensor) -> torch.Tensor:
+    """`x` in the precision that convolutions run in here, where that is not its own."""
+    kind = x.device.type
+    return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x
+
+
 def channels_last(module: M) -> M:
     """The module with its convolutions' weights in the order that CPUs and tensor cores work in."""
     for parameter in module.parameters():

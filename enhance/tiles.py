@@ -13,7 +13,7 @@ TILE = 32
 """Pixels of a tile's side."""
 
 CELL = 8
-NEEDED = 0.1
+NEEDED = 0.25
 """Mean need of a cell of CELL x CELL pixels from which its tile is worked on: single pixels always need something."""
 
 MARGIN = 1
