@@ -96,7 +96,11 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
 
 def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
     """The part of the light that the ground lacks on the far side from the sun of parked vehicles, against the near side: whether the sun
-    reaches the street at all, where the houses that keep it off were never seen. The median; None where fewer than 3 vehicles tell."""
+    reaches the street at all, where the houses that keep it off were never seen.
+
+    What three in four vehicles show at least: a kerb has pale pavement on one side and dark road on the other, which looks like a shadow
+    on one side of the street, and on the other like its opposite; a sun that is there shows on both. None where fewer than 3 tell.
+    """
     background, ground = scene.background, scene.ground
     if ground is None or not scene.meta.get("parked"):
         return None
@@ -117,7 +121,7 @@ def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
             lacking.append(1 - dark / max(bright, 1e-6))
     if len(lacking) < 3:
         return None
-    return max(0.0, sorted(lacking)[len(lacking) // 2])
+    return max(0.0, sorted(lacking)[len(lacking) // 4])
 
 
 def disc(middle: torch.Tensor, radius: float, count: int) -> torch.Tensor:

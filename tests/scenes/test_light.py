@@ -103,6 +103,23 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
     assert shadows_beside_parked(replace(scene, meta={"parked": parked[:2]}), sun) is None
 
 
+@pytest.mark.parametrize(("sun_share", "least", "most"), [(0.0, 0.0, 0.0), (0.6, 0.1, 0.6)])
+def test_a_pale_pavement_is_no_sun_and_hides_none(street, sun_share, least, most):
+    """Cars at both kerbs of a road along x, its pavements twice as bright: only a sun darkens the same side of all cars."""
+    sun = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
+    boxes = [translation(float(x), y) for y in (-5.0, 5.0) for x in range(0, 50, 10)]
+    parked = [{"track": "veh", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": b.tolist()} for b in boxes]
+    ground = street.background.gaussians.select(street.background.gaussians.means[:, 2] == 0)
+    ground = Gaussians.cat([ground] * 3)
+    y = ground.means[:, 1]
+    albedo = torch.where(y.abs() > 5, 0.4, 0.2)
+    shaded = ((y + 5) < -0.9) & ((y + 5) > -3.1) | ((y - 5) < -0.9) & ((y - 5) > -3.1)
+    colour = srgb_from_linear((albedo * torch.where(shaded, 1 - sun_share, 1.0))[:, None]).expand(-1, 3)
+    splats = Placed(replace(ground, sh=sh_from_rgb(colour)[:, None].contiguous()), street.background.world_from_local)
+    scene = replace(street, meta={**street.meta, "parked": parked}, background=splats)
+    assert least <= shadows_beside_parked(scene, sun) <= most
+
+
 def test_a_disc_stays_within_its_radius_and_fills_it():
     for middle in ([0.0, 0, 1], [0.6, 0, 0.8], [0.0, -1, 0]):
         middle = torch.tensor(middle, dtype=torch.float64)
