@@ -10,6 +10,7 @@ import torch
 
 from scenes.asset import Actor, Asset
 from scenes.collide import collisions
+from scenes.detail import coarser
 from scenes.lane import Lane
 from scenes.match import matched
 from scenes.metres import require_metres
@@ -19,6 +20,8 @@ from scenes.scene import Scene
 from scenes.trajectory import Trajectory
 
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
+ASIDE = 5.0  # metres off the recorded path from which an asset is still drawn in full: half of itself, and a shift to the next lane
+NEAREST = 1.0  # metres from which it is, wherever it stands
 
 
 @dataclass(frozen=True)
@@ -62,10 +65,22 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     if asset.model != scene.model:
         warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
     lit = matched(asset, scene, xy[int((times - start_us).abs().argmin())])
-    marked = replace(lit, meta={**lit.meta, "inserted": True})
-    actor = Actor(marked, Trajectory(times, torch.stack(poses)), _track(scene, placement.asset))
+    path = Trajectory(times, torch.stack(poses))
+    splats = coarser(lit.gaussians, finest_pixel(scene, path) / 2)  # what half a pixel holds cannot be told apart
+    marked = replace(lit, gaussians=splats, meta={**lit.meta, "inserted": True})
+    actor = Actor(marked, path, _track(scene, placement.asset))
     warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor)]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
+
+
+def finest_pixel(scene: Scene, path: Trajectory) -> float:
+    """Metres that a pixel of the sharpest camera spans at the nearest that a body's path comes to the drive, seen from `ASIDE` nearer."""
+    if not scene.rig:
+        return 1e-3
+    focal = max(max(camera.lens.focal()) for camera in scene.rig.values())
+    moments = scene.ego.times_us[[path.covers(int(t)) for t in scene.ego.times_us]] if len(path) > 1 else scene.ego.times_us
+    gaps = [float((scene.ego.at(int(t))[:3, 3] - path.at(int(t))[:3, 3]).norm()) for t in moments]
+    return max(min(gaps, default=0.0) - ASIDE, NEAREST) / focal
 
 
 def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,53 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from randomized import gaussians
+from street import box, car, street
+
+from render import rasterize
+from render.compare import psnr
+from scenes import Camera, Gaussians, Pinhole, Placed
+from scenes.detail import coarser
+from scenes.insert import insert
+from scenes.placement import Placement
+
+
+def fine_car() -> Gaussians:
+    return box((4.2, 1.8, 1.5), (0.8, 0.2, 0.1), step=0.05)
+
+
+def test_from_afar_a_coarser_car_looks_the_same_with_fewer_splats():
+    lens = Pinhole(900.0, 900.0, 160.0, 90.0)
+    camera = Camera(lens, 320, 180, torch.eye(4, dtype=torch.float64))
+    turn = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 60], [0, 0, 0, 1]], dtype=torch.float64)
+    fine, grey = fine_car(), torch.tensor([0.5, 0.5, 0.5])
+    coarse = coarser(fine, 60 / 900)
+    assert len(coarse) < 0.6 * len(fine)
+    pictures = [rasterize(Placed(g, turn), camera, ("rgb",), background=grey).rgb for g in (fine, coarse)]
+    assert psnr(*pictures) > 38
+
+
+def test_merging_keeps_mean_covariance_and_colour():
+    g = gaussians(40)
+    g = replace(g, means=0.1 * torch.rand(40, 3), logit_opacities=torch.full((40,), 1.0), log_scales=torch.full((40, 3), -3.0))
+    one = coarser(g, 1.0)
+    assert len(one) == 1
+    torch.testing.assert_close(one.means[0], g.means.mean(0), atol=1e-6, rtol=0)
+    torch.testing.assert_close(one.sh[0], g.sh.mean(0), atol=1e-6, rtol=0)
+    spread = (g.means - g.means.mean(0)).T @ (g.means - g.means.mean(0)) / 40
+    wide = one.log_scales.exp().square().sum()
+    torch.testing.assert_close(wide, spread.trace() + 3 * torch.tensor(-6.0).exp(), atol=1e-6, rtol=1e-4)
+
+
+def test_splats_alone_in_their_cells_stay_as_they_are():
+    g = gaussians(100)
+    assert coarser(g, 1e-6) is g
+    with pytest.raises(ValueError, match="wider than 0"):
+        coarser(g, 0.0)
+
+
+def test_an_asset_is_put_far_away_with_fewer_splats_than_near():
+    asset, scene = replace(car(), gaussians=fine_car()), street()
+    near, far = (insert(scene, asset, Placement("car/0001", x, -3.5)).actor.asset.gaussians for x in (8.0, 120.0))
+    assert len(far) < 0.5 * len(near) and len(near) > 0.9 * len(asset.gaussians)
