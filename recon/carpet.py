@@ -15,7 +15,7 @@ from scenes.trajectory import Trajectory
 SPACING = 0.3
 """Metres between the splats of the carpet."""
 
-REACH = 8.0
+REACH = 10.0
 """Metres from the path that it covers."""
 
 NEAR_GROUND = 0.25
