@@ -6,8 +6,9 @@ import torch
 import warp as wp
 
 from render.compositing import draw, draw_backward
+from render.kernels.bin import REACH
 from render.kernels.types import MEDIAN, RECORD, WHO
-from render.launch import run, stage, view
+from render.launch import run_each, stage, view
 from render.order import depth_order
 from render.projected import Projected
 from render.projection import projection, uniforms
@@ -46,17 +47,19 @@ class Rasterize(torch.autograd.Function):
         device = fields[0].device
         n = sum(sizes)
         records = torch.empty(n, RECORD, device=device)
+        reach = torch.empty(n, REACH, dtype=torch.int32, device=device)
         keys, counts = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
-        told = []
+        told, jobs = [], []
         still, lens_now = poses.detach().cpu(), settings.lens(*lens.tolist())
         for (p, copy), group, base in zip(draws, groups, bases, strict=True):
             told.append([*uniforms(settings, lens_now, still[p], settings.instances[p], group[4].shape[1], copy), base])
-            args = [*_arrays(group), *told[-1], view(records, float), view(keys, int), view(counts, int)]
-            run(ways.forward, len(group[0]), args, device)
+            args = [*_arrays(group), *told[-1], view(records, float), view(reach, int), view(keys, int), view(counts, int)]
+            jobs.append((len(group[0]), args))
+        run_each(ways.forward, jobs, device)
         per_record, frames = (None if t is None else t.contiguous().repeat(ways.copies, 1) for t in (features, frames))
-        scene = Projected(records, counts, depth_order(keys), per_record, frames, rays)
+        scene = Projected(records, reach, counts, depth_order(keys), per_record, frames, rays)
         picture = draw(settings, scene)
-        ctx.settings, ctx.groups, ctx.told, ctx.draws, ctx.scene, ctx.parts = settings, groups, told, draws, scene, picture.parts
+        ctx.settings, ctx.groups, ctx.told, ctx.scene, ctx.parts = settings, groups, told, scene, picture.parts
         ctx.like_pose, ctx.like_lens = poses.new_empty(0), lens.new_empty(lens.shape)
         alpha = 1 - picture.planes[0]
         z, weights = picture.planes[4:6] if settings.wanted.depth else (None, None)
@@ -69,26 +72,30 @@ class Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):
         settings, device = ctx.settings, ctx.scene.records.device
-        outputs: list = []
+        outs: list = []
         g_uniform: list = []
+        jobs = []
         with stage(device):
             slots = draw_backward(settings, ctx.scene, ctx.parts, [-g_alpha[None], g_rgb, g_z, g_weights, g_channels])
             ways = projection(settings.lens, settings.rolling)
-            for (p, copy), group, told in zip(ctx.draws, ctx.groups, ctx.told, strict=True):
+            for group, told in zip(ctx.groups, ctx.told, strict=True):
                 size = len(group[0])
                 out = [torch.empty_like(f) for f in group]
                 chunk = POSE_CHUNK if device.type == "cpu" else 1
                 items = -(-size // chunk)
                 shared = torch.empty(items, ways.uniforms, device=device)
                 args = [*_arrays(group), *told, size, chunk, view(slots.counts, int), view(slots.starts, int), view(slots.values, float)]
-                run(ways.backward, items, [*args, *_arrays(out), view(shared, float)], device)
-                if copy:  # the other side of a seam: the same splats and the same pose once more
-                    for first, second in zip(outputs[FIELDS * p : FIELDS * (p + 1)], out, strict=True):
-                        first += second
-                    g_uniform[p] = torch.cat([g_uniform[p], shared])
-                else:
-                    outputs += out
-                    g_uniform.append(shared)
+                jobs.append((items, [*args, *_arrays(out), view(shared, float)]))
+                outs.append(out)
+                g_uniform.append(shared)
+            run_each(ways.backward, jobs, device)
+            instances = len(outs) // ways.copies
+            for i in range(instances, len(outs)):  # the other side of a seam: the same splats and the same poses once more
+                for first, second in zip(outs[i - instances], outs[i], strict=True):
+                    first += second
+                g_uniform[i - instances] = torch.cat([g_uniform[i - instances], g_uniform[i]])
+            outputs = [t for out in outs[:instances] for t in out]
+            g_uniform = g_uniform[:instances]
             both_sides = [None if g is None else g.view(ways.copies, -1, g.shape[1]).sum(0) for g in (slots.channels, slots.frames)]
             more = (*both_sides, slots.rays)
         if not any(ctx.needs_input_grad[1:3]):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from render.chunks import Sums, add_to, room_in, window, windows
-from render.kernels.composite import HELD, composite, composite_gradient
+from render.kernels.composite import BATCH, HELD, composite, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.types import GRADIENTS, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, view
@@ -105,7 +105,7 @@ def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tupl
     """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up."""
     counts = scene.counts if alone else room_in(scene.records, scene.counts, w)
     drawn = settings.drawn_tiles().to(counts.device)
-    return tile_lists(scene.records, scene.order, counts, w, drawn, counting=counts.device.type == "cpu"), counts
+    return tile_lists(scene.records, scene.reach, scene.order, counts, w, drawn, settings.gradients, counts.device.type == "cpu"), counts
 
 
 def _planes(w: Window, count: int, device) -> torch.Tensor:
@@ -161,11 +161,11 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
         args = [*lists_of, view(scene.records, float), *_features(scene), w, *limits, view(planes, float), view(picks, float)]
         run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(last, int)], device)
         return planes, picks, (last,)
-    last = torch.empty(planes.shape[1], planes.shape[2] // TILE, dtype=torch.int32)
-    dark_at = _planes(w, 1, device)[0]
-    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels)]
+    ends = planes.shape[1:] if settings.gradients else (0, 0)
+    last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends)
+    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
     out = [lanes_of(planes), lanes_of(picks), view(last, int), lanes_of(dark_at)]
-    run(composite(settings.wanted, settings.squarings), BANDS, [*args, *out], device)
+    run(composite(settings.wanted, settings.squarings, settings.gradients), BANDS, [*args, *out], device)
     return planes, picks, (last, dark_at)
 
 
@@ -190,3 +190,10 @@ def _working(channels: int) -> list:
     """The column ramp, and working rows of the tile at hand for each band."""
     ramp = torch.arange(TILE, dtype=torch.float32)[None]
     return [view(ramp, lanes), view(torch.empty(BANDS, int(HELD) + channels, TILE, TILE), lanes)]
+
+
+def _batches() -> list:
+    """Where forward keeps the entries of the batch at hand for each band."""
+    entries = BANDS * int(BATCH)
+    terms = torch.empty(2 * entries, TILE)
+    return [view(torch.empty(entries, TILE), lanes), view(terms, lanes), view(terms.view(-1), float)]

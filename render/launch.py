@@ -7,6 +7,7 @@ makes the result the same bits on any number of threads.
 import os
 import sys
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -46,23 +47,47 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None:
     """Launch `kernel` over `count` work items, inside a `stage`; its last parameter, `first`, is the index of a band's first item."""
-    if count == 0:
+    run_each(kernel, [(count, args)], device)
+
+
+def run_each(kernel: wp.Kernel, jobs: Sequence[tuple[int, list]], device: torch.device) -> None:
+    """Launch `kernel` as `run` does over the items of several jobs, each with its own arguments, all side by side."""
+    jobs = [(count, args) for count, args in jobs if count]
+    if not jobs:
         return
     _ready(kernel, device.type)
     if device.type == "cuda":
-        wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
+        for count, args in jobs:
+            wp.launch(kernel, dim=count, inputs=[*args, 0], device=wp.device_from_torch(device))
         return
     threads = _cores.threads
-    bands = 1 if threads == 1 else min(BANDS, count)
-    edges = [count * b // bands for b in range(bands + 1)]
+    bands = _bands(jobs, 1 if threads == 1 else BANDS)
 
-    def band(b: int) -> None:
-        wp.launch(kernel, dim=edges[b + 1] - edges[b], inputs=[*args, edges[b]], device="cpu")
+    def band(pieces: list[tuple[int, int, list]]) -> None:
+        for first, count, args in pieces:
+            wp.launch(kernel, dim=count, inputs=[*args, first], device="cpu")
 
-    if bands == 1:
-        band(0)
+    if len(bands) == 1:
+        band(bands[0])
     else:
-        list(_pool(threads).map(band, range(bands)))
+        list(_pool(threads).map(band, bands))
+
+
+def _bands(jobs: Sequence[tuple[int, list]], most: int) -> list[list[tuple[int, int, list]]]:
+    """All items dealt to at most `most` bands of one size: first item, how many, and arguments of each piece of a job."""
+    size = -(-sum(count for count, _ in jobs) // most)
+    bands: list[list[tuple[int, int, list]]] = [[]]
+    room = size
+    for count, args in jobs:
+        first = 0
+        while first < count:
+            if room == 0:
+                bands.append([])
+                room = size
+            taken = min(room, count - first)
+            bands[-1].append((first, taken, args))
+            first, room = first + taken, room - taken
+    return bands
 
 
 PATIENCE = 0.7

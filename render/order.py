@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from render.kernels.bin import count_chunks, emit_chunks, emit_pairs
+from render.kernels.bin import WITH_SLOTS, deal, emit_pairs
 from render.kernels.types import CULLED, Window
 from render.launch import run, sort_pairs, view
 
@@ -20,6 +20,7 @@ class TileLists:
 
     starts `[tiles + 1]`, ids `[I]` (record of each entry; the first starts[-1] count), slot_of `[I]` (its gradient slot),
     first_slot `[N]` (where a record's slots begin; they lie side by side, so that its gradient is one contiguous sum in fixed order).
+    Where no gradient is wanted, slot_of and first_slot are empty.
     """
 
     starts: torch.Tensor
@@ -41,42 +42,59 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
 
 
 def tile_lists(
-    records: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, drawn: torch.Tensor, counting: bool = True
-) -> TileLists:
+    records: torch.Tensor, reach: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, drawn: torch.Tensor,
+    slots: bool = True, counting: bool = True,
+) -> TileLists:  # fmt: skip
     """Deal the visible records, sorted by depth, to the window's tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
-    counts `[N]`: entries to set aside for each record; replaced by how many it has. drawn int32 `[tiles_y, tiles_x]` of the image: 0 for
-    tiles that shall have no entries.
+    counts `[N]`: entries to set aside for each record. drawn int32 `[tiles_y, tiles_x]` of the image: 0 for tiles that shall have no
+    entries. slots: whether gradients will need slots; then counts become how many each record has.
     """
+    if len(order) == 0:
+        none = torch.empty(0, dtype=torch.int32, device=records.device)
+        return TileLists(none.new_zeros(window.tiles_x * window.tiles_y + 1), none, none, torch.zeros_like(counts))
+    if counting:
+        return _by_counting(records, reach, order, counts, window, drawn, slots)
+    return _by_sorting(records, order, counts, window, drawn)
+
+
+def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bool) -> TileLists:
+    tiles, visible = window.tiles_x * window.tiles_y, len(order)
+    chunk = -(-visible // CHUNKS)
+    cursor = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
+    exact = torch.empty(visible, dtype=torch.int32)
+    told = [view(records, float), view(reach.index_select(0, order), int), view(order, int), visible, chunk, window, view(drawn, int)]
+    none = view(exact[:0], int)
+    run(deal, CHUNKS, [*told, view(cursor, int), 0, view(exact, int), none, none, none], records.device)
+    by_tile = cursor.t().reshape(-1)
+    after = by_tile.cumsum(0, dtype=torch.int32)
+    starts = torch.zeros(tiles + 1, dtype=torch.int32)
+    starts[1:] = after[CHUNKS - 1 :: CHUNKS]
+    cursor = (after - by_tile).reshape(tiles, CHUNKS).t().contiguous()
+    ids = torch.empty(int(starts[-1]), dtype=torch.int32)
+    slot_of = begins = first_slot = exact[:0]
+    if slots:
+        slot_of = torch.empty_like(ids)
+        begins = exact.cumsum(0, dtype=torch.int32) - exact
+        first_slot = torch.empty_like(counts)
+        first_slot[order], counts[order] = begins, exact
+    out = [view(exact, int), view(begins, int), view(ids, int), view(slot_of, int)]
+    run(deal, CHUNKS, [*told, view(cursor, int), int(WITH_SLOTS) if slots else 1, *out], records.device)
+    return TileLists(starts, ids, slot_of, first_slot)
+
+
+def _by_sorting(records, order, counts, window: Window, drawn) -> TileLists:
     device, tiles = records.device, window.tiles_x * window.tiles_y
-    visible = order.shape[0]
     ends = counts[order].cumsum(0)
-    total = int(ends[-1]) if visible else 0
+    total = int(ends[-1])
     first_slot = torch.empty_like(counts)
     first_slot[order] = (ends - counts[order]).to(torch.int32)
-    ids = torch.empty(total, dtype=torch.int32, device=device)
-    slot_of = torch.empty(total, dtype=torch.int32, device=device)
-    starts = torch.zeros(tiles + 1, dtype=torch.int32, device=device)
-    if total and counting:
-        chunk = -(-visible // CHUNKS)
-        histogram = torch.zeros(CHUNKS, tiles, dtype=torch.int32)
-        tile_keys = torch.empty(total, dtype=torch.int32)
-        args = [view(records, float), view(order, int), visible, chunk, window, view(drawn, int), view(first_slot, int)]
-        run(count_chunks, CHUNKS, [*args, view(counts, int), view(histogram, int), view(tile_keys, int)], device)
-        by_tile = histogram.t().reshape(-1)
-        after = by_tile.cumsum(0, dtype=torch.int32)
-        starts[1:] = after[CHUNKS - 1 :: CHUNKS]
-        cursor = (after - by_tile).reshape(tiles, CHUNKS).t().contiguous()
-        args = [view(order, int), visible, chunk, view(first_slot, int), view(counts, int), view(tile_keys, int)]
-        run(emit_chunks, CHUNKS, [*args, view(cursor, int), view(ids, int), view(slot_of, int)], device)
-    elif total:
-        pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
-        owner = torch.empty(total, dtype=torch.int32, device=device)
-        args = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int)]
-        run(emit_pairs, visible, [*args, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
-        sort_pairs(pair[0], pair[1], total)
-        slot_of = pair[1, :total].clone()
-        ids = owner[slot_of.long()]
-        edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
-        starts = torch.searchsorted(pair[0, :total].contiguous(), edges).to(torch.int32)
-    return TileLists(starts, ids, slot_of, first_slot)
+    pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
+    owner = torch.empty(total, dtype=torch.int32, device=device)
+    told = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int)]
+    run(emit_pairs, len(order), [*told, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
+    sort_pairs(pair[0], pair[1], total)
+    slot_of = pair[1, :total].clone()
+    edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    starts = torch.searchsorted(pair[0, :total].contiguous(), edges).to(torch.int32)
+    return TileLists(starts, owner[slot_of.long()], slot_of, first_slot)

@@ -89,13 +89,14 @@ def rasterize(
 
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
-    seen = placed
-    if not differentiated(placed, camera):
+    seen, gradients = placed, differentiated(placed, camera)
+    if not gradients:
         seen = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
         if not any(o in outputs for o in SUMMED):
             seen = in_sight(seen, camera, model)
     cam_from_local = poses(camera, seen)
     summed = channel_fields(outputs, seen, cam_from_local[:, 0], features)
+    channels = torch.cat(list(summed.values()), 1) if summed else None
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
     settings = Settings(
         width=camera.width,
@@ -109,9 +110,9 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         rolling=moves(camera, placed),
         crop=crop,
         mask=mask,
+        gradients=gradients or (channels is not None and channels.requires_grad and torch.is_grad_enabled()),
     )
     fields = [t for p in seen for t in p.gaussians.tensors().values()]
-    channels = torch.cat(list(summed.values()), 1) if summed else None
     frames, rays = _along_rays(seen, camera, cam_from_local) if settings.by_rays else (None, None)
     lens = camera.lens.params()
     rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, lens, channels, frames, rays, *fields)

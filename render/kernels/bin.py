@@ -1,8 +1,8 @@
 """Which tiles a splat touches, exactly, and the tiles' lists in depth order.
 
-Room for a splat's entries is set aside by the box around its ellipse; `tile_columns` then finds the exact tiles, once, and their
-number replaces the box's. So nothing is computed twice, and counting and emitting cannot disagree; entries past the room, which
-rounding alone could ask for, are not written.
+Projection, which has a record at hand, notes what tiles the ellipse reaches in 16 bytes (`reach`): dealing reads splats in depth order,
+all over memory, and records would not stay in the caches. What covers more than 8 rows or 16 columns of tiles is looked up in its record.
+Room for a splat's entries is set aside by the box around its ellipse.
 """
 
 import warp as wp
@@ -16,20 +16,32 @@ LAST_CENTRE = wp.constant(TILE - 0.5)
 FAR = wp.constant(1.0e6)
 ROOM = wp.constant(1.0001)  # the box that sets room aside is this much wider than the ellipse, whatever rounding does to either
 
+REACH = 4
+"""Ints of a splat's reach: first row and column of tiles, then a bit for each of 8x8 tiles from there, row by row, in two halves."""
+SIDE = wp.constant(8)
+WORD = wp.constant(wp.int64(0xFFFFFFFF))
+ONE = wp.constant(wp.int64(1))
+WITH_SLOTS = wp.constant(2)
+EVERY_ROW = wp.constant(wp.int64(0x0101010101010101))
+
 
 @wp.func
-def span_within(centre: float, reach: float, start: int, tiles: int):
-    """First and last of `tiles` tiles from `start` whose pixel centres lie within `reach` of `centre` along one direction; empty where
-    last < first."""
+def span_of(centre: float, reach: float):
+    """First and last of the tiles along one direction whose pixel centres lie within `reach` of `centre`; empty where last < first."""
     first = wp.ceil((wp.clamp(centre - reach - SLACK, -FAR, FAR) - LAST_CENTRE) / TILE_SIZE)
     last = wp.floor((wp.clamp(centre + reach + SLACK, -FAR, FAR) - 0.5) / TILE_SIZE)
-    return wp.vec2i(wp.max(int(first), start), wp.min(int(last), start + tiles - 1))
+    return wp.vec2i(int(first), int(last))
 
 
 @wp.func
-def tile_columns(records: wp.array2d[float], j: int, ty: int, window: Window):
+def within(span: wp.vec2i, start: int, tiles: int):
+    """Those of the span among `tiles` tiles from `start`."""
+    return wp.vec2i(wp.max(span[0], start), wp.min(span[1], start + tiles - 1))
+
+
+@wp.func
+def columns_of(records: wp.array2d[float], j: int, ty: int):
     """First and last tile of tile row ty that the ellipse reaches: its extreme x over the row's span of y."""
-    x = records[j, X]
     inv_k = records[j, INV_K]
     m = records[j, M]
     h = records[j, H]
@@ -41,7 +53,67 @@ def tile_columns(records: wp.array2d[float], j: int, ty: int, window: Window):
     dy_left = wp.clamp(-y_at_ext, above, below)
     right = m * dy_right + wp.sqrt(wp.max(s_max - h * dy_right * dy_right, 0.0)) * inv_k
     left = m * dy_left - wp.sqrt(wp.max(s_max - h * dy_left * dy_left, 0.0)) * inv_k
-    return span_within(x + 0.5 * (left + right), 0.5 * (right - left), window.left, window.tiles_x)
+    return span_of(records[j, X] + 0.5 * (left + right), 0.5 * (right - left))
+
+
+@wp.func
+def note_reach(records: wp.array2d[float], j: int, rows: wp.vec2i, columns: wp.vec2i, reach: wp.array2d[int]):
+    """Write reach j of a record that is written; rows, columns: of the box around it. No bits: the record must be asked."""
+    reach[j, 0] = rows[0]
+    reach[j, 1] = columns[0]
+    for half in range(2):
+        word = int(0)
+        if rows[1] - rows[0] < SIDE and columns[1] - columns[0] < SIDE:
+            for q in range(4):
+                ty = rows[0] + 4 * half + q
+                if ty <= rows[1]:
+                    here = columns
+                    if rows[1] > rows[0] and columns[1] > columns[0]:
+                        here = within(columns_of(records, j, ty), columns[0], columns[1] - columns[0] + 1)
+                    if here[0] <= here[1]:
+                        word = word | (((2 << (here[1] - here[0])) - 1) << (here[0] - columns[0] + SIDE * q))
+        reach[j, 2 + half] = word
+
+
+@wp.func
+def bits_within(first: int, start: int, count: int):
+    """Of 8 numbers from `first`, as bits, those of the `count` from `start`."""
+    low = wp.clamp(start - first, 0, SIDE)
+    high = wp.clamp(start + count - first, 0, SIDE)
+    return ((1 << high) - 1) & ~((1 << low) - 1)
+
+
+@wp.func
+def tiles_reached(reach: wp.array2d[int], j: int, window: Window):
+    """The window's tiles of reach j, as 8x8 bits."""
+    bits = (wp.int64(reach[j, 2]) & WORD) | (wp.int64(reach[j, 3]) << wp.int64(32))
+    columns = wp.int64(bits_within(reach[j, 1], window.left, window.tiles_x)) * EVERY_ROW
+    low = wp.clamp(window.top - reach[j, 0], 0, SIDE)
+    high = wp.clamp(window.top + window.tiles_y - reach[j, 0], 0, SIDE)
+    if low > 0 or high < SIDE:
+        for row in range(SIDE):
+            if row < low or row >= high:
+                bits = bits & ~(wp.int64(255) << wp.int64(SIDE * row))
+    return bits & columns
+
+
+@wp.func
+def deal_entry(
+    j: int, ty: int, tx: int, window: Window, drawn: wp.array2d[int], part: int, cursor: wp.array2d[int], emit: int, slot: int,
+    ids: wp.array[int], slot_of: wp.array[int],
+):  # fmt: skip
+    """Count an entry, or write it where the cursor stands; returns how many there are."""
+    entries = int(0)
+    if drawn[ty, tx] != 0:
+        tile = (ty - window.top) * window.tiles_x + tx - window.left
+        k = cursor[part, tile]
+        cursor[part, tile] = k + 1
+        if emit != 0:
+            ids[k] = j
+            if emit == WITH_SLOTS:
+                slot_of[k] = slot
+        entries = 1
+    return entries
 
 
 @wp.kernel
@@ -52,8 +124,8 @@ def set_room_aside(records: wp.array2d[float], counts: wp.array[int], window: Wi
     if counts[j] > 0:
         inv_c = records[j, INV_C]
         reach = wp.sqrt(records[j, S_MAX] * inv_c / records[j, H]) * records[j, INV_K] / inv_c
-        rows = span_within(records[j, Y], ROOM * records[j, Y_EXT] + SLACK, window.top, window.tiles_y)
-        columns = span_within(records[j, X], ROOM * reach + SLACK, window.left, window.tiles_x)
+        rows = within(span_of(records[j, Y], ROOM * records[j, Y_EXT] + SLACK), window.top, window.tiles_y)
+        columns = within(span_of(records[j, X], ROOM * reach + SLACK), window.left, window.tiles_x)
         room[j] = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
 
 
@@ -70,61 +142,57 @@ def add_slots(
 
 
 @wp.kernel
-def count_chunks(
-    records: wp.array2d[float], order: wp.array[int], visible: int, chunk: int, window: Window, drawn: wp.array2d[int],
-    starts: wp.array[int], counts: wp.array[int], histogram: wp.array2d[int], tile_keys: wp.array[int],
+def deal(
+    records: wp.array2d[float], reach: wp.array2d[int], order: wp.array[int], visible: int, chunk: int, window: Window,
+    drawn: wp.array2d[int], cursor: wp.array2d[int], emit: int, counts: wp.array[int], slots: wp.array[int], ids: wp.array[int],
+    slot_of: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """A thread takes one chunk of the depth-ordered splats: the tile of every slot, each splat's exact count, and the histogram
-    `[chunks, tiles]` of entries a tile, zeroed before. drawn: 0 for tiles of the image that shall have no entries."""
+    """A stable counting sort's two passes; a thread takes one chunk of the depth-ordered splats. Both must see the same tiles, to the bit,
+    and so are the same code. reach, counts and slots (where a splat's gradient slots begin) are in depth order: what the loop branches
+    on must not wait for far memory.
+
+    First, with emit = 0 and `cursor` `[chunks, tiles]` zeroed, which leaves there how many entries of each tile every chunk has, and in
+    counts each splat's; then with `cursor` where each chunk's entries of each tile begin. drawn: 0 for tiles of the image that shall have
+    no entries.
+    """
     part = first + wp.tid()
     for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
         j = order[d]
-        slot = starts[j]
-        end = slot + counts[j]
-        rows = span_within(records[j, Y], records[j, Y_EXT], window.top, window.tiles_y)
-        for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(records, j, ty, window)
-            for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
-                if drawn[ty, tx] != 0:
-                    tile = (ty - window.top) * window.tiles_x + tx - window.left
-                    tile_keys[slot] = tile
-                    histogram[part, tile] = histogram[part, tile] + 1
-                    slot += 1
-        counts[j] = slot - starts[j]
-
-
-@wp.kernel
-def emit_chunks(
-    order: wp.array[int], visible: int, chunk: int, starts: wp.array[int], counts: wp.array[int], tile_keys: wp.array[int],
-    cursor: wp.array2d[int], ids: wp.array[int], slot_of: wp.array[int],
-    first: int,
-):  # fmt: skip
-    """The stable second pass of the counting sort: `cursor` holds where each chunk's entries of each tile begin."""
-    part = first + wp.tid()
-    for d in range(part * chunk, wp.min(part * chunk + chunk, visible)):
-        j = order[d]
-        for slot in range(starts[j], starts[j] + counts[j]):
-            tile = tile_keys[slot]
-            k = cursor[part, tile]
-            cursor[part, tile] = k + 1
-            ids[k] = j
-            slot_of[k] = slot
+        entries = int(0)
+        slot = int(0)
+        if emit == WITH_SLOTS:
+            slot = slots[d]
+        if reach[d, 2] == 0 and reach[d, 3] == 0:
+            rows = within(span_of(records[j, Y], records[j, Y_EXT]), window.top, window.tiles_y)
+            for ty in range(rows[0], rows[1] + 1):
+                columns = within(columns_of(records, j, ty), window.left, window.tiles_x)
+                for tx in range(columns[0], columns[1] + 1):
+                    entries += deal_entry(j, ty, tx, window, drawn, part, cursor, emit, slot + entries, ids, slot_of)
+        else:
+            bits = tiles_reached(reach, d, window)
+            while bits != wp.int64(0):
+                q = wp.bit_count((bits & -bits) - ONE)
+                bits = bits & (bits - ONE)
+                ty = reach[d, 0] + q // SIDE
+                tx = reach[d, 1] + q % SIDE
+                entries += deal_entry(j, ty, tx, window, drawn, part, cursor, emit, slot + entries, ids, slot_of)
+        counts[d] = entries
 
 
 @wp.kernel
 def emit_pairs(
-    records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int], starts: wp.array[int],
-    counts: wp.array[int], tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
+    records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int],
+    starts: wp.array[int], counts: wp.array[int], tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
     first: int,
 ):  # fmt: skip
     """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists."""
     j = order[first + wp.tid()]
     slot = starts[j]
     end = slot + counts[j]
-    rows = span_within(records[j, Y], records[j, Y_EXT], window.top, window.tiles_y)
+    rows = within(span_of(records[j, Y], records[j, Y_EXT]), window.top, window.tiles_y)
     for ty in range(rows[0], rows[1] + 1):
-        columns = tile_columns(records, j, ty, window)
+        columns = within(columns_of(records, j, ty), window.left, window.tiles_x)
         for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
             if drawn[ty, tx] != 0:
                 tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left

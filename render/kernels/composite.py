@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.rows import ROLLED, before, below, exp_series, lesser, row_range
+from render.kernels.rows import ROLLED, WIDTH, before, below, exp_of, farther, greater, largest, lesser, row_range, shown
 from render.kernels.types import (
     BLUE,
     G_BLUE,
@@ -47,7 +47,8 @@ from render.kernels.types import (
     lanes,
 )
 
-LOOK = wp.constant(32)
+BATCH = wp.constant(24)  # entries between looks for dark lanes: as many as a float's bits
+ROUNDING = wp.constant(1.00001)
 FAINTEST = wp.constant(1.0e-20)  # times termination, and once more 1 - alpha_max, is a float yet
 vec_rows = wp.types.vector(length=TILE, dtype=wp.int32)
 HELD = wp.constant(11)  # rows of working state a tile before its channels
@@ -55,22 +56,23 @@ NEVER = wp.constant(16777216.0)  # the place in a tile's list of a lane that nev
 
 
 @cache
-def composite(wanted: Wanted, squarings: int):
-    """The forward kernel. exp(-s) is `exp_series(s / 2^squarings)`, squared that often: 3 for cutoffs down to 1/400, 5 to 1e-10."""
-    scale = 0.5**squarings
-    root = scale**0.5
+def composite(wanted: Wanted, squarings: int, gradients: bool):
+    """The forward kernel; last and dark_at are left for backward where `gradients` are wanted. exp(-s) is `exp_of(squarings)`."""
+    exp_minus = exp_of(squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], features: wp.array2d[float], channels: int,
         window: Window, bands: int, alpha_max: float, termination: float,
-        columns: wp.array[lanes], state: wp.array3d[lanes],
+        columns: wp.array[lanes], state: wp.array3d[lanes], held: wp.array[lanes], terms: wp.array[lanes], numbers: wp.array[float],
         planes: wp.array3d[lanes], picks: wp.array3d[lanes], last: wp.array2d[int], dark_at: wp.array2d[lanes],
         first: int,
     ):  # fmt: skip
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
         state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight, where in the
         tile's list the lane went dark, its transmittance then, median depth, channels.
+        held `[bands * BATCH]`: the records of the batch's entries; terms `[bands * BATCH * 2]`: their exponents' terms by row, and the same
+        memory as numbers.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -82,6 +84,7 @@ def composite(wanted: Wanted, squarings: int):
             x0 = float((window.left + tx) * TILE) + 0.5
             y0 = float((window.top + ty) * TILE) + 0.5
             start = tile_starts[tile]
+            stop = tile_starts[tile + 1]
             for r in range(TILE):
                 state[band, 0, r] = lanes(1.0)
                 for p in range(1, wp.static(8 if wanted.instance else 6 if wanted.depth else 4)):
@@ -93,84 +96,88 @@ def composite(wanted: Wanted, squarings: int):
                         state[band, HELD + c, r] = lanes(0.0)
                 if wp.static(wanted.instance):
                     state[band, 6, r] = lanes(-1.0)
-                state[band, 8, r] = lanes(NEVER)
+                if wp.static(gradients):
+                    state[band, 8, r] = lanes(NEVER)
                 state[band, 9, r] = lanes(0.0)
-            row_max = lanes(1.0)
+            light = lanes(1.0)  # by row: of its brightest lane
             row_last = vec_rows(start)
-            strength = float(1.0)  # at most so much weaker has any lane become since the last look
-            next_look = start + LOOK
-            stop = tile_starts[tile + 1]
-            next_rows = wp.vec2i(0, -1)
-            if stop > start:
-                next_rows = row_range(records[ids[start]], x0, y0)
-            for n in range(start, stop):
-                if n == next_look or strength < FAINTEST:
-                    strength = float(1.0)
-                    next_look = n + LOOK
-                    gone = lanes(0.0)
-                    for r in range(TILE):
-                        seen = state[band, 0, r]
-                        gone = wp.max(gone, wp.cw_mul(below(termination, seen), seen))
-                    if wp.max(gone) > 0.0:
-                        for r in range(TILE):
-                            seen = state[band, 0, r]
-                            dark = below(termination, seen)
-                            kept = wp.cw_mul(dark, seen)
-                            state[band, 8, r] = wp.min(state[band, 8, r], lanes(NEVER) + dark * (float(n - start) - NEVER))
-                            state[band, 9, r] = state[band, 9, r] + kept
-                            state[band, 0, r] = seen - kept
-                            row_max[r] = wp.max(seen - kept)
-                        if wp.max(row_max) <= 0.0:
-                            break
-                i = ids[n]
-                record = records[i]
-                px = record[X] - x0
-                py = record[Y] - y0
-                k = record[K] * wp.static(root)
-                m = record[M]
-                h = record[H] * wp.static(scale)
-                z_max = record[S_MAX] * wp.static(scale)
-                opacity = record[OPACITY]
-                red = record[RED]
-                green = record[GREEN]
-                blue = record[BLUE]
-                strength *= 1.0 - lesser(opacity, alpha_max)
-                rows = wp.vec2i(next_rows[0], next_rows[1])  # a copy: plain assignment would be another name for the same variable
-                # the next entry's rows are found before this one's are drawn: the branch that ends a loop of unknown
-                # length is mispredicted, and then only what came before it is already done
-                next_rows = row_range(records[ids[wp.min(n + 1, stop - 1)]], x0, y0)
-                for r in range(rows[0], rows[1] + 1):
-                    if row_max[r] > 0.0:
-                        dy = float(r) - py
-                        u = column * k - lanes(k * (px + m * dy))
-                        z = wp.cw_mul(u, u) + lanes(h * dy * dy)
-                        e = exp_series(wp.min(z, lanes(z_max)))
-                        for _q in range(wp.static(squarings)):
-                            e = wp.cw_mul(e, e)
+            base = int(start)
+            while base < stop:
+                strength = float(1.0)  # at most so much weaker does any lane become in this batch
+                count = int(0)
+                meets = lanes(0.0)  # by row: the entries that it meets, as the bits of a whole number
+                bit = float(1.0)
+                while count < BATCH and base + count < stop and strength >= FAINTEST:
+                    record = records[ids[base + count]]
+                    strength *= 1.0 - lesser(record[OPACITY], alpha_max)
+                    k = record[K]
+                    dy = column - lanes(record[Y] - y0)
+                    ridge = (lanes(record[X] - x0) + dy * record[M]) * k
+                    across = wp.cw_mul(dy, dy) * record[H]
+                    beyond = farther(ridge - lanes(k * WIDTH), lanes(0.0) - ridge)
+                    meets = meets + shown(wp.cw_mul(beyond, beyond) + across, record[S_MAX] * ROUNDING, lanes(bit), bit)
+                    held[band * BATCH + count] = record + lanes(0.0)
+                    terms[2 * (band * BATCH + count)] = ridge
+                    terms[2 * (band * BATCH + count) + 1] = across
+                    bit *= 2.0
+                    count += 1
+                brightest = float(0.0)
+                r = int(0)
+                while r < TILE:
+                    if light[r] > 0.0:
                         t = state[band, 0, r]
-                        w = wp.cw_mul(t, wp.cw_mul(wp.min(e * opacity, lanes(alpha_max)), below(z_max, z)))
-                        state[band, 1, r] = state[band, 1, r] + w * red
-                        state[band, 2, r] = state[band, 2, r] + w * green
-                        state[band, 3, r] = state[band, 3, r] + w * blue
-                        if wp.static(wanted.depth):
-                            state[band, 4, r] = state[band, 4, r] + w * record[Z]
-                            state[band, 5, r] = state[band, 5, r] + w
-                        if wp.static(wanted.channels):
-                            for c in range(channels):
-                                state[band, HELD + c, r] = state[band, HELD + c, r] + w * features[i, c]
-                        if wp.static(wanted.median):
-                            here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
-                            state[band, 10, r] = state[band, 10, r] + here * record[Z]
-                        if wp.static(wanted.instance):
-                            most = state[band, 7, r]
-                            leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
-                            state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(record[INSTANCE]) - state[band, 6, r])
-                            state[band, 7, r] = wp.max(most, w)
-                        state[band, 0, r] = t - w
-                        row_last[r] = n + 1
+                        dark = below(termination, t)
+                        kept = wp.cw_mul(dark, t)
+                        if wp.static(gradients):
+                            state[band, 8, r] = wp.min(state[band, 8, r], lanes(NEVER) + dark * (float(base - start) - NEVER))
+                        state[band, 9, r] = state[band, 9, r] + kept
+                        t = t - kept
+                        light[r] = largest(t)
+                        brightest = greater(brightest, light[r])
+                        bits = int(meets[r])
+                        if light[r] > 0.0 and bits > 0:
+                            red = state[band, 1, r]
+                            green = state[band, 2, r]
+                            blue = state[band, 3, r]
+                            while bits != 0:
+                                n = wp.bit_count((bits & (0 - bits)) - 1)
+                                bits = bits & (bits - 1)
+                                record = held[band * BATCH + n]
+                                at = 2 * TILE * (band * BATCH + n) + r
+                                u = column * record[K] - lanes(numbers[at])
+                                s = wp.cw_mul(u, u) + lanes(numbers[at + TILE])
+                                w = wp.cw_mul(t, shown(s, record[S_MAX], exp_minus(s) * record[OPACITY], alpha_max))
+                                red = red + w * record[RED]
+                                green = green + w * record[GREEN]
+                                blue = blue + w * record[BLUE]
+                                if wp.static(wanted.depth):
+                                    state[band, 4, r] = state[band, 4, r] + w * record[Z]
+                                    state[band, 5, r] = state[band, 5, r] + w
+                                if wp.static(wanted.channels):
+                                    for c in range(channels):
+                                        state[band, HELD + c, r] = state[band, HELD + c, r] + w * features[ids[base + n], c]
+                                if wp.static(wanted.median):
+                                    here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
+                                    state[band, 10, r] = state[band, 10, r] + here * record[Z]
+                                if wp.static(wanted.instance):
+                                    most = state[band, 7, r]
+                                    leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
+                                    state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(record[INSTANCE]) - state[band, 6, r])
+                                    state[band, 7, r] = wp.max(most, w)
+                                t = t - w
+                            state[band, 1, r] = red
+                            state[band, 2, r] = green
+                            state[band, 3, r] = blue
+                            row_last[r] = base + n + 1
+                        state[band, 0, r] = t
+                    r += 1
+                if brightest <= 0.0:
+                    break
+                base += count
             for r in range(TILE):
-                last[row0 + r, tx] = row_last[r]
-                dark_at[row0 + r, tx] = state[band, 8, r]
+                if wp.static(gradients):
+                    last[row0 + r, tx] = row_last[r]
+                    dark_at[row0 + r, tx] = state[band, 8, r]
                 planes[0, row0 + r, tx] = state[band, 0, r] + state[band, 9, r]
                 for p in range(1, wp.static(wanted.first_channel)):
                     planes[p, row0 + r, tx] = state[band, p, r]
@@ -188,8 +195,7 @@ def composite(wanted: Wanted, squarings: int):
 @cache
 def composite_gradient(wanted: Wanted, squarings: int):
     """The backward kernel: writes one gradient slot for every entry of every tile, on every path, and one of its channels."""
-    scale = 0.5**squarings
-    root = scale**0.5
+    exp_minus = exp_of(squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
@@ -263,10 +269,10 @@ def composite_gradient(wanted: Wanted, squarings: int):
                 record = records[i]
                 px = record[X] - x0
                 py = record[Y] - y0
-                k = record[K] * wp.static(root)
+                k = record[K]
                 m = record[M]
-                h = record[H] * wp.static(scale)
-                z_max = record[S_MAX] * wp.static(scale)
+                h = record[H]
+                s_max = record[S_MAX]
                 opacity = record[OPACITY]
                 red = record[RED]
                 green = record[GREEN]
@@ -287,11 +293,8 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     if n < row_last[r]:
                         dy = float(r) - py
                         u = column * k - lanes(k * (px + m * dy))
-                        z = wp.cw_mul(u, u) + lanes(h * dy * dy)
-                        e = exp_series(wp.min(z, lanes(z_max)))
-                        for _q in range(wp.static(squarings)):
-                            e = wp.cw_mul(e, e)
-                        e = wp.cw_mul(e, below(z_max, z))
+                        s = wp.cw_mul(u, u) + lanes(h * dy * dy)
+                        e = shown(s, s_max, exp_minus(s), 1.0)
                         full = e * opacity
                         a = wp.min(full, lanes(alpha_max))
                         inverse = wp.cw_div(one, one - a)

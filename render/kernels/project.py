@@ -46,7 +46,7 @@ def project(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
     view: View, pose: Pose, base: int,
-    records: wp.array2d[float], depth_keys: wp.array[int], counts: wp.array[int],
+    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
     first: int,
 ):  # fmt: skip
     """Records, depth keys and tiles at most of one instance, from record `base`."""
@@ -60,7 +60,7 @@ def project(
         scale = exp_scale(log_scales[i])
         if in_view(t, axes, scale, view):
             e = ellipse(t, footprint(t, axes, scale, view), view)
-            write_splat(e, opacity, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, depth_keys, counts, j)
+            write_splat(e, opacity, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
 
 
 @wp.kernel

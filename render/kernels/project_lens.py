@@ -257,7 +257,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
         means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
         logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
         view: View, optics: Optics, motion: Motion, base: int,
-        records: wp.array2d[float], depth_keys: wp.array[int], counts: wp.array[int],
+        records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
         first: int,
     ):  # fmt: skip
         """As `project`."""
@@ -275,7 +275,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
             if ahead:
                 e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view.unscented))
                 sight = wp.vec3(wp.transpose(c.rotation) * c.t)
-                write_splat(e, opacity, float(c.depth), motion.instance, sh, i, sight, view, records, depth_keys, counts, j)
+                write_splat(e, opacity, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens_backward(

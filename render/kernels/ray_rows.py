@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.rows import below, exp_series, row_range
+from render.kernels.rows import below, exp_of, row_range, shown
 from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, TINY, H, K, M, X, Y, lanes
 
 KEY, ALPHA, OWNER, THROUGH, PART_W, PART_E = (wp.constant(i) for i in range(6))
@@ -107,28 +107,24 @@ def insert(lists: wp.array3d[lanes], band: int, count: int, key: lanes, alpha: l
 @cache
 def ray_functions(ray: bool, squarings: int):
     """exp(-s) within the cutoff of a row's pixels, 0 beyond it, by the conic or along the rays."""
-    scale = 0.5**squarings
-    root = scale**0.5
+    exp_minus = exp_of(squarings)
 
     @wp.func
     def faded(records: wp.array[lanes], frames: wp.array2d[float], i: int, d: Rays, column: lanes, x0: float, y: float):
         record = records[i]
-        z_max = record[S_MAX] * wp.static(scale / RAY_BOUNDS if ray else scale)
-        z = lanes(0.0)
+        s_max = record[S_MAX] * wp.static(1.0 / RAY_BOUNDS if ray else 1.0)
+        s = lanes(0.0)
         if wp.static(ray):
             c = canonical(frames, i, d)
-            z = wp.cw_div(wp.cw_mul(c.cx, c.cx) + wp.cw_mul(c.cy, c.cy) + wp.cw_mul(c.cz, c.cz), c.square) * wp.static(0.5 * scale)
+            s = wp.cw_div(wp.cw_mul(c.cx, c.cx) + wp.cw_mul(c.cy, c.cy) + wp.cw_mul(c.cz, c.cz), c.square) * 0.5
             # what the ray leaves behind it is not seen
-            z = z + below(0.0, place(frames, i, c)) * (2.0 * z_max)
+            s = s + below(0.0, place(frames, i, c)) * (2.0 * s_max)
         else:
-            k = record[K] * wp.static(root)
+            k = record[K]
             dy = y - record[Y]
             u = column * k - lanes(k * (record[X] - x0 + record[M] * dy))
-            z = wp.cw_mul(u, u) + lanes(record[H] * wp.static(scale) * dy * dy)
-        e = exp_series(wp.min(z, lanes(z_max)))
-        for _q in range(wp.static(squarings)):
-            e = wp.cw_mul(e, e)
-        return wp.cw_mul(e, below(z_max, z))
+            s = wp.cw_mul(u, u) + lanes(record[H] * dy * dy)
+        return shown(s, s_max, exp_minus(s), 1.0)
 
     return faded
 

@@ -5,7 +5,7 @@ Nothing from here on knows of lenses or shutters.
 
 import warp as wp
 
-from render.kernels.bin import ROOM, span_within
+from render.kernels.bin import ROOM, note_reach, span_of, within
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
@@ -74,9 +74,9 @@ class EllipseGradient:
 @wp.func
 def write_splat(
     e: Ellipse, opacity: float, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
-    records: wp.array2d[float], depth_keys: wp.array[int], counts: wp.array[int], j: int,
+    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
 ):  # fmt: skip
-    """Record j, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
+    """Record j, its reach, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
 
     sight: from the eye to the splat in its local frame, of any length.
     """
@@ -110,14 +110,17 @@ def write_splat(
         records[j, INV_C] = 1.0 / c
         root = wp.sqrt(s_max / (c * h))
         records[j, Y_AT_EXT] = k * m * root
-        rows = span_within(e.y, ROOM * records[j, Y_EXT] + SLACK, view.tile_top, view.tiles_y)
-        columns = span_within(e.x, ROOM * c * root / k + SLACK, view.tile_left, view.tiles_x)
+        all_rows = span_of(e.y, ROOM * records[j, Y_EXT] + SLACK)
+        all_columns = span_of(e.x, ROOM * c * root / k + SLACK)
+        rows = within(all_rows, view.tile_top, view.tiles_y)
+        columns = within(all_columns, view.tile_left, view.tiles_x)
         total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
         colour = wp.vec3(0.0)
         if total > 0:
             colour = harmonics(sh, i, view.sh_count, wp.normalize(sight))
         if total > 0 and wp.isfinite(colour):
             counts[j] = total
+            note_reach(records, j, all_rows, all_columns, reach)
             depth_keys[j] = wp.cast(depth, int)
             records[j, RED] = wp.max(colour[0], 0.0)
             records[j, GREEN] = wp.max(colour[1], 0.0)
