@@ -40,7 +40,8 @@ def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> lis
     if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
         return placed
     sides = _sides(camera, model)
-    seen = [part for p in placed for part in _parts(p, inverse(camera.world_from_cam) @ p.world_from_local, sides)]
+    there = [p for p in placed if len(p.gaussians)]
+    seen = [part for p, beyond in zip(there, _beyond(there, camera, sides), strict=True) for part in _parts(p, beyond)]
     return seen or [replace(placed[0], gaussians=placed[0].gaussians.map(lambda t: t[:0]))]
 
 
@@ -59,15 +60,23 @@ def _sides(camera: Camera, model: SplatModel) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.tensor(normals, dtype=torch.float64), dim=1)
 
 
-def _parts(p: Placed, cam_from_local: torch.Tensor, sides: torch.Tensor) -> list[Placed]:
-    if not len(p.gaussians):
+def _beyond(placed: Sequence[Placed], camera: Camera, sides: torch.Tensor) -> list[list[bool]]:
+    """For each cluster of each instance, whether it lies beyond one of the sides."""
+    if not placed:
         return []
-    centres, radii = bounds(p.gaussians)
-    there = centres @ cam_from_local[:3, :3].T.to(centres) + cam_from_local[:3, 3].to(centres)
+    centres, radii = zip(*(bounds(p.gaussians) for p in placed), strict=True)
+    sizes = torch.tensor([len(r) for r in radii])
+    poses = inverse(camera.world_from_cam) @ torch.stack([p.world_from_local for p in placed])
+    poses = poses.repeat_interleave(sizes, 0).to(centres[0])
+    there = (poses[:, :3, :3] @ torch.cat(centres)[..., None])[..., 0] + poses[:, :3, 3]
     # a bound that is not a number is not beyond anything
-    beyond = (there @ sides.T.to(centres) > radii[:, None]).any(1)
-    runs = _runs((~beyond).tolist())
-    if runs == [(0, len(centres))]:
+    beyond = (there @ sides.T.to(there) > torch.cat(radii)[:, None]).any(1)
+    return [part.tolist() for part in beyond.split(sizes.tolist())]
+
+
+def _parts(p: Placed, beyond: list[bool]) -> list[Placed]:
+    runs = _runs([not b for b in beyond])
+    if runs == [(0, len(beyond))]:
         return [p]
     return [replace(p, gaussians=p.gaussians.map(lambda t, a=a, b=b: t[a * CLUSTER : b * CLUSTER])) for a, b in runs]
 

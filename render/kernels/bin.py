@@ -23,6 +23,7 @@ WORD = wp.constant(wp.int64(0xFFFFFFFF))
 ONE = wp.constant(wp.int64(1))
 WITH_SLOTS = wp.constant(2)
 EVERY_ROW = wp.constant(wp.int64(0x0101010101010101))
+EVERY_TILE = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 
 
 @wp.func
@@ -57,44 +58,45 @@ def columns_of(records: wp.array2d[float], j: int, ty: int):
 
 
 @wp.func
-def note_reach(records: wp.array2d[float], j: int, rows: wp.vec2i, columns: wp.vec2i, reach: wp.array2d[int]):
-    """Write reach j of a record that is written; rows, columns: of the box around it. No bits: the record must be asked."""
-    reach[j, 0] = rows[0]
-    reach[j, 1] = columns[0]
-    for half in range(2):
-        word = int(0)
-        if rows[1] - rows[0] < SIDE and columns[1] - columns[0] < SIDE:
-            for q in range(4):
-                ty = rows[0] + 4 * half + q
-                if ty <= rows[1]:
-                    here = columns
-                    if rows[1] > rows[0] and columns[1] > columns[0]:
-                        here = within(columns_of(records, j, ty), columns[0], columns[1] - columns[0] + 1)
-                    if here[0] <= here[1]:
-                        word = word | (((2 << (here[1] - here[0])) - 1) << (here[0] - columns[0] + SIDE * q))
-        reach[j, 2 + half] = word
-
-
-@wp.func
 def bits_within(first: int, start: int, count: int):
     """Of 8 numbers from `first`, as bits, those of the `count` from `start`."""
     low = wp.clamp(start - first, 0, SIDE)
-    high = wp.clamp(start + count - first, 0, SIDE)
-    return ((1 << high) - 1) & ~((1 << low) - 1)
+    high = wp.clamp(start + count - first, low, SIDE)
+    return (1 << high) - (1 << low)
+
+
+@wp.func
+def bits_of_rows(low: int, high: int):
+    """The rows from low to before high, of 8x8 bits."""
+    return wp.where(high > low, wp.int64((EVERY_TILE >> wp.uint64(SIDE * (low + SIDE - high))) << wp.uint64(SIDE * low)), wp.int64(0))
+
+
+@wp.func
+def note_reach(records: wp.array2d[float], j: int, rows: wp.vec2i, columns: wp.vec2i, reach: wp.array2d[int]):
+    """Write reach j of a record that is written; rows, columns: of the box around it. No bits: the record must be asked."""
+    high = rows[1] - rows[0] + 1
+    wide = columns[1] - columns[0] + 1
+    bits = wp.int64(0)
+    if high <= SIDE and wide <= SIDE:
+        bits = (wp.int64((1 << wide) - 1) * EVERY_ROW) & bits_of_rows(0, high)
+        if high > 1 and wide > 1:
+            bits = wp.int64(0)
+            for row in range(high):
+                here = within(columns_of(records, j, rows[0] + row), columns[0], wide)
+                bits = bits | (wp.int64(bits_within(columns[0], here[0], here[1] - here[0] + 1)) << wp.int64(SIDE * row))
+    reach[j, 0] = rows[0]
+    reach[j, 1] = columns[0]
+    reach[j, 2] = int(bits & WORD)
+    reach[j, 3] = int(bits >> wp.int64(32))
 
 
 @wp.func
 def tiles_reached(reach: wp.array2d[int], j: int, window: Window):
     """The window's tiles of reach j, as 8x8 bits."""
     bits = (wp.int64(reach[j, 2]) & WORD) | (wp.int64(reach[j, 3]) << wp.int64(32))
-    columns = wp.int64(bits_within(reach[j, 1], window.left, window.tiles_x)) * EVERY_ROW
     low = wp.clamp(window.top - reach[j, 0], 0, SIDE)
     high = wp.clamp(window.top + window.tiles_y - reach[j, 0], 0, SIDE)
-    if low > 0 or high < SIDE:
-        for row in range(SIDE):
-            if row < low or row >= high:
-                bits = bits & ~(wp.int64(255) << wp.int64(SIDE * row))
-    return bits & columns
+    return bits & bits_of_rows(low, high) & (wp.int64(bits_within(reach[j, 1], window.left, window.tiles_x)) * EVERY_ROW)
 
 
 @wp.func
