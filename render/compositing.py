@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import warp as wp
 
 from render.chunks import Sums, add_to, room_in, window, windows
-from render.kernels.composite import BATCH, HELD, composite, composite_gradient
+from render.kernels.composite import BATCH, HELD, composite
+from render.kernels.composite_backward import SUMS, composite_gradient
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.types import GRADIENTS, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, view
@@ -173,23 +175,37 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene:
     """Fill the gradient slots of the window's entries; grads are planes as of `_of_part`."""
     device, w = scene.records.device, part.window
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int)]
-    out = [view(slots, float), view(channel_slots, float)]
     if device.type == "cuda":
         kernel = composite_blocks_gradient(settings.wanted, TILE)
         args = [*lists_of, view(scene.records, float), *_features(scene), w, settings.alpha_max, view(part.planes, float)]
-        run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(grads, float), view(part.ends[0], int), *out], device)
+        run_blocks(
+            kernel,
+            w.tiles_x * w.tiles_y,
+            TILE * TILE,
+            [*args, view(grads, float), view(part.ends[0], int), view(slots, float), view(channel_slots, float)],
+            device,
+        )
         return
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
+    terms = torch.empty(BANDS * int(3 * BATCH + SUMS), TILE)
+    args += [
+        view(terms, lanes),
+        view(terms.view(-1), float),
+        view(terms.view(-1, 4), wp.vec4),
+        view(torch.empty(BANDS * int(BATCH), dtype=torch.int32), int),
+    ]
     sums = view(torch.zeros(BANDS, max(scene.channels, 1), TILE), lanes)
     ends = [view(part.ends[0], int), lanes_of(part.ends[1])]
+    out = [view(slots, float), view(channel_slots, float)]
     kernel = composite_gradient(settings.wanted, settings.squarings)
     run(kernel, BANDS, [*args, lanes_of(part.planes), lanes_of(grads), *ends, *out, sums], device)
 
 
 def _working(channels: int) -> list:
-    """The column ramp, and working rows of the tile at hand for each band."""
-    ramp = torch.arange(TILE, dtype=torch.float32)[None]
-    return [view(ramp, lanes), view(torch.empty(BANDS, int(HELD) + channels, TILE, TILE), lanes)]
+    """0 to 15 and their powers of two, and working rows of the tile at hand for each band; 17 where 16 are used, so that those of its
+    fields do not fall on one another in the store buffer, which tells addresses apart by their last 12 bits."""
+    ramp = torch.arange(TILE, dtype=torch.float32)
+    return [view(torch.stack([ramp, ramp.exp2()]), lanes), view(torch.empty(BANDS, int(HELD) + channels, TILE + 1, TILE), lanes)]
 
 
 def _batches() -> list:

@@ -10,6 +10,7 @@ from functools import cache
 
 import warp as wp
 
+from render.kernels.lanewise import below
 from render.kernels.ray_rows import (
     ALPHA,
     OWNER,
@@ -24,7 +25,7 @@ from render.kernels.ray_rows import (
     rays_of,
     reach_of,
 )
-from render.kernels.rows import ROLLED, below
+from render.kernels.rows import ROLLED
 from render.kernels.types import (
     BLUE,
     FRAME,
@@ -87,9 +88,7 @@ def composite_rays(wanted: Wanted, ray: bool, ordered: bool, squarings: int):
             for r in range(TILE):
                 row = row0 + r
                 d = rays_of(rays, row, tx)
-                count = make(
-                    ids, start, stop, records, frames, reach, d, column, x0, y0 + float(r), r, band, alpha_max, termination, lists
-                )
+                count = make(ids, start, stop, records, frames, reach, d, column, x0, y0 + float(r), r, band, alpha_max, termination, lists)
                 t = lanes(1.0)
                 red = lanes(0.0)
                 green = lanes(0.0)

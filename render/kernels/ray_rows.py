@@ -10,7 +10,8 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.rows import below, exp_of, row_range, shown
+from render.kernels.lanewise import below, cut
+from render.kernels.rows import exp_of, row_range
 from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, TINY, H, K, M, X, Y, lanes
 
 KEY, ALPHA, OWNER, THROUGH, PART_W, PART_E = (wp.constant(i) for i in range(6))
@@ -124,7 +125,7 @@ def ray_functions(ray: bool, squarings: int):
             dy = y - record[Y]
             u = column * k - lanes(k * (record[X] - x0 + record[M] * dy))
             s = wp.cw_mul(u, u) + lanes(record[H] * dy * dy)
-        return shown(s, s_max, exp_minus(s), 1.0)
+        return cut(s, s_max, exp_minus(s))
 
     return faded
 

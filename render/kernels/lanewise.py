@@ -1,0 +1,115 @@
+"""Choices lane by lane, and sums and greatest of all lanes, written so that each becomes a vector instruction or two.
+
+Warp's own `min` and `max` mind NaN, which doubles them; its vectors have no comparison; and it adds lanes up one by one.
+"""
+
+import warp as wp
+
+from render.kernels.types import lanes
+
+RECIPROCAL = wp.constant(0x7EF311C7)
+
+
+@wp.func
+def lesser(a: float, b: float):
+    return wp.where(a < b, a, b)
+
+
+@wp.func
+def greater(a: float, b: float):
+    return wp.where(a > b, a, b)
+
+
+@wp.func
+def below(limit: float, z: lanes):
+    """1 where z < limit, else 0 (limit of ordinary size, z of any)."""
+    return wp.min(wp.max(lanes(limit * 1.0e30) - z * 1.0e30, lanes(0.0)), lanes(1.0))
+
+
+@wp.func
+def before(place: float, places: lanes):
+    """Those of `places`, whole numbers, that are less than `place`; -1 for the others."""
+    less = wp.min(wp.max(lanes(place) - places, lanes(0.0)), lanes(1.0))
+    return wp.cw_mul(less, places + lanes(1.0)) - lanes(1.0)
+
+
+@wp.func
+def cut(s: lanes, limit: float, v: lanes):
+    """v where s < limit, else 0."""
+    return lanes(
+        wp.where(s[0] < limit, v[0], 0.0), wp.where(s[1] < limit, v[1], 0.0),
+        wp.where(s[2] < limit, v[2], 0.0), wp.where(s[3] < limit, v[3], 0.0),
+        wp.where(s[4] < limit, v[4], 0.0), wp.where(s[5] < limit, v[5], 0.0),
+        wp.where(s[6] < limit, v[6], 0.0), wp.where(s[7] < limit, v[7], 0.0),
+        wp.where(s[8] < limit, v[8], 0.0), wp.where(s[9] < limit, v[9], 0.0),
+        wp.where(s[10] < limit, v[10], 0.0), wp.where(s[11] < limit, v[11], 0.0),
+        wp.where(s[12] < limit, v[12], 0.0), wp.where(s[13] < limit, v[13], 0.0),
+        wp.where(s[14] < limit, v[14], 0.0), wp.where(s[15] < limit, v[15], 0.0),
+    )  # fmt: skip
+
+
+@wp.func
+def least(v: lanes, limit: float):
+    """The lesser of v and limit."""
+    return lanes(
+        lesser(v[0], limit), lesser(v[1], limit), lesser(v[2], limit), lesser(v[3], limit),
+        lesser(v[4], limit), lesser(v[5], limit), lesser(v[6], limit), lesser(v[7], limit),
+        lesser(v[8], limit), lesser(v[9], limit), lesser(v[10], limit), lesser(v[11], limit),
+        lesser(v[12], limit), lesser(v[13], limit), lesser(v[14], limit), lesser(v[15], limit),
+    )  # fmt: skip
+
+
+@wp.func
+def greatest(a: lanes, b: lanes):
+    """The greater of both, or 0 where neither is positive."""
+    return lanes(
+        greater(greater(a[0], b[0]), 0.0), greater(greater(a[1], b[1]), 0.0),
+        greater(greater(a[2], b[2]), 0.0), greater(greater(a[3], b[3]), 0.0),
+        greater(greater(a[4], b[4]), 0.0), greater(greater(a[5], b[5]), 0.0),
+        greater(greater(a[6], b[6]), 0.0), greater(greater(a[7], b[7]), 0.0),
+        greater(greater(a[8], b[8]), 0.0), greater(greater(a[9], b[9]), 0.0),
+        greater(greater(a[10], b[10]), 0.0), greater(greater(a[11], b[11]), 0.0),
+        greater(greater(a[12], b[12]), 0.0), greater(greater(a[13], b[13]), 0.0),
+        greater(greater(a[14], b[14]), 0.0), greater(greater(a[15], b[15]), 0.0),
+    )  # fmt: skip
+
+
+@wp.func
+def reciprocal(v: lanes):
+    """1 / v to a rounding error, for v of ordinary size: a guess off by an eighth, from the bits, then Newton's three times."""
+    bits = lanes(
+        wp.cast(RECIPROCAL - wp.cast(v[0], int), float), wp.cast(RECIPROCAL - wp.cast(v[1], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[2], int), float), wp.cast(RECIPROCAL - wp.cast(v[3], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[4], int), float), wp.cast(RECIPROCAL - wp.cast(v[5], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[6], int), float), wp.cast(RECIPROCAL - wp.cast(v[7], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[8], int), float), wp.cast(RECIPROCAL - wp.cast(v[9], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[10], int), float), wp.cast(RECIPROCAL - wp.cast(v[11], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[12], int), float), wp.cast(RECIPROCAL - wp.cast(v[13], int), float),
+        wp.cast(RECIPROCAL - wp.cast(v[14], int), float), wp.cast(RECIPROCAL - wp.cast(v[15], int), float),
+    )  # fmt: skip
+    y = wp.cw_mul(bits, lanes(2.0) - wp.cw_mul(v, bits))
+    y = y + wp.cw_mul(y, lanes(1.0) - wp.cw_mul(v, y))
+    return y + wp.cw_mul(y, lanes(1.0) - wp.cw_mul(v, y))
+
+
+@wp.func
+def largest(v: lanes):
+    """The largest lane of numbers that are not negative."""
+    a = greater(greater(greater(v[0], v[8]), greater(v[4], v[12])), greater(greater(v[2], v[10]), greater(v[6], v[14])))
+    b = greater(greater(greater(v[1], v[9]), greater(v[5], v[13])), greater(greater(v[3], v[11]), greater(v[7], v[15])))
+    return greater(a, b)
+
+
+@wp.func
+def total(v: lanes):
+    """The sum of all lanes."""
+    a = ((v[0] + v[8]) + (v[4] + v[12])) + ((v[2] + v[10]) + (v[6] + v[14]))
+    b = ((v[1] + v[9]) + (v[5] + v[13])) + ((v[3] + v[11]) + (v[7] + v[15]))
+    return a + b
+
+
+@wp.func
+def total_at(quarters: wp.array[wp.vec4], at: int):
+    """The sum of all lanes of the vector `at` of an array that is seen as quarters of vectors."""
+    v = (quarters[4 * at] + quarters[4 * at + 1]) + (quarters[4 * at + 2] + quarters[4 * at + 3])
+    return (v[0] + v[1]) + (v[2] + v[3])
