@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 import warp as wp
 
@@ -38,6 +40,7 @@ class Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, settings: Settings, poses, lens, features, frames, rays, *fields):
+        settings = replace(settings, gradients=settings.gradients and any(ctx.needs_input_grad))
         ways = projection(settings.lens, settings.rolling)
         groups = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
         draws = [(p, copy) for copy in range(ways.copies) for p in range(len(groups))]

@@ -49,8 +49,9 @@ def differentiated(placed: Sequence[Placed], camera: Camera) -> bool:
     """Whether autograd will ask for a gradient of anything here."""
     if not torch.is_grad_enabled():
         return False
-    tensors = [t for p in placed for t in (p.world_from_local, *p.gaussians.tensors().values())]
-    return any(t.requires_grad for t in (camera.world_from_cam, camera.lens.params(), *tensors))
+    tensors = [t for p in placed for t in (p.world_from_local, p.world_from_local_end, *p.gaussians.tensors().values())]
+    tensors += [camera.world_from_cam, camera.world_from_cam_end, camera.lens.params()]
+    return any(t is not None and t.requires_grad for t in tensors)
 
 
 def _sides(camera: Camera, model: SplatModel) -> torch.Tensor:

@@ -89,8 +89,8 @@ def rasterize(
 
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
-    seen, gradients = placed, differentiated(placed, camera)
-    if not gradients:
+    seen = placed
+    if not differentiated(placed, camera):
         seen = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
         if not any(o in outputs for o in SUMMED):
             seen = in_sight(seen, camera, model)
@@ -110,7 +110,7 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         rolling=moves(camera, placed),
         crop=crop,
         mask=mask,
-        gradients=gradients or (channels is not None and channels.requires_grad and torch.is_grad_enabled()),
+        gradients=torch.is_grad_enabled(),
     )
     fields = [t for p in seen for t in p.gaussians.tensors().values()]
     frames, rays = _along_rays(seen, camera, cam_from_local) if settings.by_rays else (None, None)

@@ -18,7 +18,7 @@ class Settings:
     """Image size, model, config, what is wanted, each instance's id, lens type, and what the shutter does.
 
     crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask bool `[H, W]` of the whole
-    image: which pixels are drawn. gradients: whether any may be asked for.
+    image: which pixels are drawn. gradients: whether any may be asked for, of anything.
     """
 
     width: int

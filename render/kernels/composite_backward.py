@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.composite import BATCH, HELD, vec_rows
-from render.kernels.lanewise import before, cut, least, reciprocal, total, total_at
+from render.kernels.lanewise import before, cut, least, total, total_at
 from render.kernels.rows import ROLLED, exp_of, rows_met
 from render.kernels.types import (
     BLUE,
@@ -168,7 +168,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
                         e = cut(s, s_max, exp_minus(s))
                         full = e * opacity
                         a = least(full, alpha_max)
-                        inverse = reciprocal(one - a)
+                        inverse = wp.cw_div(one, one - a)
                         t = wp.cw_mul(state[band, 0, r], inverse)
                         w = wp.cw_mul(t, a)
                         gr = state[band, 2, r]

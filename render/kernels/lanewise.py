@@ -7,8 +7,6 @@ import warp as wp
 
 from render.kernels.types import lanes
 
-RECIPROCAL = wp.constant(0x7EF311C7)
-
 
 @wp.func
 def lesser(a: float, b: float):
@@ -72,24 +70,6 @@ def greatest(a: lanes, b: lanes):
         greater(greater(a[12], b[12]), 0.0), greater(greater(a[13], b[13]), 0.0),
         greater(greater(a[14], b[14]), 0.0), greater(greater(a[15], b[15]), 0.0),
     )  # fmt: skip
-
-
-@wp.func
-def reciprocal(v: lanes):
-    """1 / v to a rounding error, for v of ordinary size: a guess off by an eighth, from the bits, then Newton's three times."""
-    bits = lanes(
-        wp.cast(RECIPROCAL - wp.cast(v[0], int), float), wp.cast(RECIPROCAL - wp.cast(v[1], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[2], int), float), wp.cast(RECIPROCAL - wp.cast(v[3], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[4], int), float), wp.cast(RECIPROCAL - wp.cast(v[5], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[6], int), float), wp.cast(RECIPROCAL - wp.cast(v[7], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[8], int), float), wp.cast(RECIPROCAL - wp.cast(v[9], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[10], int), float), wp.cast(RECIPROCAL - wp.cast(v[11], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[12], int), float), wp.cast(RECIPROCAL - wp.cast(v[13], int), float),
-        wp.cast(RECIPROCAL - wp.cast(v[14], int), float), wp.cast(RECIPROCAL - wp.cast(v[15], int), float),
-    )  # fmt: skip
-    y = wp.cw_mul(bits, lanes(2.0) - wp.cw_mul(v, bits))
-    y = y + wp.cw_mul(y, lanes(1.0) - wp.cw_mul(v, y))
-    return y + wp.cw_mul(y, lanes(1.0) - wp.cw_mul(v, y))
 
 
 @wp.func

@@ -63,7 +63,7 @@ class Captured:
 def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole, features=None):
     """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
-    kept.needs_input_grad = (False,) * 11
+    kept.needs_input_grad = (True,) * 11
     return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), features, None, None, *gaussians.tensors().values())
 
 
