@@ -58,7 +58,7 @@ def a_render_interrupted_at_any_stage(device: str) -> list[str]:
     def fail(*_arguments, **_more):
         raise KeyboardInterrupt
 
-    stages = [(bridge, "run"), (bridge, "depth_order"), (compositing, "tile_lists"), (compositing, "_composite")]
+    stages = [(bridge, "run_each"), (bridge, "depth_order"), (compositing, "tile_lists"), (compositing, "_composite")]
     for room, stage in [*stages, (compositing, "_composite_backward"), (compositing, "_of_part")]:
         kept = getattr(room, stage)
         setattr(room, stage, fail)
