@@ -67,9 +67,9 @@ class Enhancer:
     def step(self, frame: Frame | torch.Tensor, memory: Memory | None = None) -> tuple[torch.Tensor, Memory]:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 
-        frame   rgb `[H, W, 3]` display-referred, of any size, or a rendered Frame: its flow_prev then moves the memory exactly,
-                its instance says where objects were put, and its need where there is anything to do at all, all three optional.
-                Without flow the memory stays in place.
+        frame   rgb `[H, W, 3]` display-referred, of any size (beyond 1280 pixels a side it is worked on in parts), or a rendered
+                Frame: its flow_prev then moves the memory exactly, its instance says where objects were put, and its need where
+                there is anything to do at all, all three optional. Without flow the memory stays in place.
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
@@ -84,14 +84,14 @@ class Enhancer:
         flow = None
         if given.flow is not None and memory is not None:
             flow = _pad(given.flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan)
-        tiles = None if given.need is None else Tiles.of(given.need)
-        if tiles is not None and tiles.nothing():
+        tiles = Tiles.of(torch.ones(height, width) if given.need is None else given.need)
+        if tiles.nothing():
             return rgb, self._skipped(memory, (height, width), flow)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if given.mask is None else _pad(given.mask.to(self.device, torch.float32)[None, None], value=0)
         past = None if memory is None else self._brought(memory, flow, padded)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            if tiles is None or tiles.everything():
+            if tiles.everything():
                 out = self.net(padded, mask, past)
                 better, after = out.rgb, out.past
             else:

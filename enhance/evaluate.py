@@ -26,6 +26,9 @@ from scenes.lenses import Pinhole
 HIGHEST = 60.0
 """PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""
 
+EVERY = 3
+"""Every how many frames the measures are taken that cost more than the enhancer: SSIM, features, sharpness."""
+
 SMALLEST = 200
 """Pixels that a region must have to be measured by itself."""
 
@@ -74,7 +77,7 @@ def evaluate(
     """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
-    weights are measured alike. `limit` is the most clips of a kind. ValueError where nothing is held out.
+    weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
     """
     encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False)
 
@@ -83,7 +86,7 @@ def evaluate(
 
     rows = []
     for kind in KINDS:
-        shards = pairs.of(kind, split)[:limit]
+        shards = spread(pairs.of(kind, split), limit)
         for method in METHODS if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
@@ -91,6 +94,13 @@ def evaluate(
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
+
+
+def spread(shards: Sequence[Shard], most: int | None) -> Sequence[Shard]:
+    """At most `most` of the clips, from the first to the last as evenly as there can be."""
+    if most is None or len(shards) <= most:
+        return shards
+    return [shards[i] for i in np.linspace(0, len(shards) - 1, most).round().astype(int)]
 
 
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
@@ -126,10 +136,14 @@ def _measure(found: dict[str, list[float]], better: torch.Tensor, window: Window
     target = window.target[t].permute(1, 2, 0)
     region = window.region[t, 0] > 0.5
     found["frame"].append(psnr(better, target))
-    found["ssim"].append(ssim(better, target))
-    if int(region.sum()) < SMALLEST:
+    large = int(region.sum()) >= SMALLEST
+    if large:
+        found["region"].append(psnr(better, target, region))
+    if t % EVERY != EVERY - 1:
         return
-    found["region"].append(psnr(better, target, region))
+    found["ssim"].append(ssim(better, target))
+    if not large:
+        return
     found["ssim in the region"].append(region_ssim(better, target, region))
     found["features"].append(feature_distance(better, target, region, features))
     found["sharpness"].append(sharpness(better, region) / max(sharpness(target, region), 1e-9))

@@ -230,13 +230,16 @@ class Net(nn.Module):
         better, pixels = rgb.clone(), F.pad(tiles.pixels(), (0, width - tiles.width, 0, height - tiles.height))
         latent = rgb.new_zeros(1, LATENT, height // STRIDE, width // STRIDE)
         known = latent[:, :1].clone()
-        for window in tiles.windows():
+        for window, core in tiles.windows():
             y, x = within(window, height, width)
             local = sampled(fields, (y, x), height, width)
             picture, _, _, _, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)), local)
-            better[..., y, x] = torch.where(pixels[y, x].to(rgb.device), picture, rgb[..., y, x])
-            rows, columns = coarser((y, x), STRIDE)
-            latent[..., rows, columns], known[..., rows, columns] = found, 1
+            v, u = within(core, height, width)
+            inner = slice(v.start - y.start, v.stop - y.start), slice(u.start - x.start, u.stop - x.start)
+            better[..., v, u] = torch.where(pixels[v, u].to(rgb.device), picture[..., inner[0], inner[1]], rgb[..., v, u])
+            rows, columns = coarser((v, u), STRIDE)
+            part = coarser(inner, STRIDE)
+            latent[..., rows, columns], known[..., rows, columns] = found[..., part[0], part[1]], 1
         return better, past.followed(better, latent, fields, count, self.config.history, known)
 
     def _history(self, past: Past) -> tuple[torch.Tensor, torch.Tensor]:

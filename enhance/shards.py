@@ -109,14 +109,14 @@ class Shard:
 
 def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:
     """Store one clip; the json file is written last, so a shard without one is unfinished and is made again."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     for name, dtype in STORED.items():
         check_tensor(name, tensors[name], ("T", "H", "W", {"flow": 2}.get(name, 3)) if tensors[name].ndim == 4 else ("T", "H", "W"), dtype)
     path.parent.mkdir(parents=True, exist_ok=True)
     t, h, w = tensors["region"].shape
     with atomic_file(path) as half:
-        save_file({name: tensors[name].contiguous() for name in STORED}, str(half))
+        half.write_bytes(save({name: tensors[name].contiguous() for name in STORED}))
     with atomic_file(path.with_suffix(".json")) as half:
         Path(half).write_text(json.dumps({"frames": t, "height": h, "width": w, **meta}, indent=1))
 

@@ -19,6 +19,9 @@ NEEDED = 0.25
 MARGIN = 1
 """Tiles around those worked on that are looked at, too."""
 
+LARGEST = 40
+"""Tiles a side (1280 pixels) of a window: attention over more costs more than twice for twice, and was not trained for."""
+
 MOST = 0.75
 """Of the frame: windows that cover more are slower than the whole, whose picture is the better one."""
 
@@ -38,30 +41,42 @@ class Tiles:
         """Of a need map `[H, W]` in 0..1."""
         height, width = need.shape
         pad = (0, -width % TILE, 0, -height % TILE)
-        cells = F.avg_pool2d(F.pad(need.float(), pad)[None, None], CELL)
+        cells = F.avg_pool2d(F.pad(need.float()[None, None], pad, mode="replicate"), CELL)
         tiles = F.max_pool2d(cells, TILE // CELL)[0, 0] > NEEDED
         return cls(tiles.cpu().numpy(), height, width)
 
     def nothing(self) -> bool:
         return not self.needed.any()
 
-    def windows(self) -> list[Window]:
-        """Rows and columns of rectangles in pixels, each around tiles that touch or nearly do; one of the whole frame where that is less
-        work. They may reach past the frame by part of a tile."""
+    def windows(self) -> list[tuple[Window, Window]]:
+        """Rows and columns of rectangles in pixels, each around tiles that touch or nearly do, one of the whole frame where that is less
+        work; and the part of each whose result counts: a rectangle of more than LARGEST tiles a side is worked on in parts that
+        overlap. They may reach past the frame by part of a tile."""
         around = ndimage.binary_dilation(self.needed, np.ones((3, 3)), MARGIN)
         boxes = ndimage.find_objects(ndimage.label(around, np.ones((3, 3)))[0])
         if sum(self.needed[box].size for box in boxes) > MOST * self.needed.size:
             boxes = [(slice(0, self.needed.shape[0]), slice(0, self.needed.shape[1]))]
-        return [(_scaled(rows), _scaled(columns)) for rows, columns in boxes]
+        parts = [(r, c) for rows, columns in boxes for r in _parts(rows) for c in _parts(columns)]
+        return [((_scaled(r[0]), _scaled(c[0])), (_scaled(r[1]), _scaled(c[1]))) for r, c in parts]
 
     def everything(self) -> bool:
         """Whether the whole frame is one window."""
-        return any(w == (slice(0, TILE * self.needed.shape[0]), slice(0, TILE * self.needed.shape[1])) for w in self.windows())
+        whole = slice(0, TILE * self.needed.shape[0]), slice(0, TILE * self.needed.shape[1])
+        return any(window == whole for window, _ in self.windows())
 
     def pixels(self) -> torch.Tensor:
         """The tiles as a mask, bool `[H, W]`."""
         grown = torch.from_numpy(self.needed.repeat(TILE, 0).repeat(TILE, 1))
         return grown[: self.height, : self.width]
+
+
+def _parts(tiles: slice) -> list[tuple[slice, slice]]:
+    """Equal parts of at most LARGEST tiles: with a margin towards each other, and without."""
+    length = tiles.stop - tiles.start
+    count = -(-length // LARGEST)
+    ends = [tiles.start + round(i * length / count) for i in range(count + 1)]
+    cores = [slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]
+    return [(slice(max(c.start - MARGIN, tiles.start), min(c.stop + MARGIN, tiles.stop)), c) for c in cores]
 
 
 def _scaled(tiles: slice) -> slice:

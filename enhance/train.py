@@ -101,8 +101,10 @@ class _Run:
 
     def save(self, path: Path) -> None:
         state = {name: part.state_dict() for name, part in self.parts().items()}
-        with atomic_file(path) as half:
-            torch.save({"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds, **state}, half)
+        facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds}
+        # through Python's file, which says that the disk is full; torch's own writer says "unexpected pos"
+        with atomic_file(path) as half, open(half, "wb") as file:
+            torch.save({**facts, **state}, file)
 
     def load(self, path: Path) -> None:
         try:

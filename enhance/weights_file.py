@@ -17,11 +17,12 @@ FORMAT = "sidestep-enhancer-1"
 
 def save_net(net: Net, path: str | Path, about: dict) -> None:
     """Write `net` to `path`; `about` is json-like: data, licence, attribution, seed, steps, minutes, command."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     state = {name: value.detach().to("cpu", torch.float16).contiguous() for name, value in net.state_dict().items()}
     with atomic_file(path) as half:
-        save_file(state, str(half), {"format": FORMAT, "config": json.dumps(asdict(net.config)), "about": json.dumps(about)})
+        # written by Python, whose error says that the disk is full
+        half.write_bytes(save(state, {"format": FORMAT, "config": json.dumps(asdict(net.config)), "about": json.dumps(about)}))
 
 
 def load_net(path: str | Path) -> tuple[Net, dict]:

@@ -48,7 +48,8 @@ def test_tiles_are_those_whose_cells_need_something_and_single_pixels_do_not_cou
 def test_windows_hold_their_tiles_with_a_margin_and_far_ones_are_apart():
     near, far = Tiles.of(need_at((40, 100), (40, 132))), Tiles.of(need_at((10, 10), (100, 290)))
     assert len(near.windows()) == 1 and len(far.windows()) == 2
-    assert near.windows()[0] == (slice(0, 96), slice(64, 192))
+    whole = (slice(0, 96), slice(64, 192))
+    assert near.windows()[0] == (whole, whole)
     assert Tiles.of(torch.ones(H, W)).everything() and Tiles.of(torch.zeros(H, W)).nothing() and not far.everything()
 
 
@@ -117,3 +118,22 @@ def test_after_many_frames_that_need_nothing_there_is_no_past(enhancer):
         _, memory = enhancer.step(frame(rgb, need=none, flow_prev=flow), memory)
     assert memory.past is None
     assert torch.equal(enhancer.step(frame(rgb, flow_prev=flow), memory)[0], enhancer.step(frame(rgb))[0])
+
+
+def test_large_frames_are_worked_on_in_parts_that_cover_every_pixel_once():
+    tiles = Tiles(torch.ones(68, 120, dtype=torch.bool).numpy(), 2160, 3840)  # 4K
+    count = torch.zeros(68 * TILE, 120 * TILE, dtype=torch.int32)
+    for window, core in tiles.windows():
+        count[core] += 1
+        assert all(w.start <= c.start and c.stop <= w.stop and w.stop - w.start <= 42 * TILE for w, c in zip(window, core, strict=True))
+    assert (count == 1).all() and not tiles.everything() and len(tiles.windows()) == 6
+
+
+def test_parts_of_a_large_frame_are_about_the_whole(enhancer, monkeypatch):
+    rgb = picture()
+    memory = enhancer.step(rgb)[1]
+    whole, _ = enhancer.step(rgb, memory)
+    monkeypatch.setattr("enhance.tiles.LARGEST", 6)
+    parts, after = enhancer.step(rgb, memory)
+    assert not torch.equal(parts, whole) and (parts - whole).abs().mean() < 0.3 * (whole - rgb).abs().mean()
+    assert (after.past.valid[0, 0] == 1).all()

@@ -1,7 +1,9 @@
 """Training: repeatable, resumable, and downhill."""
 
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -97,3 +99,44 @@ def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_p
     for name, value in before.state_dict().items():
         same = torch.equal(after.state_dict()[name], value)
         assert same if name.startswith("encoder.") else not (same and name == "decoder.pixels.weight"), name
+
+
+@pytest.fixture(scope="module")
+def trained(pairs, tmp_path_factory):
+    """The folder of a short training."""
+    return train(pairs, tmp_path_factory.mktemp("trained"), steps=3, config=QUICK, net=SMALL).parent
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_disk_that_fills_and_a_stop_in_the_middle_of_saving_lose_nothing(pairs, trained, monkeypatch, fault):
+    kept, before = (trained / "checkpoint.pt").read_bytes(), sorted(trained.iterdir())
+    save = torch.save
+
+    def half(state, file):
+        save({"step": state["step"]}, file)
+        raise fault
+
+    monkeypatch.setattr(torch, "save", half)
+    with pytest.raises(type(fault)):
+        train(pairs, trained, steps=4, config=QUICK, net=SMALL, resume=True, save_every=0)
+    monkeypatch.undo()
+    assert (trained / "checkpoint.pt").read_bytes() == kept and sorted(trained.iterdir()) == before
+    train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")
+def test_a_full_disk_is_called_that(pairs, trained, monkeypatch):
+    @contextmanager
+    def full(path):
+        yield Path("/dev/full")
+
+    monkeypatch.setattr(sys.modules["enhance.train"], "atomic_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
+
+
+@pytest.mark.parametrize("spoil", [lambda b: b[: len(b) // 2], lambda b: b"not a checkpoint", lambda b: b""])
+def test_a_broken_checkpoint_is_refused_by_name(pairs, trained, tmp_path, spoil):
+    (tmp_path / "checkpoint.pt").write_bytes(spoil((trained / "checkpoint.pt").read_bytes()))
+    with pytest.raises(ValueError, match="checkpoint.pt is not a checkpoint of this training"):
+        train(pairs, tmp_path, steps=3, config=QUICK, net=SMALL, resume=True)
