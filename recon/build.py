@@ -26,6 +26,7 @@ from scenes.files import save
 from scenes.gaussians import Placed
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
+from scenes.space_order import space_order
 
 PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""
@@ -187,7 +188,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         if not t.moving and t.name.startswith("veh")
     ]
     sky = Sky(linear_from_srgb(fit.sky.detach().clamp(0, 1)))
-    background = Placed(groups[0], torch.eye(4, dtype=torch.float64))
+    background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
     return Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
 

@@ -17,6 +17,7 @@ from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation
+from scenes.space_order import space_order
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("SIDESTEP_SHARED", REPOSITORY.parent / "shared"))
@@ -64,17 +65,6 @@ def street(count: int, folder: Path | None = None) -> Preset:
     tiles = [replace(g, means=g.means + torch.tensor([150.0 * x, 150.0 * y, 0.0])) for x, y in cells[:copies]]
     whole = Gaussians.cat(tiles).select(torch.arange(count))
     return Preset([Placed(whole, first.placed[0].world_from_local)], first.camera, first.model)
-
-
-def space_order(means: torch.Tensor) -> torch.Tensor:
-    """Indices `[N]` along the Z-order curve (Morton 1966) through a grid of 1024 cells a side: neighbours in space are near in memory."""
-    low, high = means.quantile(0.001, 0), means.quantile(0.999, 0)
-    cells = ((means - low) / (high - low) * 1023).clamp(0, 1023).long()
-    code = torch.zeros(len(means), dtype=torch.long)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code.argsort()
 
 
 def biker() -> Preset:

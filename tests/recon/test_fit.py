@@ -17,7 +17,7 @@ from scenes import Scene, load
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
-CONFIG = FitConfig(steps=160, budget=8000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
+CONFIG = FitConfig(steps=160, budget=11_000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
 SIZE = (96, 54)
 
 
