@@ -41,6 +41,9 @@ class Recon:
         from recon import open_log, reconstruct
         from scenes.usd_scene import is_scene
 
+        shelf = self.output.parent
+        if not shelf.exists() and shelf.parent.is_dir():
+            shelf.mkdir()  # the first scene of scenes/ makes that folder
         fresh(self.output, self.overwrite)
         if self.output.exists() and not is_scene(self.output):
             raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
