@@ -24,7 +24,8 @@ class Pairs:
     data: tuple[Path, ...] = ()
     """The recordings that the scenes were reconstructed from, in the same order."""
     kinds: Names = None
-    """Which damage: sparse, cycle, crossref, underfit, isp, relight, shadow, reinsert, clean."""
+    """Which damage, of sparse, cycle, crossref, underfit, isp, relight, shadow, reinsert, clean; the reconstructions from less that the
+    first four take are fitted once, some minutes each."""
     cameras: Names = None
     """Cameras to use; the front camera's pairs are never trained on."""
     skies: tuple[Path, ...] = ()
@@ -38,18 +39,17 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.clips import PairConfig
-        from enhance.pairs import check_kinds, make_pairs, open_reconstruction, prepare_sources
-        from enhance.shards import KINDS
+        from enhance.pairs import check_kinds, kinds_for, make_pairs, open_reconstruction, prepare_sources
         from recon import open_log
         from render.progress import Progress
 
         if not self.scenes or len(self.scenes) != len(self.data):
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
-        kinds = self.kinds or KINDS
-        check_kinds(kinds)
+        check_kinds(self.kinds or ())
         for path, data in zip(self.scenes, self.data, strict=True):
             scene, log = open_reconstruction(path), open_log(data)
+            kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
             sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank)
             with Progress(f"pairs {path.name}") as steps:

@@ -101,6 +101,13 @@ def prepare_sources(
     return Sources([s for s in map(load, early) if isinstance(s, Scene)], made, [_sky(path) for path in skies], own, anywhere)
 
 
+def kinds_for(scene: Scene, log: Log) -> tuple[str, ...]:
+    """All kinds that can be made of a scene and its recording: crossref takes two cameras, shadow an object to cut out."""
+    cameras = [name for name in log.cameras if name in scene.rig]
+    objects = scene.actors or scene.meta.get("parked")
+    return tuple(k for k in KINDS if (k != "crossref" or len(cameras) > 1) and (k not in ("shadow", "reinsert") or objects))
+
+
 def open_reconstruction(path: str | Path | Scene) -> Scene:
     """A scene; ValueError where the path holds something else."""
     scene = path if isinstance(path, Scene) else load(path)

@@ -1,6 +1,7 @@
 """Pairs of a made-up street: its "recording" is rendered from it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from enhance.clips import PairConfig
 from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
-from enhance.pairs import make_pairs, prepare_sources
+from enhance.pairs import kinds_for, make_pairs, prepare_sources
 from enhance.refits import REFITS, Refit
 from enhance.shards import KINDS, PairSet
 from recon.log import Log, LogCamera
@@ -108,6 +109,12 @@ def test_a_kind_without_what_it_is_made_from_says_what_it_needs(street, recordin
             make_pairs(street, recording, tmp_path / kind, kinds=(kind,), config=CONFIG)
     with pytest.raises(ValueError, match="Did you mean sparse"):
         prepare_sources(street, recording, tmp_path, ("spars",))
+
+
+def test_without_being_told_kinds_are_those_that_can_be_made(street, recording):
+    alone = replace(street, rig={"front_camera": street.rig["front_camera"]}, actors=())
+    assert kinds_for(street, recording) == KINDS
+    assert set(KINDS) - set(kinds_for(alone, recording)) == {"crossref", "shadow", "reinsert"}
 
 
 def test_kinds_may_be_added_to_a_folder(street, recording, tmp_path):
