@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -16,7 +16,7 @@ from render.kernels.types import GRADIENTS, TILE, Window, lanes
 from render.launch import BANDS, run, run_blocks, view
 from render.order import TileLists, tile_lists
 from render.projected import Part, Projected
-from render.ray_compositing import add_window, draw_rays, draw_rays_backward, lanes_of
+from render.ray_compositing import add_window, draw_rays, draw_rays_backward, lanes_of, lists_where, settled_tiles
 from render.settings import Settings
 
 
@@ -32,7 +32,7 @@ class Picture:
 @dataclass(frozen=True)
 class Slots:
     """Gradients of the records: those of record j are values[starts[j] : starts[j] + counts[j]], to be summed; the others are summed:
-    channels `[N, C]`, frames `[N, FRAME]`, rays `[H, W, 3]`."""
+    channels `[N, C]`, frames `[N, FRAME]`, rays `[G, C, H, W]`."""
 
     counts: torch.Tensor
     starts: torch.Tensor
@@ -75,7 +75,7 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     device = scene.records.device
     sums = Sums(scene.counts) if len(parts) > 1 else None
     g_features = None if scene.features is None else torch.zeros_like(scene.features)
-    g_frames = None if scene.frames is None else torch.zeros_like(scene.frames)
+    g_frames = None if scene.frames is None else torch.zeros_like(scene.frames, dtype=torch.float32)
     g_rays = None if scene.rays is None else torch.zeros_like(scene.rays)
     wanted = [g if g.ndim == 3 else g[None] for g in gradients if g is not None]
     if settings.mask is not None:
@@ -88,7 +88,10 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
         channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
         grads = _of_part(settings, part, wanted)
         if g_frames is not None and g_rays is not None:
-            frame_slots, of_window = draw_rays_backward(settings, part, lists, scene, grads, slots, channel_slots)
+            settled, *ends = part.ends
+            plain, crossing = lists_where(lists, settled), lists_where(lists, 1 - settled)
+            _composite_backward(settings, replace(part, ends=tuple(ends)), plain, scene, grads, slots, channel_slots)
+            frame_slots, of_window = draw_rays_backward(settings, part, crossing, scene, grads, slots, channel_slots, settled)
             if len(frame_slots):
                 add_to(g_frames, counts, lists, frame_slots)
             add_window(g_rays, part.window, of_window)
@@ -153,8 +156,16 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
     planes = _planes(w, settings.wanted.first_channel + scene.channels, device)
     picks = _planes(w, 2 if settings.wanted.picks else 0, device)
     if settings.by_rays:
-        draw_rays(settings, w, lists, scene, planes, picks)
-        return planes, picks, ()
+        settled = settled_tiles(settings, w, lists, scene)
+        ends = _by_tile(settings, w, lists_where(lists, settled), scene, planes, picks)
+        draw_rays(settings, w, lists_where(lists, 1 - settled), scene, planes, picks, settled)
+        return planes, picks, (settled, *ends)
+    return planes, picks, _by_tile(settings, w, lists, scene, planes, picks)
+
+
+def _by_tile(settings: Settings, w: Window, lists: TileLists, scene: Projected, planes, picks) -> tuple[torch.Tensor, ...]:
+    """Fill planes and picks in the tiles' order; returns where compositing ended."""
+    device = scene.records.device
     lists_of = [view(lists.starts, int), view(lists.ids, int)]
     limits = [settings.alpha_max, settings.termination]
     if device.type == "cuda":
@@ -162,13 +173,13 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
         kernel = composite_blocks(settings.wanted, TILE)
         args = [*lists_of, view(scene.records, float), *_features(scene), w, *limits, view(planes, float), view(picks, float)]
         run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(last, int)], device)
-        return planes, picks, (last,)
+        return (last,)
     ends = planes.shape[1:] if settings.gradients else (0, 0)
     last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends)
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
     out = [lanes_of(planes), lanes_of(picks), view(last, int), lanes_of(dark_at)]
     run(composite(settings.wanted, settings.squarings, settings.gradients), BANDS, [*args, *out], device)
-    return planes, picks, (last, dark_at)
+    return last, dark_at
 
 
 def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene: Projected, grads, slots, channel_slots) -> None:

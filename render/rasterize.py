@@ -19,12 +19,12 @@ from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
-from render.rays import camera_rays
+from render.rays import exact_rays
 from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
-from scenes.lenses import Orthographic
+from scenes.poses import inverse
 
 
 @overload
@@ -113,7 +113,7 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         gradients=torch.is_grad_enabled(),
     )
     fields = [t for p in seen for t in p.gaussians.tensors().values()]
-    frames, rays = _along_rays(seen, camera, cam_from_local) if settings.by_rays else (None, None)
+    frames, rays = _along_rays(seen, camera, settings) if settings.by_rays else (None, None)
     lens = camera.lens.params()
     rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, lens, channels, frames, rays, *fields)
 
@@ -144,12 +144,13 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
-def _along_rays(placed: list[Placed], camera: Camera, cam_from_local: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The splats' canonical frames and the camera's rays, which hold all gradients of the lens."""
-    frames = torch.cat([canonical_frames(p.gaussians, pose) for p, pose in zip(placed, cam_from_local[:, 0], strict=True)])
-    if torch.is_grad_enabled() and camera.lens.params().requires_grad:
-        return frames, camera.lens.unproject(camera.pixel_centres()).to(frames)
-    return frames, camera_rays(camera).to(frames)
+def _along_rays(placed: list[Placed], camera: Camera, settings: Settings) -> tuple[torch.Tensor, torch.Tensor]:
+    """The splats' canonical frames and the camera's rays, which hold all gradients of response "ray"; an order has none."""
+    with torch.set_grad_enabled(torch.is_grad_enabled() and settings.model.response == "ray"):
+        rays, groups = exact_rays(camera, placed, settings.rolling)
+        cam_from_world = inverse(camera.world_from_cam)
+        there = [(p.gaussians, cam_from_world @ p.world_from_local, group) for p, group in zip(placed, groups, strict=True)]
+        return torch.cat([canonical_frames(*one) for one in there]), rays
 
 
 def _as_placed(splats) -> list[Placed]:
@@ -180,8 +181,6 @@ def _check(placed, camera, outputs, flow_to, model, config) -> None:
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
     if model.response == "ray" or config.order == "pixel":
         which = 'response "ray"' if model.response == "ray" else 'order "pixel"'
-        if isinstance(camera.lens, Orthographic) or moves(camera, placed):
-            raise ValueError(f'{which} needs rays from one eye that stands still; use shutter="global" and a lens that has an eye')
         if placed[0].gaussians.device.type != "cpu":
             raise ValueError(f"{which} is drawn on the CPU only; move the splats there, or use the default")
     check_projection(camera, placed, model)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
 
 from scenes.camera import Camera
+from scenes.gaussians import Placed
 from scenes.lenses import Orthographic
-from scenes.poses import interpolate
+from scenes.poses import interpolate, inverse
 
 
 def camera_rays(camera: Camera) -> torch.Tensor:
@@ -31,10 +33,60 @@ def world_directions(camera: Camera) -> torch.Tensor:
     rays, start, end = camera_rays(camera), camera.world_from_cam.detach(), camera.world_from_cam_end
     if camera.shutter == "global" or end is None:
         return rays @ start[:3, :3].to(torch.float32).T
-    steps = camera.height if camera.shutter == "rows" else camera.width
-    share = (torch.arange(steps, dtype=torch.float64) + 0.5) / steps
-    turns = interpolate(start.expand(steps, 4, 4), end.detach().expand(steps, 4, 4), share)[:, :3, :3].to(torch.float32)
+    turns = readout(camera, start, end.detach())[:, :3, :3].to(torch.float32)
     return torch.einsum("hwj,hij->hwi" if camera.shutter == "rows" else "hwj,wij->hwi", rays, turns)
+
+
+def exact_rays(camera: Camera, placed: Sequence[Placed], moving: bool) -> tuple[torch.Tensor, list[int]]:
+    """float64 `[G, C, H, W]` rays through the pixel centres, and which of the G look at each of `placed`; differentiable in the lens and,
+    where the shutter moves, in all poses.
+
+    C is 3 where all rays begin in the eye, directions of depth 1; else 6, directions and where they begin. Each is in the frame of the
+    camera at its start pose: as the pixel sees it when it is read out, and, for an instance that moves by then, as if that stood still.
+    """
+    if not moving:
+        if torch.is_grad_enabled() and camera.lens.params().requires_grad:
+            return _exact(camera), [0] * len(placed)
+        return _kept_exact(camera.lens.key(), camera.width, camera.height), [0] * len(placed)
+    centres = camera.pixel_centres()
+    directions, origins = camera.lens.unproject(centres), camera.lens.origins(centres)
+    start_from_world = inverse(camera.world_from_cam)
+    world_from_cam = readout(camera, camera.world_from_cam, camera.world_from_cam_end)
+    groups, ways = [], [start_from_world @ world_from_cam]
+    for p in placed:
+        groups.append(0 if p.world_from_local_end is None else len(ways))
+        if groups[-1]:
+            local = readout(camera, p.world_from_local, p.world_from_local_end)
+            ways.append(start_from_world @ p.world_from_local @ inverse(local) @ world_from_cam)
+    along = "gnij,hnj->gihn" if camera.shutter == "columns" else "gnij,nwj->ginw"
+    way = torch.stack(ways)
+    shifts = way[..., :3, 3].transpose(1, 2)
+    shifts = shifts[:, :, None] if camera.shutter == "columns" else shifts[..., None]
+    turned, begun = (torch.einsum(along, way[..., :3, :3], v) for v in (directions, origins))
+    return torch.cat([turned, begun + shifts], 1), groups
+
+
+def readout(camera: Camera, start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:
+    """A pose `[n, 4, 4]` at the moments at which the rows or columns of the image are read out."""
+    steps = camera.width if camera.shutter == "columns" else camera.height
+    if end is None:
+        return start.expand(steps, 4, 4)
+    share = (torch.arange(steps, dtype=torch.float64) + 0.5) / steps
+    return interpolate(start.expand(steps, 4, 4), end.expand(steps, 4, 4), share)
+
+
+def _exact(camera: Camera) -> torch.Tensor:
+    centres = camera.pixel_centres()
+    parts = [camera.lens.unproject(centres)]
+    if isinstance(camera.lens, Orthographic):
+        parts.append(camera.lens.origins(centres))
+    return torch.cat(parts, -1).permute(2, 0, 1)[None].contiguous()
+
+
+@lru_cache(maxsize=8)
+def _kept_exact(key: tuple, width: int, height: int) -> torch.Tensor:
+    lens_type, *numbers = key
+    return _exact(Camera(lens_type(*numbers), width, height, torch.eye(4, dtype=torch.float64)))
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,7 @@ import torch
 from render.frame_types import RenderConfig
 from render.kernels.types import TILE, Wanted
 from scenes.gaussians import SplatModel
-from scenes.lenses import Lens, Pinhole
+from scenes.lenses import Lens, Orthographic, Pinhole
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,11 @@ class Settings:
     def by_rays(self) -> bool:
         """Whether pixels look along their own rays."""
         return self.model.response == "ray" or self.config.order == "pixel"
+
+    @property
+    def eyes(self) -> bool:
+        """Whether the pixels' rays begin in places of their own."""
+        return self.rolling or self.lens is Orthographic
 
     @property
     def squarings(self) -> int:

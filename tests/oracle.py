@@ -24,7 +24,7 @@ NEAREST = 0.5
 REACH = 3.33
 PART = 12  # pixels on a side of a part of a large picture
 BEYOND = 9.0  # sigma: exp(-40) is below float64's rounding of 1
-TIE = 1e-5  # of its depth: two splats nearer to each other than this on a ray may stand in either order
+TIE = 1e-9  # of its depth: two splats nearer to each other than this on a ray may stand in either order
 SEEN = 1e-5  # what such a swap must change to matter
 
 
@@ -99,33 +99,37 @@ def render(
     jumps: bool = False,
     world_from_cam_end: torch.Tensor | None = None,
     ends: list[torch.Tensor | None] | None = None,
+    features: bool = False,
 ):
     """rgb `[H, W, 3]`, alpha, depth, instance `[H, W]`, and `unsure` `[H, W]`: where the picture jumps within float32's rounding,
     since a splat is within 1e-4 of the cutoff, or since two that show change places; with jumps, by how much instead.
 
     placed: (fields, world_from_local, instance id). order: "tile", by depth of the centres, or "pixel", by `ray_depths`, which is
-    exact; no termination. world_from_cam_end, ends: what the camera and each of `placed` move to while the image is read out.
+    exact; no termination. world_from_cam_end, ends: what the camera and each of `placed` move to while the image is read out. features: the
+    fields hold `features` `[N, C]`; returns their sums `[H, W, C]` as well.
     """
     world_from_cam = camera.world_from_cam if world_from_cam is None else world_from_cam
     lens = camera.lens.params() if lens is None else lens
     optics = type(camera.lens)(*lens.unbind())
     ends = [None] * len(placed) if ends is None else ends
     moving = camera.shutter != "global" and any(end is not None for end in (world_from_cam_end, *ends))
-    parts = []
+    parts, ways = [], []
     for (g, world_from_local, instance), end in zip(placed, ends, strict=True):
+        pose = oracle_lens.pose_at((world_from_cam, world_from_cam_end), (world_from_local, end))
         if isinstance(optics, Pinhole) and not moving:
             part = _pinhole(g, inverse(world_from_cam) @ world_from_local, camera, model, lens)
         else:
-            pose = oracle_lens.pose_at((world_from_cam, world_from_cam_end), (world_from_local, end))
             rows, points, axes, sight, mean, covariance = oracle_lens.project(optics, camera, model, pose, g, moving)
-            part = points, axes, _colours(g["sh"][rows], sight), torch.sigmoid(g["logit_opacities"])[rows], mean, covariance
+            part = points, axes, _shown(g, rows, sight), torch.sigmoid(g["logit_opacities"])[rows], mean, covariance
+            if moving:
+                ways.append((pose, g["means"][rows], matrix_from_quat(g["quats"][rows]) * g["log_scales"][rows].exp()[:, None, :]))
         parts.append((*part, torch.full((len(part[0]),), instance)))
     points, axes, colour, opacity, mean, covariance, instances = (torch.cat(p) for p in zip(*parts, strict=True))
     dilated = covariance + model.dilation * torch.eye(2, dtype=torch.float64)
     if model.antialias:
         opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
     conic = torch.linalg.inv(dilated)
-    drawn = (points, axes, mean, conic, opacity, colour, instances)
+    drawn = (optics.depth(points), mean, conic, opacity, colour, instances)
     reach = BEYOND * torch.diagonal(dilated.detach(), dim1=-2, dim2=-1).sqrt()
     rows = []
     for strip in _parts(camera.pixel_centres(), len(points)):
@@ -133,10 +137,12 @@ def render(
         for pixels in strip:
             # of a part of a large picture only the splats that a float64 could see there
             near = ((mean.detach() - pixels.mean((0, 1))).abs() < reach + 0.5 * pixels.shape[0]).all(1) if len(strip) > 1 else slice(None)
-            shown.append(_composite(pixels, optics, *(t[near] for t in drawn), model.response, order, cutoff, alpha_max))
+            there = _as_read_out(camera, ways, pixels, near) if moving else (points[None, near], axes[None, near])
+            shown.append(_composite(pixels, optics, there, *(t[near] for t in drawn), model.response, order, cutoff, alpha_max))
         rows.append([torch.cat(part, 1) for part in zip(*shown, strict=True)])
     rgb, alpha, depth, instance, jump = (torch.cat(part) for part in zip(*rows, strict=True))
-    return rgb, alpha, depth, instance, jump if jumps else jump > SEEN
+    frame = rgb[..., :3], alpha, depth, instance, jump if jumps else jump > SEEN
+    return (*frame, rgb[..., 3:]) if features else frame
 
 
 def _pinhole(g, cam_from_local: torch.Tensor, camera: Camera, model: SplatModel, lens: torch.Tensor):
@@ -144,13 +150,19 @@ def _pinhole(g, cam_from_local: torch.Tensor, camera: Camera, model: SplatModel,
     points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
     axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
     keep = in_view(points, axes, lens, camera.width, camera.height, model.dilation)
-    colour = _colours(g["sh"][keep], g["means"][keep] - inverse(cam_from_local)[:3, 3])
+    colour = _shown(g, keep, g["means"][keep] - inverse(cam_from_local)[:3, 3])
     points, axes = points[keep], axes[keep]
     if model.projection == "ewa":
         mean, covariance = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
     else:
         mean, covariance = project_ut(points, axes, lens, camera.width, camera.height)
     return points, axes, colour, torch.sigmoid(g["logit_opacities"][keep]), mean, covariance
+
+
+def _shown(g: dict[str, torch.Tensor], rows: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
+    """Colours, and beside them the features where there are some."""
+    colours = _colours(g["sh"][rows], sight)
+    return torch.cat([colours, g["features"][rows]], 1) if "features" in g else colours
 
 
 def _colours(sh: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
@@ -170,25 +182,40 @@ def truth(placed: list[Placed], camera: Camera, model: SplatModel, order: str = 
     return rgb, jump
 
 
+def _as_read_out(camera: Camera, ways: list, pixels: torch.Tensor, near) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points `[P, N, 3]` and axes `[P, N, 3, 3]` in the camera as it and each instance stand when each of `pixels` is read out."""
+    axis, extent = (0, camera.width) if camera.shutter == "columns" else (1, camera.height)
+    share = pixels.reshape(-1, 2)[:, axis] / extent
+    points, axes = [], []
+    for pose, means, local in ways:
+        at = pose(share)[:, None]
+        points.append(oracle_lens.transformed(at, means))
+        axes.append(at[..., :3, :3] @ local)
+    return torch.cat(points, 1)[:, near], torch.cat(axes, 1)[:, near]
+
+
+def _canonical(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, origins: torch.Tensor):
+    """Directions and centres `[P, N, 3]` seen from the rays' origins, where each Gaussian is the unit one: A^-1 with A its scaled axes."""
+    inverse_axes = (axes / axes.square().sum(-2, keepdim=True)).transpose(-1, -2)
+    return torch.einsum("pnij,pj->pni", inverse_axes, rays), torch.einsum("pnij,pnj->pni", inverse_axes, points - origins[:, None])
+
+
 def ray_depths(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, origins: torch.Tensor) -> torch.Tensor:
     """`[P, N]`: where along each ray `[P, 3]` from its origin `[P, 3]`, in its own lengths, each 3D Gaussian is greatest; with z = 1, a
-    depth in metres.
+    depth in metres. points `[P or 1, N, 3]`, axes `[P or 1, N, 3, 3]`.
 
     With A the Gaussian's scaled axes as columns, t = (A^-1 d) . (A^-1 p) / |A^-1 d|^2 (the order of StopThePop, Radl et al. 2024).
     """
-    inverse_axes = (axes / axes.square().sum(1, keepdim=True)).transpose(1, 2)
-    d = torch.einsum("nij,pj->pni", inverse_axes, rays)
-    away = torch.einsum("nij,pnj->pni", inverse_axes, points - origins[:, None])
+    d, away = _canonical(points, axes, rays, origins)
     return (d * away).sum(-1) / d.square().sum(-1)
 
 
 def ray_exponents(points: torch.Tensor, axes: torch.Tensor, rays: torch.Tensor, origins: torch.Tensor) -> torch.Tensor:
     """`[P, N]`: half the squared Mahalanobis distance of each 3D Gaussian's centre from the nearest point of each ray (3DGUT, Wu et al.
     2025): at its greatest along the ray; of the eye's own place where that lies behind it, which is not seen."""
-    t = ray_depths(points, axes, rays, origins)
-    nearest = origins[:, None] + t[..., None] * rays[:, None] - points
-    away = torch.einsum("nij,pnj->pni", torch.linalg.inv(axes), nearest)
-    return torch.where(t > 0, 0.5 * away.square().sum(-1), torch.inf)
+    d, away = _canonical(points, axes, rays, origins)
+    t = (d * away).sum(-1) / d.square().sum(-1)
+    return torch.where(t > 0, 0.5 * (t[..., None] * d - away).square().sum(-1), torch.inf)
 
 
 def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[torch.Tensor, ...]]:
@@ -198,13 +225,13 @@ def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[
     return [strip.split(PART, 1) for strip in pixels.split(PART, 0)]
 
 
-def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, instances, response, order, cutoff, alpha_max):
+def _composite(pixels, lens: Lens, there, depths, mean, conic, opacity, colour, instances, response, order, cutoff, alpha_max):
     """rgb, alpha, depth, instance and jump of some pixels `[h, w, 2]`."""
     shape, pixels = pixels.shape[:2], pixels.reshape(-1, 2)
     d = pixels[:, None] - mean
     s = 0.5 * torch.einsum("pni,nij,pnj->pn", d, conic, d)
     if response == "ray":
-        s = ray_exponents(points, axes, lens.unproject(pixels), lens.origins(pixels))
+        s = ray_exponents(*there, lens.unproject(pixels), lens.origins(pixels))
     alpha = opacity * torch.exp(-s)
     jump = torch.zeros(len(pixels), dtype=torch.float64)
     if cutoff > 0:
@@ -212,9 +239,9 @@ def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, i
         jump = (margin.abs() < 1e-4 * (1 + s)).any(1).double()
         alpha = torch.where(margin > 0, alpha, torch.zeros_like(alpha))
     alpha = alpha.clamp_max(alpha_max)
-    depths = lens.depth(points)
     if order == "pixel":
-        keys = ray_depths(points, axes, lens.unproject(pixels).detach(), lens.origins(pixels).detach())
+        with torch.no_grad():
+            keys = ray_depths(*there, lens.unproject(pixels), lens.origins(pixels)).nan_to_num()
     else:
         keys = depths.expand_as(alpha)
     first = keys.detach().argsort(dim=1, stable=True)
@@ -226,10 +253,10 @@ def _composite(pixels, lens: Lens, points, axes, mean, conic, opacity, colour, i
         swap = (before * sorted_alpha)[:, :-1] * sorted_alpha[:, 1:] * (colour[first[:, 1:]] - colour[first[:, :-1]]).abs().amax(-1)
         jump = jump + torch.where(depth_step < TIE * depths[first[:, 1:]], swap, torch.zeros_like(swap)).sum(1)
     weight = alpha * before.gather(1, first.argsort(dim=1))
-    total = 1 - passing[:, -1] if len(points) else torch.zeros(len(pixels), dtype=torch.float64)
+    total = 1 - passing[:, -1] if len(depths) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
     depth = torch.where(drawn, weight @ depths / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
-    who = instances[weight.detach().argmax(1)] if len(points) else torch.full((len(pixels),), -1)
+    who = instances[weight.detach().argmax(1)] if len(depths) else torch.full((len(pixels),), -1)
     out = (weight @ colour, total, depth, torch.where(total < 0.5, -1, who), jump)
     return tuple(t.reshape(*shape, *t.shape[1:]) for t in out)
 

@@ -150,7 +150,7 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
         d = torch.cat([-moved[:, None], d - moved[:, None]], 1)
         weights = torch.tensor([2.0] + [1 / 6] * 6, dtype=torch.float64)
         covariance = torch.einsum("k,nki,nkj->nij", weights, d, d)
-    if isinstance(lens, Equirectangular):
+    if isinstance(lens, Equirectangular) and model.response == "conic":  # a ray meets a splat once, on whichever side of the seam
         other = torch.where(mean[:, :1] < lens.cx, lens.period(), -lens.period())
         copies = torch.cat([mean, mean + torch.cat([other, torch.zeros_like(other)], 1)])
         rows, points, axes, sight, covariance = (torch.cat([t, t]) for t in (rows, points, axes, sight, covariance))

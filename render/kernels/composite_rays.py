@@ -1,9 +1,9 @@
 """Compositing ray by ray, for the CPU: the response of the 3D Gaussian along each pixel's ray, and each pixel's own order of depth.
 
 Response "ray" takes the least exponent along the ray for the conic's; order "pixel" sorts by its place (`ray_rows.py`). A row of a tile
-makes a list of the entries that reach it, one lane vector an entry. Sorted, the list is kept by insertion, all lanes at once: entries
-come by the depth of their centres, which is nearly each ray's own order, so few places are passed. Backward makes the same list, goes
-through it from its end, and leaves each lane's part with the entry that it came from; then every entry sums up its row.
+makes a list of the entries that reach it, one lane vector an entry. Where every pixel's order is the list's, it is gone through as it
+stands; else its keys are sorted, all lanes at once, and each pixel takes its next entry's alpha and leaves the weight there. Then every
+entry adds its colour by its weights: so colours are never gathered. Backward makes the same list and goes through it from its end.
 """
 
 from functools import cache
@@ -13,22 +13,24 @@ import warp as wp
 from render.kernels.lanewise import below
 from render.kernels.ray_rows import (
     ALPHA,
-    OWNER,
-    PART_E,
-    PART_W,
+    CENTRE,
+    GROUP,
+    NONE,
+    PICKED,
+    SHADE,
     THROUGH,
-    canonical,
-    channel_of,
-    field_of,
+    WEIGHT,
+    dot,
+    entry,
+    lanes64,
     list_row,
     ray_functions,
-    rays_of,
     reach_of,
+    square,
 )
 from render.kernels.rows import ROLLED
 from render.kernels.types import (
     BLUE,
-    FRAME,
     G_BLUE,
     G_GREEN,
     G_H,
@@ -58,233 +60,290 @@ from render.kernels.types import (
     lanes,
 )
 
+SUMS = GRADIENTS + 12
+"""Sums of a tile's entry: a gradient slot, and d loss / d (A, p) of its canonical frame."""
+TWO = wp.constant(wp.float64(2.0))
+
+
+@wp.func
+def gathered(scattered: wp.array4d[float], band: int, field: int, keys: wp.array[wp.float64], place: int, entries: int):
+    """A field of each lane's own entry at a place of its order."""
+    out = lanes(0.0)
+    for j in range(TILE):
+        out[j] = scattered[band, field, entry(keys, place, j, entries), j]
+    return out
+
+
+@wp.func
+def scatter(scattered: wp.array4d[float], band: int, field: int, keys: wp.array[wp.float64], place: int, entries: int, values: lanes):
+    for j in range(TILE):
+        scattered[band, field, entry(keys, place, j, entries), j] = values[j]
+
 
 @cache
-def composite_rays(wanted: Wanted, ray: bool, ordered: bool, squarings: int):
-    """The forward kernel, for response "ray" or "conic", in each pixel's own order or the tiles'."""
-    make = list_row(ray, ordered, squarings)
+def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarings: int):
+    """The forward kernel, for response "ray" or "conic", in each pixel's own order or the tiles'. eyes: as of `ray_functions`."""
+    make = list_row(ray, eyes, ordered, squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], frames: wp.array2d[float],
-        features: wp.array2d[float], channels: int, rays: wp.array3d[lanes],
-        window: Window, bands: int, alpha_max: float, termination: float,
-        columns: wp.array[lanes], lists: wp.array3d[lanes], reach: wp.array3d[int],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], frames: wp.array2d[wp.float64],
+        features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
+        window: Window, bands: int, alpha_max: float, termination: float, entries: int,
+        columns: wp.array[lanes], lists: wp.array3d[lanes], scattered: wp.array4d[float], keys: wp.array[lanes64],
+        keys_by_lane: wp.array[wp.float64], reach: wp.array3d[int],
         planes: wp.array3d[lanes], picks: wp.array3d[lanes],
         first: int,
     ):  # fmt: skip
-        """lists `[bands, LISTS, longest tile list]`, reach `[bands, 2, longest]`: working memory."""
+        """elsewhere: 1 for tiles that are drawn by another kernel. lists `[bands, LISTS, longest tile list]`, scattered, the same memory by
+        lane, keys `[bands * longest]`, and by lane, reach `[bands, 3, longest]`, the first and last row of each entry and which of them
+        stand in the row's list: working memory. entries: a power of two, at least the longest list."""
         band = first + wp.tid()
         column = columns[0]
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % window.tiles_x
-            row0 = (tile // window.tiles_x) * TILE
-            x0 = float((window.left + tx) * TILE) + 0.5
-            y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
-            start = tile_starts[tile]
-            stop = tile_starts[tile + 1]
-            reach_of(records, ids, start, stop, x0, y0, band, reach)
-            for r in range(TILE):
-                row = row0 + r
-                d = rays_of(rays, row, tx)
-                count = make(ids, start, stop, records, frames, reach, d, column, x0, y0 + float(r), r, band, alpha_max, termination, lists)
-                t = lanes(1.0)
-                red = lanes(0.0)
-                green = lanes(0.0)
-                blue = lanes(0.0)
-                z = lanes(0.0)
-                weights = lanes(0.0)
-                median = lanes(0.0)
-                who = lanes(-1.0)
-                most = lanes(0.0)
-                if wp.static(wanted.channels):
-                    for c in range(channels):
-                        planes[wp.static(wanted.first_channel) + c, row, tx] = lanes(0.0)
-                for k in range(count):
-                    if wp.max(t) < termination:
-                        break
-                    owners = lists[band, OWNER, k]
-                    w = wp.cw_mul(t, lists[band, ALPHA, k])
-                    red = red + wp.cw_mul(w, field_of(records, ids, start, owners, RED))
-                    green = green + wp.cw_mul(w, field_of(records, ids, start, owners, GREEN))
-                    blue = blue + wp.cw_mul(w, field_of(records, ids, start, owners, BLUE))
-                    if wp.static(wanted.depth):
-                        z = z + wp.cw_mul(w, field_of(records, ids, start, owners, Z))
-                        weights = weights + w
+            if elsewhere[tile] == 0:
+                tx = tile % window.tiles_x
+                row0 = (tile // window.tiles_x) * TILE
+                x0 = float((window.left + tx) * TILE) + 0.5
+                y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
+                start = tile_starts[tile]
+                stop = tile_starts[tile + 1]
+                reach_of(records, ids, start, stop, x0, y0, band, reach)
+                first_key = band * reach.shape[2]
+                for r in range(TILE):
+                    row = row0 + r
+                    count, crossing = make(
+                        ids, start, stop, records, frames, reach, rays, column, x0, y0 + float(r), row, tx, r, band,
+                        alpha_max, termination, entries, first_key, lists, keys, keys_by_lane,
+                    )  # fmt: skip
+                    for m in range(count):
+                        lists[band, WEIGHT, m] = lanes(0.0)
+                        if wp.static(wanted.median):
+                            lists[band, PICKED, m] = lanes(0.0)
+                    t = lanes(1.0)
+                    for k in range(count):
+                        if (k & 7) == 0:  # noqa: SIM102 - looking costs more than drawing one
+                            if wp.max(t) < termination:
+                                break
+                        a = lists[band, ALPHA, k]
+                        if crossing:
+                            a = gathered(scattered, band, ALPHA, keys_by_lane, first_key + k, entries)
+                        w = wp.cw_mul(t, a)
+                        if crossing:
+                            scatter(scattered, band, WEIGHT, keys_by_lane, first_key + k, entries, w)
+                        else:
+                            lists[band, WEIGHT, k] = w
+                        if wp.static(wanted.median):
+                            here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
+                            if crossing:
+                                scatter(scattered, band, PICKED, keys_by_lane, first_key + k, entries, here)
+                            else:
+                                lists[band, PICKED, k] = here
+                        t = t - w
+                    red = lanes(0.0)
+                    green = lanes(0.0)
+                    blue = lanes(0.0)
+                    z = lanes(0.0)
+                    weights = lanes(0.0)
+                    median = lanes(0.0)
+                    who = lanes(-1.0)
+                    most = lanes(0.0)
                     if wp.static(wanted.channels):
                         for c in range(channels):
-                            p = wp.static(wanted.first_channel) + c
-                            planes[p, row, tx] = planes[p, row, tx] + wp.cw_mul(w, channel_of(features, ids, start, owners, c))
+                            planes[wp.static(wanted.first_channel) + c, row, tx] = lanes(0.0)
+                    for m in range(count):
+                        i = ids[start + reach[band, 2, m]]
+                        record = records[i]
+                        w = lists[band, WEIGHT, m]
+                        red = red + w * record[RED]
+                        green = green + w * record[GREEN]
+                        blue = blue + w * record[BLUE]
+                        if wp.static(wanted.depth):
+                            z = z + w * record[Z]
+                            weights = weights + w
+                        if wp.static(wanted.channels):
+                            for c in range(channels):
+                                p = wp.static(wanted.first_channel) + c
+                                planes[p, row, tx] = planes[p, row, tx] + w * features[i, c]
+                        if wp.static(wanted.median):
+                            median = median + lists[band, PICKED, m] * record[Z]
+                        if wp.static(wanted.instance):
+                            leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
+                            who = who + wp.cw_mul(leads, lanes(record[INSTANCE]) - who)
+                            most = wp.max(most, w)
+                    planes[0, row, tx] = t
+                    planes[1, row, tx] = red
+                    planes[2, row, tx] = green
+                    planes[3, row, tx] = blue
+                    if wp.static(wanted.depth):
+                        planes[4, row, tx] = z
+                        planes[5, row, tx] = weights
                     if wp.static(wanted.median):
-                        here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
-                        median = median + wp.cw_mul(here, field_of(records, ids, start, owners, Z))
+                        picks[MEDIAN, row, tx] = median
                     if wp.static(wanted.instance):
-                        leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
-                        who = who + wp.cw_mul(leads, field_of(records, ids, start, owners, INSTANCE) - who)
-                        most = wp.max(most, w)
-                    t = t - w
-                planes[0, row, tx] = t
-                planes[1, row, tx] = red
-                planes[2, row, tx] = green
-                planes[3, row, tx] = blue
-                if wp.static(wanted.depth):
-                    planes[4, row, tx] = z
-                    planes[5, row, tx] = weights
-                if wp.static(wanted.median):
-                    picks[MEDIAN, row, tx] = median
-                if wp.static(wanted.instance):
-                    picks[WHO, row, tx] = who
+                        picks[WHO, row, tx] = who
 
     return composite_rays_forward
 
 
 @cache
-def composite_rays_gradient(wanted: Wanted, ray: bool, ordered: bool, squarings: int):
+def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarings: int):
     """The backward kernel: writes every entry's gradient slot, those of its channels and of its canonical frame, and the rays' gradient."""
-    make = list_row(ray, ordered, squarings)
-    faded = ray_functions(ray, squarings)
+    make = list_row(ray, eyes, ordered, squarings)
+    canonical, faded_conic, faded_along = ray_functions(ray, eyes, squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], frames: wp.array2d[float],
-        features: wp.array2d[float], channels: int, rays: wp.array3d[lanes],
-        window: Window, bands: int, alpha_max: float, termination: float,
-        columns: wp.array[lanes], lists: wp.array3d[lanes], reach: wp.array3d[int], scattered: wp.array4d[float],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], frames: wp.array2d[wp.float64],
+        features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
+        window: Window, bands: int, alpha_max: float, termination: float, entries: int,
+        columns: wp.array[lanes], lists: wp.array3d[lanes], scattered: wp.array4d[float], keys: wp.array[lanes64],
+        keys_by_lane: wp.array[wp.float64], reach: wp.array3d[int],
         planes: wp.array3d[lanes], grads: wp.array3d[lanes],
-        slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array3d[lanes],
+        sums: wp.array3d[wp.float64],
+        slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array4d[lanes64],
         first: int,
     ):  # fmt: skip
-        """scattered: the same memory as lists, by lane. grads: as for `composite_gradient`."""
+        """grads: as for `composite_gradient`; g_rays: zeroed before. sums `[bands, longest, SUMS]`: working memory, for the gradients of
+        needles cancel from row to row."""
         band = first + wp.tid()
         column = columns[0]
         one = lanes(1.0)
+        one64 = lanes64(wp.float64(1.0))
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % window.tiles_x
-            row0 = (tile // window.tiles_x) * TILE
-            x0 = float((window.left + tx) * TILE) + 0.5
-            y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
-            start = tile_starts[tile]
-            stop = tile_starts[tile + 1]
-            reach_of(records, ids, start, stop, x0, y0, band, reach)
-            for n in range(start, stop):
-                for c in range(GRADIENTS):
-                    slots[slot_of[n], c] = 0.0
-                if wp.static(wanted.channels):
-                    for c in range(channels):
-                        channel_slots[slot_of[n], c] = 0.0
-                if wp.static(ray):
-                    for c in range(FRAME):
-                        frame_slots[slot_of[n], c] = 0.0
-            for r in range(TILE):
-                row = row0 + r
-                y = y0 + float(r)
-                d = rays_of(rays, row, tx)
-                count = make(ids, start, stop, records, frames, reach, d, column, x0, y, r, band, alpha_max, termination, lists)
-                t = lanes(1.0)
-                seen = int(0)
-                for k in range(count):
-                    if wp.max(t) < termination:
-                        break
-                    lists[band, THROUGH, k] = t
-                    t = t - wp.cw_mul(t, lists[band, ALPHA, k])
-                    seen += 1
-                for n in range(stop - start):
-                    if reach[band, 0, n] <= r and reach[band, 1, n] >= r:
-                        lists[band, PART_W, n] = lanes(0.0)
-                        lists[band, PART_E, n] = lanes(0.0)
-                gr = grads[1, row, tx]
-                gg = grads[2, row, tx]
-                gb = grads[3, row, tx]
-                rest = grads[0, row, tx] * 1.0
-                for back in range(seen):
-                    k = seen - 1 - back
-                    owners = lists[band, OWNER, k]
-                    a = lists[band, ALPHA, k]
-                    through = lists[band, THROUGH, k]
-                    w = wp.cw_mul(through, a)
-                    dot = wp.cw_mul(gr, field_of(records, ids, start, owners, RED))
-                    dot = dot + wp.cw_mul(gg, field_of(records, ids, start, owners, GREEN))
-                    dot = dot + wp.cw_mul(gb, field_of(records, ids, start, owners, BLUE))
-                    if wp.static(wanted.depth):
-                        dot = dot + wp.cw_mul(grads[4, row, tx], field_of(records, ids, start, owners, Z)) + grads[5, row, tx]
+            if elsewhere[tile] == 0:
+                tx = tile % window.tiles_x
+                row0 = (tile // window.tiles_x) * TILE
+                x0 = float((window.left + tx) * TILE) + 0.5
+                y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
+                start = tile_starts[tile]
+                stop = tile_starts[tile + 1]
+                reach_of(records, ids, start, stop, x0, y0, band, reach)
+                for j in range(stop - start):
+                    for c in range(SUMS):
+                        sums[band, j, c] = NONE
                     if wp.static(wanted.channels):
                         for c in range(channels):
-                            g_c = grads[wp.static(wanted.first_channel) + c, row, tx]
-                            dot = dot + wp.cw_mul(g_c, channel_of(features, ids, start, owners, c))
-                    da = wp.cw_mul(through, dot) - wp.cw_div(rest, one - a)
-                    rest = rest + wp.cw_mul(w, dot)
-                    for j in range(TILE):
-                        scattered[band, PART_W, int(owners[j]), j] = w[j]
-                        scattered[band, PART_E, int(owners[j]), j] = da[j]
-                ray_x = lanes(0.0)
-                ray_y = lanes(0.0)
-                ray_z = lanes(0.0)
-                for n in range(stop - start):
-                    if reach[band, 0, n] <= r and reach[band, 1, n] >= r:
-                        w = lists[band, PART_W, n]
-                        da = lists[band, PART_E, n]
-                        i = ids[start + n]
-                        slot = slot_of[start + n]
+                            channel_slots[slot_of[start + j], c] = 0.0
+                first_key = band * reach.shape[2]
+                for r in range(TILE):
+                    row = row0 + r
+                    y = y0 + float(r)
+                    count, crossing = make(
+                        ids, start, stop, records, frames, reach, rays, column, x0, y, row, tx, r, band,
+                        alpha_max, termination, entries, first_key, lists, keys, keys_by_lane,
+                    )  # fmt: skip
+                    gr = grads[1, row, tx]
+                    gg = grads[2, row, tx]
+                    gb = grads[3, row, tx]
+                    for m in range(count):
+                        i = ids[start + reach[band, 2, m]]
+                        record = records[i]
+                        shade = gr * record[RED] + gg * record[GREEN] + gb * record[BLUE]
+                        if wp.static(wanted.depth):
+                            shade = shade + grads[4, row, tx] * record[Z] + grads[5, row, tx]
+                        if wp.static(wanted.channels):
+                            for c in range(channels):
+                                shade = shade + grads[wp.static(wanted.first_channel) + c, row, tx] * features[i, c]
+                        lists[band, SHADE, m] = shade
+                        lists[band, WEIGHT, m] = lanes(0.0)
+                        lists[band, PICKED, m] = lanes(0.0)
+                    t = lanes(1.0)
+                    seen = int(0)
+                    for k in range(count):
+                        if (k & 7) == 0:  # noqa: SIM102 - as forward
+                            if wp.max(t) < termination:
+                                break
+                        a = lists[band, ALPHA, k]
+                        if crossing:
+                            a = gathered(scattered, band, ALPHA, keys_by_lane, first_key + k, entries)
+                        lists[band, THROUGH, k] = t
+                        t = t - wp.cw_mul(t, a)
+                        seen += 1
+                    rest = grads[0, row, tx] * 1.0
+                    for back in range(seen):
+                        k = seen - 1 - back
+                        a = lists[band, ALPHA, k]
+                        shade = lists[band, SHADE, k]
+                        if crossing:
+                            a = gathered(scattered, band, ALPHA, keys_by_lane, first_key + k, entries)
+                            shade = gathered(scattered, band, SHADE, keys_by_lane, first_key + k, entries)
+                        through = lists[band, THROUGH, k]
+                        w = wp.cw_mul(through, a)
+                        da = wp.cw_mul(through, shade) - wp.cw_div(rest, one - a)
+                        rest = rest + wp.cw_mul(w, shade)
+                        if crossing:
+                            scatter(scattered, band, WEIGHT, keys_by_lane, first_key + k, entries, w)
+                            scatter(scattered, band, PICKED, keys_by_lane, first_key + k, entries, da)
+                        else:
+                            lists[band, WEIGHT, k] = w
+                            lists[band, PICKED, k] = da
+                    for m in range(count):
+                        j = reach[band, 2, m]
+                        w = lists[band, WEIGHT, m]
+                        da = lists[band, PICKED, m]
+                        i = ids[start + j]
                         record = records[i]
                         opacity = record[OPACITY]
-                        e = faded(records, frames, i, d, column, x0, y)
+                        e = lanes(0.0)
+                        if wp.static(ray):
+                            ux, uy, uz, qx, qy, qz = canonical(frames, i, rays, row, tx)
+                            e = faded_along(record, ux, uy, uz, qx, qy, qz)
+                        else:
+                            e = faded_conic(record, column, x0, y)
                         de = wp.cw_mul(wp.cw_mul(da, e), below(alpha_max, e * opacity))
-                        slots[slot, G_OPACITY] = slots[slot, G_OPACITY] + wp.dot(de, one)
-                        slots[slot, G_RED] = slots[slot, G_RED] + wp.dot(w, gr)
-                        slots[slot, G_GREEN] = slots[slot, G_GREEN] + wp.dot(w, gg)
-                        slots[slot, G_BLUE] = slots[slot, G_BLUE] + wp.dot(w, gb)
+                        sums[band, j, G_OPACITY] = sums[band, j, G_OPACITY] + wp.float64(wp.dot(de, one))
+                        sums[band, j, G_RED] = sums[band, j, G_RED] + wp.float64(wp.dot(w, gr))
+                        sums[band, j, G_GREEN] = sums[band, j, G_GREEN] + wp.float64(wp.dot(w, gg))
+                        sums[band, j, G_BLUE] = sums[band, j, G_BLUE] + wp.float64(wp.dot(w, gb))
                         if wp.static(wanted.depth):
-                            slots[slot, G_Z] = slots[slot, G_Z] + wp.dot(w, grads[4, row, tx])
+                            sums[band, j, G_Z] = sums[band, j, G_Z] + wp.float64(wp.dot(w, grads[4, row, tx]))
                         if wp.static(wanted.channels):
                             for c in range(channels):
                                 g_c = grads[wp.static(wanted.first_channel) + c, row, tx]
-                                channel_slots[slot, c] = channel_slots[slot, c] + wp.dot(w, g_c)
+                                channel_slots[slot_of[start + j], c] = channel_slots[slot_of[start + j], c] + wp.dot(w, g_c)
                         ds = de * (-opacity)
                         if wp.static(ray):
-                            v = canonical(frames, i, d)
-                            qx = frames[i, 9]
-                            qy = frames[i, 10]
-                            qz = frames[i, 11]
-                            per = wp.cw_div(ds, v.square)
-                            hx = wp.cw_mul(per, v.cx)  # dL/d (u x q)
-                            hy = wp.cw_mul(per, v.cy)
-                            hz = wp.cw_mul(per, v.cz)
-                            far = wp.cw_mul(v.cx, v.cx) + wp.cw_mul(v.cy, v.cy) + wp.cw_mul(v.cz, v.cz)
-                            far = wp.cw_mul(wp.cw_div(far, v.square), per)
-                            ux = hz * qy - hy * qz - wp.cw_mul(far, v.x)
-                            uy = hx * qz - hz * qx - wp.cw_mul(far, v.y)
-                            uz = hy * qx - hx * qy - wp.cw_mul(far, v.z)
-                            frame_slots[slot, 0] = frame_slots[slot, 0] + wp.dot(ux, d.x)
-                            frame_slots[slot, 1] = frame_slots[slot, 1] + wp.dot(ux, d.y)
-                            frame_slots[slot, 2] = frame_slots[slot, 2] + wp.dot(ux, d.z)
-                            frame_slots[slot, 3] = frame_slots[slot, 3] + wp.dot(uy, d.x)
-                            frame_slots[slot, 4] = frame_slots[slot, 4] + wp.dot(uy, d.y)
-                            frame_slots[slot, 5] = frame_slots[slot, 5] + wp.dot(uy, d.z)
-                            frame_slots[slot, 6] = frame_slots[slot, 6] + wp.dot(uz, d.x)
-                            frame_slots[slot, 7] = frame_slots[slot, 7] + wp.dot(uz, d.y)
-                            frame_slots[slot, 8] = frame_slots[slot, 8] + wp.dot(uz, d.z)
-                            frame_slots[slot, 9] = frame_slots[slot, 9] + wp.dot(hy, v.z) - wp.dot(hz, v.y)
-                            frame_slots[slot, 10] = frame_slots[slot, 10] + wp.dot(hz, v.x) - wp.dot(hx, v.z)
-                            frame_slots[slot, 11] = frame_slots[slot, 11] + wp.dot(hx, v.y) - wp.dot(hy, v.x)
-                            ray_x = ray_x + ux * frames[i, 0] + uy * frames[i, 3] + uz * frames[i, 6]
-                            ray_y = ray_y + ux * frames[i, 1] + uy * frames[i, 4] + uz * frames[i, 7]
-                            ray_z = ray_z + ux * frames[i, 2] + uy * frames[i, 5] + uz * frames[i, 8]
+                            # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
+                            t64 = wp.cw_div(dot(ux, uy, uz, qx, qy, qz), square(ux, uy, uz))
+                            mx = wp.cw_mul(lanes64(ds), qx - wp.cw_mul(t64, ux))
+                            my = wp.cw_mul(lanes64(ds), qy - wp.cw_mul(t64, uy))
+                            mz = wp.cw_mul(lanes64(ds), qz - wp.cw_mul(t64, uz))
+                            group = int(0)
+                            if wp.static(eyes):
+                                group = int(frames[i, GROUP])
+                            for c in range(3):
+                                missed = lanes64(frames[i, CENTRE + c]) - wp.cw_mul(t64, rays[group, c, row, tx])
+                                pushed = mx * frames[i, c] + my * frames[i, 3 + c] + mz * frames[i, 6 + c]
+                                g_rays[group, c, row, tx] = g_rays[group, c, row, tx] - wp.cw_mul(t64, pushed)
+                                if wp.static(eyes):
+                                    missed = missed - rays[group, 3 + c, row, tx]
+                                    g_rays[group, 3 + c, row, tx] = g_rays[group, 3 + c, row, tx] - pushed
+                                sums[band, j, GRADIENTS + c] = sums[band, j, GRADIENTS + c] + wp.dot(mx, missed)
+                                sums[band, j, GRADIENTS + 3 + c] = sums[band, j, GRADIENTS + 3 + c] + wp.dot(my, missed)
+                                sums[band, j, GRADIENTS + 6 + c] = sums[band, j, GRADIENTS + 6 + c] + wp.dot(mz, missed)
+                                sums[band, j, GRADIENTS + CENTRE + c] = sums[band, j, GRADIENTS + CENTRE + c] + wp.dot(pushed, one64)
                         else:
-                            k1 = record[K]
-                            m = record[M]
-                            dy = y - record[Y]
-                            x = column - lanes(record[X] - x0 + m * dy)
-                            dsx = wp.dot(ds, x)
-                            slots[slot, G_X] = slots[slot, G_X] - 2.0 * k1 * k1 * dsx
-                            slots[slot, G_Y] = slots[slot, G_Y] + 2.0 * k1 * k1 * m * dsx - 2.0 * record[H] * dy * wp.dot(ds, one)
-                            slots[slot, G_K] = slots[slot, G_K] + 2.0 * k1 * wp.dot(wp.cw_mul(ds, x), x)
-                            slots[slot, G_M] = slots[slot, G_M] - 2.0 * k1 * k1 * dy * dsx
-                            slots[slot, G_H] = slots[slot, G_H] + dy * dy * wp.dot(ds, one)
-                if wp.static(ray):
-                    g_rays[0, row, tx] = ray_x
-                    g_rays[1, row, tx] = ray_y
-                    g_rays[2, row, tx] = ray_z
+                            k1 = wp.float64(record[K])
+                            m1 = wp.float64(record[M])
+                            dy = wp.float64(y - record[Y])
+                            ds64 = lanes64(ds)
+                            x = lanes64(column - lanes(record[X] - x0 + record[M] * (y - record[Y])))
+                            slope = TWO * k1 * k1 * wp.dot(ds64, x)
+                            per_y = dy * wp.dot(ds64, one64)
+                            sums[band, j, G_X] = sums[band, j, G_X] - slope
+                            sums[band, j, G_Y] = sums[band, j, G_Y] + m1 * slope - TWO * wp.float64(record[H]) * per_y
+                            sums[band, j, G_K] = sums[band, j, G_K] + TWO * k1 * wp.dot(wp.cw_mul(ds64, x), x)
+                            sums[band, j, G_M] = sums[band, j, G_M] - dy * slope
+                            sums[band, j, G_H] = sums[band, j, G_H] + dy * per_y
+                for j in range(stop - start):
+                    slot = slot_of[start + j]
+                    for c in range(GRADIENTS):
+                        slots[slot, c] = float(sums[band, j, c])
+                    if wp.static(ray):
+                        for c in range(SUMS - GRADIENTS):
+                            frame_slots[slot, c] = float(sums[band, j, GRADIENTS + c])
 
     return composite_rays_backward

@@ -1,9 +1,13 @@
-"""What a row of pixels sees along its own rays: splats in their canonical frames, and the row's list of entries.
+"""What a row of pixels sees along its own rays: splats in their canonical frames, and the row's list of entries, in float64.
 
-A splat in the canonical frame where it is the unit Gaussian: M = S^-1 R' of the camera, q = M p for its centre p (`FRAME` floats). There a
-ray with direction d from the eye is u = M d, and (3DGUT, Wu et al. 2025; StopThePop, Radl et al. 2024)
+A splat in the canonical frame where it is the unit Gaussian: A = S^-1 R' and its centre p (`FRAME`). There a ray from o along d is
+u = A d, and the centre lies at q = A (p - o) from where it begins (3DGUT, Wu et al. 2025; StopThePop, Radl et al. 2024):
 
-    s = |u x q|^2 / (2 |u|^2)   is the least exponent along the ray,   t = (u . q) / |u|^2   the place of it, in the ray's own lengths.
+    t = (u . q) / |u|^2   is the place along the ray where the splat is greatest, in the ray's own lengths,
+    m = q - t u           what the ray misses its centre by,   s = |m|^2 / 2   the least exponent.
+
+In float32 m cancels, and two places that differ by a millionth of a depth are one; so all of it is float64. To sort, a place and the
+number of its entry become one whole number, so that minimum and maximum move both, and equal places keep the list's order.
 """
 
 from functools import cache
@@ -12,155 +16,70 @@ import warp as wp
 
 from render.kernels.lanewise import below, cut
 from render.kernels.rows import exp_of, row_range
-from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, TINY, H, K, M, X, Y, lanes
+from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, H, K, M, X, Y, Z, lanes
 
-KEY, ALPHA, OWNER, THROUGH, PART_W, PART_E = (wp.constant(i) for i in range(6))
-"""Lists of a row: where along the ray, alpha, which entry, the light that reaches it; then by entry: its weight, dL/da times e^-s."""
-LISTS = 6
+lanes64 = wp.types.vector(length=TILE, dtype=wp.float64)
 
+ALPHA, WEIGHT, PICKED, SHADE, THROUGH = (wp.constant(i) for i in range(5))
+"""Lists of a row. By entry: its alpha, its weight, whether it is the median (backward: dL/d alpha), the gradient of its colour; by place in
+the order: the light that reaches it."""
+LISTS = 5
 
-@wp.struct
-class Rays:
-    """Directions of a row's pixels."""
-
-    x: lanes
-    y: lanes
-    z: lanes
-
-
-@wp.struct
-class Canonical:
-    """A row's rays in the frame of a splat: u, |u|^2, u x q."""
-
-    x: lanes
-    y: lanes
-    z: lanes
-    square: lanes
-    cx: lanes
-    cy: lanes
-    cz: lanes
+FRAME = 16
+"""Numbers of a splat's canonical frame: A row major, p, A p, and which rays look at it."""
+CENTRE, MOVED, GROUP = wp.constant(9), wp.constant(12), wp.constant(15)
+NONE = wp.constant(wp.float64(0.0))
+LEAST = wp.constant(wp.float64(1.0e-200))
+KEYS = wp.constant(wp.float64(2251799813685248.0))
+"""2^51: keys are whole numbers up to it, which float64 holds."""
+WHOLE = wp.constant(wp.float64(6755399441055744.0))
+"""1.5 * 2^52: adding it rounds to a whole number."""
 
 
 @wp.func
-def rays_of(rays: wp.array3d[lanes], row: int, tx: int):
-    d = Rays()
-    d.x = rays[0, row, tx]
-    d.y = rays[1, row, tx]
-    d.z = rays[2, row, tx]
-    return d
+def along(frames: wp.array2d[wp.float64], i: int, row: int, x: lanes64, y: lanes64, z: lanes64):
+    """One component of A times a row of vectors."""
+    return x * frames[i, 3 * row] + y * frames[i, 3 * row + 1] + z * frames[i, 3 * row + 2]
 
 
 @wp.func
-def along(frames: wp.array2d[float], i: int, row: int, d: Rays):
-    """One component of M d."""
-    return d.x * frames[i, 3 * row] + d.y * frames[i, 3 * row + 1] + d.z * frames[i, 3 * row + 2]
+def dot(ax: lanes64, ay: lanes64, az: lanes64, bx: lanes64, by: lanes64, bz: lanes64):
+    return wp.cw_mul(ax, bx) + wp.cw_mul(ay, by) + wp.cw_mul(az, bz)
 
 
 @wp.func
-def canonical(frames: wp.array2d[float], i: int, d: Rays):
-    c = Canonical()
-    c.x = along(frames, i, 0, d)
-    c.y = along(frames, i, 1, d)
-    c.z = along(frames, i, 2, d)
-    qx = frames[i, 9]
-    qy = frames[i, 10]
-    qz = frames[i, 11]
-    c.square = wp.max(wp.cw_mul(c.x, c.x) + wp.cw_mul(c.y, c.y) + wp.cw_mul(c.z, c.z), lanes(TINY))
-    c.cx = c.y * qz - c.z * qy
-    c.cy = c.z * qx - c.x * qz
-    c.cz = c.x * qy - c.y * qx
-    return c
+def square(x: lanes64, y: lanes64, z: lanes64):
+    return wp.max(dot(x, y, z, x, y, z), lanes64(LEAST))
 
 
 @wp.func
-def place(frames: wp.array2d[float], i: int, c: Canonical):
-    """t: where along the rays the splat is greatest."""
-    return wp.cw_div(c.x * frames[i, 9] + c.y * frames[i, 10] + c.z * frames[i, 11], c.square)
+def share(along: lanes64, square: lanes64, far: wp.float64):
+    """t = along / square as a number from -1 to 1 that rises with it; far: a length, about which places are told apart best."""
+    return wp.cw_div(along, wp.max(along, -along) + square * far)
 
 
 @wp.func
-def insert(lists: wp.array3d[lanes], band: int, count: int, key: lanes, alpha: lanes, owner: float):
-    """Add an entry to a row's list of `count`, sorted by key, equal keys in the order in which they come."""
-    lists[band, KEY, count] = key
-    lists[band, ALPHA, count] = alpha
-    lists[band, OWNER, count] = lanes(owner)
-    k = int(count)
-    while k > 0:
-        front = lists[band, KEY, k - 1]
-        back = lists[band, KEY, k]
-        swap = wp.min(wp.max((front - back) * 1.0e30, lanes(0.0)), lanes(1.0))
-        if wp.max(swap) <= 0.0:
-            break
-        stay = lanes(1.0) - swap
-        lists[band, KEY, k - 1] = wp.min(front, back)
-        lists[band, KEY, k] = wp.max(front, back)
-        a = lists[band, ALPHA, k - 1]
-        b = lists[band, ALPHA, k]
-        lists[band, ALPHA, k - 1] = wp.cw_mul(stay, a) + wp.cw_mul(swap, b)
-        lists[band, ALPHA, k] = wp.cw_mul(stay, b) + wp.cw_mul(swap, a)
-        c = lists[band, OWNER, k - 1]
-        d = lists[band, OWNER, k]
-        lists[band, OWNER, k - 1] = wp.cw_mul(stay, c) + wp.cw_mul(swap, d)
-        lists[band, OWNER, k] = wp.cw_mul(stay, d) + wp.cw_mul(swap, c)
-        k -= 1
+def entry(keys: wp.array[wp.float64], place: int, lane: int, entries: int):
+    """Which entry of the list stands at a place of a lane's order."""
+    return int(wp.int64(keys[place * TILE + lane])) & (entries - 1)
 
 
-@cache
-def ray_functions(ray: bool, squarings: int):
-    """exp(-s) within the cutoff of a row's pixels, 0 beyond it, by the conic or along the rays."""
-    exp_minus = exp_of(squarings)
-
-    @wp.func
-    def faded(records: wp.array[lanes], frames: wp.array2d[float], i: int, d: Rays, column: lanes, x0: float, y: float):
-        record = records[i]
-        s_max = record[S_MAX] * wp.static(1.0 / RAY_BOUNDS if ray else 1.0)
-        s = lanes(0.0)
-        if wp.static(ray):
-            c = canonical(frames, i, d)
-            s = wp.cw_div(wp.cw_mul(c.cx, c.cx) + wp.cw_mul(c.cy, c.cy) + wp.cw_mul(c.cz, c.cz), c.square) * 0.5
-            # what the ray leaves behind it is not seen
-            s = s + below(0.0, place(frames, i, c)) * (2.0 * s_max)
-        else:
-            k = record[K]
-            dy = y - record[Y]
-            u = column * k - lanes(k * (record[X] - x0 + record[M] * dy))
-            s = wp.cw_mul(u, u) + lanes(record[H] * dy * dy)
-        return cut(s, s_max, exp_minus(s))
-
-    return faded
-
-
-@cache
-def list_row(ray: bool, ordered: bool, squarings: int):
-    """Makes a row's list; returns how many entries it has."""
-    faded = ray_functions(ray, squarings)
-
-    @wp.func
-    def make(
-        ids: wp.array[int], start: int, stop: int, records: wp.array[lanes], frames: wp.array2d[float], reach: wp.array3d[int],
-        d: Rays, column: lanes, x0: float, y: float, r: int, band: int, alpha_max: float, termination: float, lists: wp.array3d[lanes],
-    ):  # fmt: skip
-        count = int(0)
-        through = lanes(1.0)
-        for n in range(start, stop):
-            if reach[band, 0, n - start] <= r and reach[band, 1, n - start] >= r:
-                i = ids[n]
-                record = records[i]
-                a = wp.min(faded(records, frames, i, d, column, x0, y) * record[OPACITY], lanes(alpha_max))
-                if wp.max(a) > 0.0:
-                    if wp.static(ordered):
-                        insert(lists, band, count, place(frames, i, canonical(frames, i, d)), a, float(n - start))
-                    else:
-                        lists[band, ALPHA, count] = a
-                        lists[band, OWNER, count] = lanes(float(n - start))
-                        through = wp.cw_mul(through, lanes(1.0) - a)
-                    count += 1
-                    if wp.static(not ordered):  # noqa: SIM102 - a static branch and a dynamic one
-                        if wp.max(through) < termination:
-                            break
-        return count
-
-    return make
+# All lanes at once, by Batcher's merge exchange (Knuth, TAOCP 5.2.2 M), which takes as many steps for any order. Native, since wp.min and
+# wp.max mind NaN, which takes five times the instructions.
+@wp.func_native("""
+    typedef double row __attribute__((vector_size(128), aligned(8)));
+    row *all = (row *)keys.data + first;
+    for (int p = 1; p < count; p *= 2)
+        for (int k = p; k > 0; k /= 2)
+            for (int j = k % p; j + k < count; j += 2 * k)
+                for (int i = j, end = j + 2 * k < count ? j + k : count - k; i < end; ++i)
+                    if ((i ^ (i + k)) < 2 * p) {
+                        row a = all[i], b = all[i + k];
+                        all[i] = a < b ? a : b;
+                        all[i + k] = a < b ? b : a;
+                    }
+""")
+def sort(keys: wp.array[wp.float64], first: int, count: int): ...  # type: ignore[empty-body]
 
 
 @wp.func
@@ -172,23 +91,112 @@ def reach_of(records: wp.array[lanes], ids: wp.array[int], start: int, stop: int
         reach[band, 1, n - start] = rows[1]
 
 
-@wp.func
-def field_of(records: wp.array[lanes], ids: wp.array[int], start: int, owners: lanes, field: int):
-    """A field of each lane's own entry."""
-    value = records[ids[start + int(owners[0])]][field]
-    out = lanes(value)
-    if wp.min(owners) < wp.max(owners):
-        for j in range(TILE):
-            out[j] = records[ids[start + int(owners[j])]][field]
-    return out
+@cache
+def ray_functions(ray: bool, eyes: bool, squarings: int):
+    """How a row of pixels looks at a splat: `canonical`, its rays in the splat's frame, u and q, and `faded`, exp(-s) within the cutoff and
+    0 beyond it, by the conic or along the rays. eyes: rays begin in places of their own, and each instance may have rays of its own."""
+    exp_minus = exp_of(squarings)
+
+    @wp.func
+    def canonical(frames: wp.array2d[wp.float64], i: int, rays: wp.array4d[lanes64], row: int, tx: int):
+        group = int(0)
+        qx = lanes64(frames[i, MOVED])
+        qy = lanes64(frames[i, MOVED + 1])
+        qz = lanes64(frames[i, MOVED + 2])
+        if wp.static(eyes):
+            group = int(frames[i, GROUP])
+            ox = rays[group, 3, row, tx]
+            oy = rays[group, 4, row, tx]
+            oz = rays[group, 5, row, tx]
+            qx = qx - along(frames, i, 0, ox, oy, oz)
+            qy = qy - along(frames, i, 1, ox, oy, oz)
+            qz = qz - along(frames, i, 2, ox, oy, oz)
+        x = rays[group, 0, row, tx]
+        y = rays[group, 1, row, tx]
+        z = rays[group, 2, row, tx]
+        return along(frames, i, 0, x, y, z), along(frames, i, 1, x, y, z), along(frames, i, 2, x, y, z), qx, qy, qz
+
+    @wp.func
+    def faded_conic(record: lanes, column: lanes, x0: float, y: float):
+        k = record[K]
+        dy = y - record[Y]
+        u = column * k - lanes(k * (record[X] - x0 + record[M] * dy))
+        s = wp.cw_mul(u, u) + lanes(record[H] * dy * dy)
+        return cut(s, record[S_MAX], exp_minus(s))
+
+    @wp.func
+    def faded_along(record: lanes, ux: lanes64, uy: lanes64, uz: lanes64, qx: lanes64, qy: lanes64, qz: lanes64):
+        s_max = record[S_MAX] * wp.static(1.0 / RAY_BOUNDS)
+        along_ray = dot(ux, uy, uz, qx, qy, qz)
+        t = wp.cw_div(along_ray, square(ux, uy, uz))
+        mx = qx - wp.cw_mul(t, ux)
+        my = qy - wp.cw_mul(t, uy)
+        mz = qz - wp.cw_mul(t, uz)
+        s = lanes(dot(mx, my, mz, mx, my, mz) * wp.float64(0.5))
+        # what the ray leaves behind it is not seen, nor anything where there is no ray
+        s = s + (lanes(1.0) - below(0.0, lanes(-along_ray))) * (2.0 * s_max)
+        return cut(s, s_max, exp_minus(s))
+
+    return canonical, faded_conic, faded_along
 
 
-@wp.func
-def channel_of(features: wp.array2d[float], ids: wp.array[int], start: int, owners: lanes, c: int):
-    """A channel of each lane's own entry."""
-    value = features[ids[start + int(owners[0])], c]
-    out = lanes(value)
-    if wp.min(owners) < wp.max(owners):
-        for j in range(TILE):
-            out[j] = features[ids[start + int(owners[j])], c]
-    return out
+@cache
+def list_row(ray: bool, eyes: bool, ordered: bool, squarings: int):
+    """Makes a row's list: which of the tile's entries, their alphas, and, where pixels want another order than the tile's, their sorted
+    keys. Returns how many entries, and whether they are sorted by key."""
+    canonical, faded_conic, faded_along = ray_functions(ray, eyes, squarings)
+
+    @wp.func
+    def make(
+        ids: wp.array[int], start: int, stop: int, records: wp.array[lanes], frames: wp.array2d[wp.float64], reach: wp.array3d[int],
+        rays: wp.array4d[lanes64], column: lanes, x0: float, y: float, row: int, tx: int, r: int, band: int,
+        alpha_max: float, termination: float, entries: int, first_key: int,
+        lists: wp.array3d[lanes], keys: wp.array[lanes64], keys_by_lane: wp.array[wp.float64],
+    ):  # fmt: skip
+        """entries: a power of two, at least how many the tile has: a key is its place, in as many steps as that leaves, then its entry."""
+        count = int(0)
+        through = lanes(1.0)
+        farthest = lanes(-9.0)  # place of those that show
+        disorder = lanes(-9.0)
+        steps = KEYS / wp.float64(entries)
+        far = wp.float64(1.0)
+        if stop > start:
+            amid = records[ids[(start + stop) // 2]]
+            far = wp.float64(amid[Z])
+        for n in range(start, stop):
+            if reach[band, 0, n - start] <= r and reach[band, 1, n - start] >= r:
+                i = ids[n]
+                record = records[i]
+                a = lanes(0.0)
+                at = lanes64(NONE)
+                if wp.static(ray or ordered):
+                    ux, uy, uz, qx, qy, qz = canonical(frames, i, rays, row, tx)
+                    if wp.static(ordered):
+                        at = share(dot(ux, uy, uz, qx, qy, qz), square(ux, uy, uz), far)
+                if wp.static(ray):
+                    a = wp.min(faded_along(record, ux, uy, uz, qx, qy, qz) * record[OPACITY], lanes(alpha_max))
+                else:
+                    a = wp.min(faded_conic(record, column, x0, y) * record[OPACITY], lanes(alpha_max))
+                reach[band, 2, count] = n - start
+                lists[band, ALPHA, count] = a
+                if wp.static(ordered):
+                    whole = (at * steps + lanes64(WHOLE)) - lanes64(WHOLE)
+                    keys[first_key + count] = whole * wp.float64(entries) + lanes64(wp.float64(count))
+                    hidden = (lanes(1.0) - wp.min(a * 1.0e30, lanes(1.0))) * 4.0
+                    disorder = wp.max(disorder, farthest - lanes(at) - hidden)
+                    farthest = wp.max(farthest, lanes(at) - hidden)
+                    count += 1
+                else:
+                    count += 1
+                    through = wp.cw_mul(through, lanes(1.0) - a)
+                    if (count & 7) == 0:  # noqa: SIM102 - looking costs more than drawing one
+                        if wp.max(through) < termination:
+                            break
+        crossing = bool(False)
+        if wp.static(ordered):  # noqa: SIM102 - a static branch and a dynamic one
+            if wp.max(disorder) >= 0.0:
+                sort(keys_by_lane, first_key, count)
+                crossing = True
+        return count, crossing
+
+    return make
