@@ -1,6 +1,6 @@
 """What a camera pays for what it does not see: a street of 3M splats culled in clusters, a rig in one call, crops and masks.
 
-    python -m tests.bench.culling [--splats 3000000] [--repeat 5]
+python -m tests.bench.culling [--splats 3000000] [--repeat 5]
 """
 
 from __future__ import annotations

@@ -2,24 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from render import RenderConfig
+from render.compositing import _composite
 from render.kernels.types import INV_C, S_MAX, SLACK, TILE, Y_EXT, H, K, M, Wanted, X, Y
+from render.launch import stage
 from render.settings import Settings
 from tests.bench.presets import Preset
-from tests.render.test_cuda import keep_forward
+from tests.render.test_cuda import Captured, keep_forward
 
-OPERATIONS = 23
-"""Of one row of one entry, forward: offset 1, exponent 2, exp 7 + 3, alpha 2, cutoff 3, weight 2, colours 3."""
+OPERATIONS = 19
+"""Of one row of one entry, forward, a multiplication with an addition as one: offset 1, exponent 1, exp 5 + 3, opacity 1, clamp 1, cutoff
+1, weight 2, colours 3, transmittance 1."""
+
+
+def kept_lists(preset: Preset) -> tuple[Settings, Captured]:
+    """What a forward pass of a preset of one instance left, its tile lists among it."""
+    (placed,), camera = preset.placed, preset.camera
+    settings = Settings(camera.width, camera.height, preset.model, RenderConfig(), Wanted(), (0,), gradients=False)
+    kept, _ = keep_forward(settings, placed.gaussians, torch.linalg.inv(camera.world_from_cam) @ placed.world_from_local, camera.lens)
+    return settings, kept
+
+
+def compositing(preset: Preset) -> Callable[[], object]:
+    """Compositing alone, from lists that are made."""
+    settings, kept = kept_lists(preset)
+    (part,) = kept.parts
+
+    def work() -> object:
+        with stage(torch.device("cpu")):
+            return _composite(settings, part.window, part.lists, kept.scene)
+
+    return work
 
 
 def forward_limit(preset: Preset) -> float:
     """Lane operations of a forward composite of a preset of one instance, without termination."""
-    (placed,), camera = preset.placed, preset.camera
-    settings = Settings(camera.width, camera.height, preset.model, RenderConfig(), Wanted(), (0,))
-    pose = torch.linalg.inv(camera.world_from_cam) @ placed.world_from_local
-    kept, _ = keep_forward(settings, placed.gaussians, pose, camera.lens)
+    settings, kept = kept_lists(preset)
     lists = kept.parts[0].lists
     total = int(lists.starts[-1])
     tile = torch.repeat_interleave(torch.arange(len(lists.starts) - 1), lists.starts.diff().long())

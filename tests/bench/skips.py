@@ -60,6 +60,13 @@ def outputs_that_were_not_asked_for(n: int) -> Pair:
 
 
 @skip
+def what_gradients_would_need(n: int) -> Pair:
+    p = _flat(n)
+    leaves = [replace(x, gaussians=x.gaussians.map(lambda t: t.clone().requires_grad_())) for x in p.placed]
+    return _draw(p), _draw(replace(p, placed=leaves))
+
+
+@skip
 def harmonics_that_are_zero(n: int) -> Pair:
     p = _flat(n)
     padded = replace(p, placed=[replace(x, gaussians=x.gaussians.with_sh_count(16)) for x in p.placed])
