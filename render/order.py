@@ -78,9 +78,10 @@ def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bo
     slot_of = begins = first_slot = exact[:0]
     if slots:
         slot_of = torch.empty_like(ids)
-        begins = exact.cumsum(0, dtype=torch.int32) - exact
-        first_slot = torch.empty_like(counts)
-        first_slot[order], counts[order] = begins, exact
+        counts[order] = exact
+        # in the records' own order, in which the slots will be added up
+        first_slot = counts.cumsum(0, dtype=torch.int32) - counts
+        begins = first_slot.index_select(0, order)
     out = [view(exact, int), view(begins, int), view(ids, int), view(slot_of, int)]
     run(deal, CHUNKS, [*told, view(cursor, int), int(WITH_SLOTS) if slots else 1, *out], records.device)
     return TileLists(starts, ids, slot_of, first_slot)
