@@ -101,7 +101,8 @@ def _ready(kernel: wp.Kernel, device: str) -> None:
     said.daemon = True
     said.start()
     try:
-        kernel.module.load(device)
+        # the block size belongs to what is compiled: with another one, the launch would compile everything once more
+        kernel.module.load(device, block_dim=1 if device == "cpu" else None)
     finally:
         said.cancel()
 
