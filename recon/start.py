@@ -80,8 +80,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
     reach = sharpest * np.maximum(path.query(cloud.xyz)[0], NEAREST)
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
-    if log.points is None:
-        background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
+    background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
 
     groups, reaches, tracks = [], [], []
     for track in split.tracks:
