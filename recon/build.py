@@ -31,8 +31,8 @@ from scenes.space_order import space_order
 PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""
 HELD_OUT = 8
-PER_PHOTO = 40
-"""Steps that a fit takes a photo."""
+PER_PHOTO = 25, 2500
+"""Steps that a fit takes a photo, and splats that it may have."""
 
 
 def reconstruct(
@@ -116,12 +116,14 @@ def fit_size(log: Log, names: Sequence[str]) -> tuple[int, int]:
 
 
 def fit_config(log: Log, names: Sequence[str]) -> FitConfig:
-    """How long to fit. Photos that stand steps apart are learnt by heart long before a drive's pictures are: colours that turn with
-    the view, and more than `PER_PHOTO` steps each, improve the photos and nothing between them."""
+    """How long and how finely to fit. Photos that stand steps apart are learnt by heart long before a drive's pictures are: colours that
+    turn with the view, and more than `PER_PHOTO` steps and splats each, improve the photos and nothing between them."""
+    most = FitConfig()
     if log.points is None:
-        return FitConfig()
-    most = FitConfig().steps
-    return FitConfig(steps=min(most, PER_PHOTO * sum(len(log.camera(name)) for name in names)), sh_degree=0)
+        return most
+    photos = sum(len(log.camera(name)) for name in names)
+    steps, splats = (n * photos for n in PER_PHOTO)
+    return FitConfig(steps=min(most.steps, steps), budget=min(most.budget, splats), sh_degree=0)
 
 
 def begin(

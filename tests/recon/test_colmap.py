@@ -201,7 +201,8 @@ def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
 
 def test_photos_are_not_learnt_by_heart(workspace, drive):
     log = open_log(workspace)
-    assert fit_config(log, ["camera"]).steps == 12 * PER_PHOTO < FitConfig().steps
+    config = fit_config(log, ["camera"])
+    assert (config.steps, config.budget) == tuple(12 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
     assert fit_config(open_log(drive), ["front_camera"]) == FitConfig()
     assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
 
