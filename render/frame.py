@@ -10,14 +10,12 @@ from render.frame_types import Frame, RenderConfig
 from render.need import need_of, support_fields
 from render.outputs import check_outputs
 from render.rasterize import rasterize
-from render.rays import world_directions
 from render.shadow import cast, shadow_casters
+from render.sky import over_sky
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.scene import Scene
-from scenes.sky import Sky
 
-SKY_SHOWS = 1 / 512  # where less light than this passes the splats, the sky changes no 8-bit value
 DEFAULT = RenderConfig()
 
 
@@ -69,24 +67,12 @@ def render_frame(
     if "rgb" in outputs:
         assert rgb is not None
         if scene.sky is not None:
+            assert frame.alpha is not None
             rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
         if camera.exposure is not None:
             rgb = expose(rgb, camera.exposure)
     wanted = {name: getattr(frame, name) for name in outputs}
     return Frame(camera, **wanted | {"need": need, "rgb": rgb if "rgb" in outputs else None})
-
-
-def over_sky(rgb: torch.Tensor, alpha: torch.Tensor | None, sky: Sky, camera: Camera) -> torch.Tensor:
-    """Premultiplied `rgb` `[H, W, 3]` over the sky, looked up only where `alpha` `[H, W]` lets light pass."""
-    assert alpha is not None
-    through = alpha.detach() < 1 - SKY_SHOWS
-    if not through.any():
-        return rgb
-    directions = world_directions(camera)
-    through = through & (directions != 0).any(-1).to(through.device)  # no direction leads to pixels past a lens's edge
-    colour = sky.colour(directions[through.cpu()]).to(rgb)
-    behind = colour * (1 - alpha[through])[..., None]
-    return rgb.index_put((through,), behind, accumulate=True)
 
 
 def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:

@@ -30,11 +30,18 @@ def camera_origins(camera: Camera) -> torch.Tensor:
 
 def world_directions(camera: Camera) -> torch.Tensor:
     """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length, each as the camera stood when it saw it."""
-    rays, start, end = camera_rays(camera), camera.world_from_cam.detach(), camera.world_from_cam_end
+    rays, ways = camera_rays(camera), turns(camera).to(torch.float32)
+    if len(ways) == 1:
+        return rays @ ways[0].T
+    return torch.einsum("hwj,hij->hwi" if camera.shutter == "rows" else "hwj,wij->hwi", rays, ways)
+
+
+def turns(camera: Camera) -> torch.Tensor:
+    """World from camera, float64 rotations `[1, 3, 3]`, or one for each row or column where the shutter moves."""
+    start, end = camera.world_from_cam.detach(), camera.world_from_cam_end
     if camera.shutter == "global" or end is None:
-        return rays @ start[:3, :3].to(torch.float32).T
-    turns = readout(camera, start, end.detach())[:, :3, :3].to(torch.float32)
-    return torch.einsum("hwj,hij->hwi" if camera.shutter == "rows" else "hwj,wij->hwi", rays, turns)
+        return start[None, :3, :3]
+    return readout(camera, start, end.detach())[:, :3, :3]
 
 
 def exact_rays(camera: Camera, placed: Sequence[Placed], moving: bool) -> tuple[torch.Tensor, list[int]]:

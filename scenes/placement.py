@@ -43,7 +43,7 @@ class Waypoint:
 
 
 def parse_at(text: str) -> tuple[float, float]:
-    """"20m,-3.5m" as metres forward and left. ValueError with the fix otherwise."""
+    """ "20m,-3.5m" as metres forward and left. ValueError with the fix otherwise."""
     parts = text.split(",")
     if len(parts) != 2:
         raise ValueError(f'"{text}" is not a place; write metres forward and left of the body, as 20m,-3.5m')
@@ -51,7 +51,7 @@ def parse_at(text: str) -> tuple[float, float]:
 
 
 def parse_placement(text: str) -> Placement:
-    """"ID@X,Y[,yaw=5deg][,speed=8m/s][,path=lane]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
+    """ "ID@X,Y[,yaw=5deg][,speed=8m/s][,path=lane]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
     asset, at, rest = text.rpartition("@")
     if not at or not asset:
         raise ValueError(f'"{text}" does not say what goes where; write ID@X,Y as car/0003@12m,3.5m (metres forward, left)')
@@ -72,7 +72,7 @@ def parse_placement(text: str) -> Placement:
 
 
 def parse_path(text: str) -> str:
-    """"straight" or "lane". ValueError with the fix otherwise."""
+    """ "straight" or "lane". ValueError with the fix otherwise."""
     if text not in PATHS:
         raise ValueError(f'"{text}" is not a path; it is one of {", ".join(PATHS)}.{nearest(text, PATHS)}')
     return text

@@ -12,7 +12,7 @@ from scenes.gaussians import Placed, SplatModel
 from scenes.ground import Ground
 from scenes.names import unknown
 from scenes.sky import Sky
-from scenes.trajectory import Trajectory
+from scenes.trajectory import Trajectory, all_at
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,10 @@ class Scene:
     def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:
         """Background and the actors that exist at a time, each at its pose and under its instance id; with the pose to which it
         moves while an image is read out, where that takes `readout_us`."""
+        here = [(i, a) for i, a in enumerate(self.actors) if a.trajectory.covers(time_us)]
+        poses = all_at([a.trajectory for _, a in here], time_us)
         actors = [
-            Placed(a.asset.gaussians, a.trajectory.at(time_us), _end(a, time_us, readout_us), instance=i + 1)
-            for i, a in enumerate(self.actors)
-            if a.trajectory.covers(time_us)
+            Placed(a.asset.gaussians, pose, _end(a, time_us, readout_us), instance=i + 1) for (i, a), pose in zip(here, poses, strict=True)
         ]
         return [self.background, *actors]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -53,9 +54,13 @@ class Trajectory:
             raise ValueError(f"time {int(time_us)} us is outside the trajectory, which covers {first} to {last} us")
         if len(self) == 1:
             return self.world_from_body[0]
-        later = int(torch.searchsorted(self.times_us, int(time_us)).clamp(1, len(self) - 1))
-        t0, t1 = int(self.times_us[later - 1]), int(self.times_us[later])
-        return interpolate(self.world_from_body[later - 1], self.world_from_body[later], (int(time_us) - t0) / (t1 - t0))
+        return interpolate(*self._around(int(time_us)))
+
+    def _around(self, time_us: int) -> tuple[torch.Tensor, torch.Tensor, float]:
+        """The poses before and after a time, and its share of the way; of the nearest step where it lies beyond an end."""
+        later = int(torch.searchsorted(self.times_us, time_us).clamp(1, len(self) - 1))
+        t0, t1 = self.times_us[later - 1 : later + 1].tolist()
+        return self.world_from_body[later - 1], self.world_from_body[later], (time_us - t0) / (t1 - t0)
 
     def near(self, time_us: int) -> torch.Tensor:
         """`world_from_body` `[4, 4]` at a time, or at the nearest that is covered: where a readout ends after the path does."""
@@ -65,3 +70,16 @@ class Trajectory:
     def shifted(self, lateral: float = 0.0, vertical: float = 0.0, forward: float = 0.0) -> Trajectory:
         """Every pose moved by metres along its own body axes: forward x, left y, up z."""
         return replace(self, world_from_body=self.world_from_body @ translation(forward, lateral, vertical))
+
+
+def all_at(trajectories: Sequence[Trajectory], time_us: int) -> list[torch.Tensor]:
+    """Each trajectory's pose `[4, 4]` at a time that all cover, as `at` gives them one by one, interpolated together."""
+    poses = [t.world_from_body[0] for t in trajectories]
+    moving = [i for i, t in enumerate(trajectories) if len(t) > 1]
+    if moving:
+        before, after, share = zip(*(trajectories[i]._around(int(time_us)) for i in moving), strict=True)
+        for i, pose in zip(
+            moving, interpolate(torch.stack(before), torch.stack(after), torch.tensor(share, dtype=torch.float64)), strict=True
+        ):
+            poses[i] = pose
+    return poses

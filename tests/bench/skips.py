@@ -105,7 +105,7 @@ def a_sky_behind_everything(n: int) -> Pair:
     def work() -> Frame:
         return render_frame(scene, p.camera, shadows=False)
 
-    return work, _without("render.frame.SKY_SHOWS", -1.0, work)
+    return work, _without("render.sky.SKY_SHOWS", -1.0, work)
 
 
 @skip

@@ -11,7 +11,9 @@ from randomized import START_US, asset, gaussians, scene, trajectory
 
 import scenes
 from scenes import Actor, Asset, Camera, Gaussians, Ground, Pinhole, Placed, RigCamera, Sky, SplatModel
+from scenes.poses import pose_from
 from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.trajectory import Trajectory, all_at
 
 EYE = torch.eye(4, dtype=torch.float64)
 LENS = Pinhole(500.0, 510.0, 320.5, 200.25)
@@ -183,3 +185,19 @@ def test_every_name_of_the_package_exists_and_others_do_not():
     assert all(getattr(scenes, name) is not None for name in scenes.__all__)
     with pytest.raises(AttributeError, match="no attribute 'Scne'"):
         _ = scenes.Scne
+
+
+def test_poses_of_many_trajectories_are_those_of_each():
+    dice = torch.Generator().manual_seed(4)
+
+    def path(count: int) -> Trajectory:
+        poses = pose_from(
+            torch.randn(count, 4, dtype=torch.float64, generator=dice), torch.randn(count, 3, dtype=torch.float64, generator=dice)
+        )
+        return Trajectory(torch.arange(count) * 1000, poses)
+
+    paths = [path(n) for n in (5, 1, 4, 9)]
+    for time in (-300, 0, 1000, 2345):
+        for mine, alone in zip(all_at(paths, time), [p.at(time) for p in paths], strict=True):
+            torch.testing.assert_close(mine, alone, atol=1e-12, rtol=0)
+    assert all_at([], 0) == []

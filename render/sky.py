@@ -1,0 +1,53 @@
+"""A scene's sky behind its splats."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from render.kernels.sky import lay_behind
+from render.launch import run, stage, view
+from render.rays import camera_rays, turns, world_directions
+from scenes.camera import Camera
+from scenes.sky import Sky, srgb_from_linear
+
+SKY_SHOWS = 1 / 512
+"""Where less light than this passes the splats, the sky changes no 8-bit value."""
+
+_displayed = WeakTensorKeyDictionary()  # by linear radiance: its version, and display-referred colours
+
+
+def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:
+    """Premultiplied `rgb` `[H, W, 3]` over the sky, looked up only where `alpha` `[H, W]` lets light pass; differentiable in all three."""
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (rgb, alpha, sky.linear)):
+        return _differentiably(rgb, alpha, sky, camera)
+    if not (alpha < 1 - SKY_SHOWS).any():
+        return rgb
+    out = torch.empty(rgb.shape, device=rgb.device)
+    ways = turns(camera).to(rgb).contiguous()
+    with stage(rgb.device):
+        args = [view(camera_rays(camera).to(rgb.device), wp.vec3), view(ways, wp.mat33), int(camera.shutter != "columns")]
+        args += [view(_display(sky).to(rgb.device), wp.vec3), SKY_SHOWS, view(rgb, float), view(alpha, float), view(out, float)]
+        run(lay_behind, rgb.shape[0], args, rgb.device)
+    return out
+
+
+def _display(sky: Sky) -> torch.Tensor:
+    """The sky's display-referred colours, kept until it changes."""
+    kept = _displayed.get(sky.linear)
+    if kept is None or kept[0] != sky.linear._version:
+        kept = (sky.linear._version, srgb_from_linear(sky.linear.detach()).contiguous())
+        _displayed[sky.linear] = kept
+    return kept[1]
+
+
+def _differentiably(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:
+    through = alpha.detach() < 1 - SKY_SHOWS
+    if not through.any():
+        return rgb
+    directions = world_directions(camera)
+    through = through & (directions != 0).any(-1).to(through.device)  # no direction leads to pixels past a lens's edge
+    colour = sky.colour(directions[through.cpu()]).to(rgb)
+    behind = colour * (1 - alpha[through])[..., None]
+    return rgb.index_put((through,), behind, accumulate=True)
