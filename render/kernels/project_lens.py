@@ -42,6 +42,9 @@ POSE = 12
 STILL = wp.constant(wp.float64(1.0e-7))
 TURN = wp.constant(wp.float64(6.283185307179586))
 STEP = wp.constant(wp.float64(1.0e-5))
+STEPS = wp.constant(50)
+SETTLED = wp.constant(wp.float64(1.0e-13))
+ENDS = wp.constant(wp.float64(1.0e-9))
 
 
 class LensKernels(NamedTuple):
@@ -119,13 +122,15 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     planar, around = depth == PLANAR, depth == ROUND
 
     @wp.func
-    def readout(o: Optics, m: Motion, x: wp.vec3d, shift: wp.vec3d, start: wp.float64, steps: int):
-        """The share of the readout at which local point x, moved by `shift` in the camera, is seen."""
+    def readout(o: Optics, m: Motion, x: wp.vec3d, shift: wp.vec3d, start: wp.float64):
+        """The share of the readout at which local point x, moved by `shift` in the camera, is seen. Newton's steps are few, but where a
+        lens bends hard beside the view."""
         s = wp.float64(start)
         if wp.static(rolling):
             low = wp.float64(0.0)
             high = wp.float64(1.0)
-            for _i in range(steps):
+            for _i in range(STEPS):
+                last = wp.float64(s)
                 y = rotation_at(m, s) * x + translation_at(m, s) + shift
                 v = jacobian(o, y) * (rotation_rate(m, s) * x + translation_rate(m, s))
                 p = pixel(o, y)
@@ -137,6 +142,10 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 s = wp.clamp(s - early / (m.extent - v[m.axis]), wp.float64(0.0), wp.float64(1.0))
                 if (s < low and low > wp.float64(0.0)) or (s > high and high < wp.float64(1.0)):
                     s = wp.float64(0.5) * (low + high)  # past what was looked at already: a point that comes near fast
+                if wp.abs(s - last) < SETTLED:
+                    break
+            if s > wp.float64(1.0) - ENDS:
+                s = wp.float64(1.0)  # halving comes near the end, where a point that no row meets belongs
         return s
 
     @wp.func
@@ -168,7 +177,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     @wp.func
     def sighted(o: Optics, m: Motion, x: wp.vec3d, view: View):
         c = Sight()
-        c.s = readout(o, m, x, wp.vec3d(), wp.float64(0.5), 8)
+        c.s = readout(o, m, x, wp.vec3d(), wp.float64(0.5))
         c.t = placed(m, x, wp.vec3d(), c.s)
         c.rotation = m.r0
         if wp.static(rolling):
@@ -201,7 +210,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 out.v[k, 0] = e[0]
                 out.v[k, 1] = e[1]
         else:
-            s = readout(o, m, x, shift, c.s, 8)
+            s = readout(o, m, x, shift, c.s)
             out.aimed = pixel(o, placed(m, x, shift, s))
             for i in range(6):
                 local = column(axes, i // 2)
@@ -209,7 +218,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     local = -local
                 r = reach(o, c.aim, c.rotation * local, wp.static(depth))
                 point = x + r.tau * local
-                s = readout(o, m, point, shift, c.s, 8)
+                s = readout(o, m, point, shift, c.s)
                 d = pixel(o, placed(m, point, shift, s)) - out.aimed
                 stretch = ROOT3 / r.tau
                 dx = (d[0] - nearest(o, d[0]) * o.period) * stretch
@@ -356,7 +365,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                             rule = int(r.rule)
                             stretch = ROOT3 / r.tau
                         point = x + tau * local
-                        s = readout(optics, motion, point, shift, c.s, 8)
+                        s = readout(optics, motion, point, shift, c.s)
                         y = placed(motion, point, shift, s)
                         g_d = wp.vec2d(g_aimed)
                         if k < 6:

@@ -60,11 +60,11 @@ class Captured:
         pass
 
 
-def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole, features=None):
+def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole, features=None, frames=None, rays=None):
     """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
     kept.needs_input_grad = (True,) * 11
-    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), features, None, None, *gaussians.tensors().values())
+    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), features, frames, rays, *gaussians.tensors().values())
 
 
 def whole(settings: Settings):
