@@ -38,6 +38,7 @@ class Case:
     empty: bool = False
     truth: bool = True
     backward: bool = True
+    order: str = "tile"
 
 
 @dataclass
@@ -202,7 +203,7 @@ def examine(case: Case, device: str = "cpu") -> list[str]:
     placed = [replace(p, gaussians=p.gaussians.to(device).map(lambda t: t.detach().clone().requires_grad_())) for p in case.placed]
     pose = case.camera.world_from_cam.clone().requires_grad_()
     camera = replace(case.camera, world_from_cam=pose)
-    frame = rasterize(placed, camera, ("rgb", "alpha", "depth"), model=case.model)
+    frame = rasterize(placed, camera, ("rgb", "alpha", "depth"), model=case.model, config=RenderConfig(order=case.order))
     for name in ("rgb", "alpha"):
         if not getattr(frame, name).isfinite().all():
             wrong.append(f"{name} is not finite")
@@ -222,8 +223,12 @@ def examine(case: Case, device: str = "cpu") -> list[str]:
             wrong.append("gradient of the camera's pose is not finite")
     if case.truth:
         with torch.no_grad():
-            frame = rasterize(case.placed, case.camera, ("rgb",), model=case.model, config=RenderConfig(termination=0))
-            truth, _, _, _, edge = oracle.render(oracle.as_oracle(case.placed), case.camera, case.model, cutoff=1 / 255, alpha_max=0.999)
+            config = RenderConfig(termination=0, order=case.order)
+            frame = rasterize(case.placed, case.camera, ("rgb",), model=case.model, config=config)
+            truth, _, _, _, edge = oracle.render(
+                oracle.as_oracle(case.placed), case.camera, case.model, cutoff=1 / 255, alpha_max=0.999, order=case.order,
+                world_from_cam_end=case.camera.world_from_cam_end, ends=[p.world_from_local_end for p in case.placed],
+            )  # fmt: skip
         off = (frame.rgb.double() - truth).abs()[~edge]
         # beyond pixel 2048 a float's step is 2.4e-4 px, which a splat of one pixel shows as 1e-4
         limit = (1e-4 if max(case.camera.width, case.camera.height) > 2048 else 2.5e-5) * max(1.0, float(truth.max()))
