@@ -59,6 +59,8 @@ def draw_rays(
     settings: Settings, w: Window, lists: TileLists, scene: Projected, planes: torch.Tensor, picks: torch.Tensor, elsewhere: torch.Tensor
 ) -> None:
     """Fill the window's planes and picks, but of tiles that are drawn elsewhere."""
+    if elsewhere.all():
+        return
     bands, longest, working = _working(lists)
     args = [view(lists.starts, int), view(lists.ids, int), *_scene(w, scene, planes), view(elsewhere, int)]
     args += [w, bands, settings.alpha_max, settings.termination, *working, lanes_of(planes), lanes_of(picks)]
