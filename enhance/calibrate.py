@@ -14,6 +14,8 @@ from enhance.shards import Shard
 
 CLEAN_DB = 49.0
 """PSNR that clean training pictures must keep against themselves. New places fare worse: drive 002's front camera by 7 dB."""
+LEAST = (2.0, 0.5)
+"""Least that may be chosen, without a mask and with one: a picture of which nothing is told may be any video, and right already."""
 SHUTS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 15.0, 25.0, 40.0)
 PICTURES = 16
 
@@ -55,7 +57,7 @@ def _choose(pair: torch.Tensor, clean: Sequence[Shard], changed: Changed) -> Non
             errors.append(torch.stack([(make(shut) - rgb).square().mean() for shut in SHUTS]))
         if errors:
             good = torch.stack(errors).mean(0) <= 10 ** (-CLEAN_DB / 10)
-            pair[knowing] = next((s for s, fine in zip(SHUTS, good.tolist(), strict=True) if fine), SHUTS[-1])
+            pair[knowing] = next((s for s, fine in zip(SHUTS, good.tolist(), strict=True) if fine and s >= LEAST[knowing]), SHUTS[-1])
 
 
 def _pictures(clean: Sequence[Shard], knowing: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:

@@ -3,7 +3,7 @@
 import torch
 
 from enhance import calibrate
-from enhance.calibrate import CLEAN_DB, SHUTS
+from enhance.calibrate import CLEAN_DB, LEAST, SHUTS
 
 
 def chosen(monkeypatch, error, pictures=2):
@@ -16,9 +16,9 @@ def chosen(monkeypatch, error, pictures=2):
 
 
 def test_the_least_that_is_clean_enough_is_chosen_for_each_mask(monkeypatch):
-    limit = 10 ** (-CLEAN_DB / 20)
-    least = [SHUTS[3], SHUTS[5]]
-    assert chosen(monkeypatch, lambda shut, told: 0.9 * limit if shut >= least[told] else 1.1 * limit) == least
+    limit, least = 10 ** (-CLEAN_DB / 20), [SHUTS[5], SHUTS[3]]
+    assert chosen(monkeypatch, lambda shut, told: limit * (0.9 if shut >= least[told] else 1.1)) == least
+    assert chosen(monkeypatch, lambda shut, told: 0.0) == [*LEAST]
 
 
 def test_where_nothing_is_clean_enough_the_surest_is_chosen(monkeypatch):
