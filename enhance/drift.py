@@ -16,7 +16,7 @@ from render.video import read_video
 
 FRAMES = 500
 PART = 50
-"""Frames at either end that are compared."""
+"""Frames that are compared: the first, and the same pictures when they come for the last time."""
 
 KEPT = 60
 """Frames of the video that are held in memory."""
@@ -48,7 +48,9 @@ def drift(enhancer: Enhancer, video: str | Path, frames: int = FRAMES) -> Drift:
         sharp = sharpness(better, everywhere) / max(sharpness(rgb, everywhere), 1e-9)
         found.append([float(after.mean() / before.mean()), *colour.tolist(), sharp])
     part = min(PART, frames // 2)
-    first, last = (np.mean(x, 0) for x in (found[:part], found[-part:]))
+    period = 2 * len(pictures) - 2
+    again = period * ((frames - part) // period)  # the last time that the same pictures came
+    first, last = np.mean(found[:part], 0), np.mean(found[again : again + part], 0)
     change = 100 * np.abs(last / first - 1)
     return Drift(float(change[0]), float(change[1:4].max()), float(change[4]))
 
