@@ -27,9 +27,6 @@ G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i
 RAY_BOUNDS = 1.5
 """With response "ray" the conic only bounds a splat, which is no ellipse on the image: S_MAX is so many times its own."""
 
-FRAME = 12
-"""Floats of a splat's canonical frame (`ray_rows.py`): M row major, then q."""
-
 
 class Wanted(NamedTuple):
     """What a composite kernel sums up. One is compiled for every combination that is asked for.
