@@ -10,7 +10,7 @@ from render import launch
 
 class Kernel:
     def __init__(self, seconds: float):
-        self.module = SimpleNamespace(load=lambda device: time.sleep(seconds))
+        self.module = SimpleNamespace(load=lambda device, block_dim: time.sleep(seconds))
 
 
 @pytest.fixture(autouse=True)
@@ -29,3 +29,12 @@ def test_a_kernel_that_is_compiled_is_loaded_silently(capsys):
     launch._ready(Kernel(0.0), "cpu")
     time.sleep(0.1)
     assert capsys.readouterr().err == ""
+
+
+def test_a_kernel_is_compiled_once():
+    from render.kernels.sky import lay_behind
+    from render.sky import over_sky
+    from tests.render.test_sky import CAMERAS, picture
+
+    over_sky(*picture(CAMERAS["pinhole"]), CAMERAS["pinhole"])
+    assert {block_size for _, block_size in lay_behind.module.execs} == {1}
