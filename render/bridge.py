@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from render.compositing import draw, draw_backward
-from render.kernels.bin import REACH
+from render.kernels.bin import REACH_INTS
 from render.kernels.types import MEDIAN, RECORD, WHO
 from render.launch import run_each, stage, view
 from render.order import depth_order
@@ -50,7 +50,7 @@ class Rasterize(torch.autograd.Function):
         device = fields[0].device
         n = sum(sizes)
         records = torch.empty(n, RECORD, device=device)
-        reach = torch.empty(n, REACH, dtype=torch.int32, device=device)
+        reach = torch.empty(n, REACH_INTS, dtype=torch.int32, device=device)
         keys, counts = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
         told, jobs = [], []
         still, lens_now = poses.detach().cpu(), settings.lens(*lens.tolist())

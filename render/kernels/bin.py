@@ -16,7 +16,7 @@ LAST_CENTRE = wp.constant(TILE - 0.5)
 FAR = wp.constant(1.0e6)
 ROOM = wp.constant(1.0001)  # the box that sets room aside is this much wider than the ellipse, whatever rounding does to either
 
-REACH = 4
+REACH_INTS = 4
 """Ints of a splat's reach: first row and column of tiles, then a bit for each of 8x8 tiles from there, row by row, in two halves."""
 SIDE = wp.constant(8)
 WORD = wp.constant(wp.int64(0xFFFFFFFF))

@@ -19,7 +19,7 @@ def exp_of(squarings: int):
     """The function exp(-s) of lanes: a polynomial of s / 2^squarings, squared that often; s / 2^squarings should lie in [0, 0.75], beyond
     it gives anything but negative numbers. 3 squarings serve cutoffs down to 1/400, 5 to 1e-10.
 
-    The polynomial is minimax for its 8th power, with 1 at 0: off by 2e-7 at most, and by 1e-5 of itself; 5 squarings, by 3e-7 and 2e-5
+    The polynomial is minimax for its 8th power, with 1 at 0: off by 5e-7 at most, and by 6e-6 of itself; 5 squarings, by 2e-6 and 3e-5
     (`python -m tests.bench.accuracy`).
     """
     c1, c2, c3, c4, c5 = (c * 0.5 ** (squarings * (k + 1)) for k, c in enumerate(EXP))
