@@ -7,12 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from enhance.enhancer import Enhancer
+from enhance.step import Steps
 from render.frame_types import Frame
 
 READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb
 
 
-def enhance_frames(frames: Iterable[Frame], enhancer: Enhancer) -> Iterator[Frame]:
+def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
     """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in READS."""
     memory = None
     for frame in frames:
@@ -29,7 +30,7 @@ def enhancement(weights: str, device: str = "cpu") -> tuple[Callable[[Iterable[F
 def enhance_video(
     source: str | Path,
     out: str | Path,
-    enhancer: Enhancer | None = None,
+    enhancer: Steps | None = None,
     progress: Callable[[int, int | None], None] | None = None,
 ) -> int:
     """Enhance any video that FFmpeg decodes, of any size, in constant memory; returns the number of frames.

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.enhancer import Enhancer
 from enhance.metrics import sharpness
+from enhance.step import Steps
 from render.video import read_video
 
 FRAMES = 500
@@ -34,7 +34,7 @@ class Drift:
     sharpness: float
 
 
-def drift(enhancer: Enhancer, video: str | Path, frames: int = FRAMES) -> Drift:
+def drift(enhancer: Steps, video: str | Path, frames: int = FRAMES) -> Drift:
     """Of a rollout over `frames` frames of a video, as plain RGB. ValueError where the video has fewer than two."""
     pictures = [_shrunk(rgb) for rgb, _ in zip(read_video(video), range(KEPT), strict=False)]
     if len(pictures) < 2:

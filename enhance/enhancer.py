@@ -11,10 +11,10 @@ from torch.nn import functional as F
 from enhance.net import MULTIPLE, Net
 from enhance.past import Past
 from enhance.precision import channels_last, has_bfloat16
+from enhance.step import Steps, checked
 from enhance.tiles import Tiles
-from enhance.weights_file import BUILTIN, load_net
+from enhance.weights_file import BUILTIN, is_net, load_net
 from render.frame_types import Frame
-from scenes.checks import check_tensor
 
 LONGEST = 4
 """Frames that needed nothing after which the past is given up: each that is followed blurs it."""
@@ -58,10 +58,19 @@ class Enhancer:
             raise ValueError(f"history must be 0 to {net.config.history}, as the network was trained, got {history}")
 
     @classmethod
-    def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Enhancer:
-        """The shipped weights ("builtin") or those of a safetensors file. FileNotFoundError, ValueError as `load_net`."""
-        net, about = load_net(BUILTIN if weights == "builtin" else weights)
-        return cls(net, about, device, **how)
+    def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Steps:
+        """The shipped weights ("builtin"), a file that `sidestep train` wrote, or a public model's checkpoint, which `open_public` names.
+
+        FileNotFoundError where there is none, ValueError where it is not whole or not an enhancer's.
+        """
+        if weights == "builtin" or is_net(weights):
+            net, about = load_net(BUILTIN if weights == "builtin" else weights)
+            return cls(net, about, device, **how)
+        from enhance.checkpoints import open_public
+        from enhance.public.enhancer import PublicEnhancer
+
+        model, about = open_public(weights)
+        return PublicEnhancer(model, about, device, **how)
 
     @torch.inference_mode()
     def step(self, frame: Frame | torch.Tensor, memory: Memory | None = None) -> tuple[torch.Tensor, Memory]:
@@ -76,7 +85,7 @@ class Enhancer:
         Pixels whose gate is 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame
         that needs nothing costs nothing. Raises ValueError for values that are not finite.
         """
-        given = _inputs(frame)
+        given = checked(frame)
         height, width = given.rgb.shape[:2]
         if memory is not None and (memory.size != (height, width) or (memory.flow and given.flow is None)):
             memory = None
@@ -117,42 +126,6 @@ class Enhancer:
         if memory.past is None or len(since) > LONGEST:
             return Memory(None, size, memory.flow or flow is not None)
         return Memory(memory.past, size, memory.flow or flow is not None, since)
-
-
-@dataclass(frozen=True)
-class _Given:
-    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, object mask and need `[H, W]`; None where it has none."""
-
-    rgb: torch.Tensor
-    flow: torch.Tensor | None = None
-    mask: torch.Tensor | None = None
-    need: torch.Tensor | None = None
-
-
-def _inputs(frame: Frame | torch.Tensor) -> _Given:
-    """What a frame gives, checked."""
-    if isinstance(frame, Frame):
-        if frame.rgb is None:
-            raise ValueError("the frame has no rgb; render it with outputs=('rgb', ...)")
-        rgb, flow, instance, need = frame.rgb, frame.flow_prev, frame.instance, frame.need
-    else:
-        rgb, flow, instance, need = frame, None, None, None
-    check_tensor("rgb", rgb, ("H", "W", 3))
-    height, width = rgb.shape[:2]
-    if height == 0 or width == 0:
-        raise ValueError(f"rgb must hold pixels, got {width}x{height}")
-    if not rgb.is_floating_point():
-        raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
-    if not torch.isfinite(rgb.sum()) and not torch.isfinite(rgb).all():  # a sum is read once, and finite unless some value is not
-        bad = (~torch.isfinite(rgb)).any(-1).nonzero()[0].tolist()
-        raise ValueError(f"rgb holds a value that is not finite at row {bad[0]}, column {bad[1]}; enhance finite frames only")
-    if flow is not None:
-        check_tensor("flow_prev", flow, (height, width, 2))
-    if instance is not None:
-        check_tensor("instance", instance, (height, width))
-    if need is not None:
-        check_tensor("need", need, (height, width))
-    return _Given(rgb, flow, None if instance is None else instance > 0, need)
 
 
 def _pad(image: torch.Tensor, **how) -> torch.Tensor:

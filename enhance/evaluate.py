@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from enhance.drift import drift, drift_text
-from enhance.enhancer import Enhancer, Memory
+from enhance.enhancer import Enhancer
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.shards import KINDS, PairSet, Shard, Window
+from enhance.step import Steps
 from enhance.weights_file import BUILTIN, load_net
 from render.compare import psnr, ssim
 from render.frame_types import Frame
@@ -69,7 +70,7 @@ class Row:
 
 def evaluate(
     pairs: PairSet,
-    enhancer: Enhancer,
+    enhancer: Steps,
     split: str = "held out",
     limit: int | None = None,
     progress: Callable[[str], None] | None = None,
@@ -106,14 +107,14 @@ def spread(shards: Sequence[Shard], most: int | None) -> Sequence[Shard]:
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
 
 
-def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Enhancer, features: Features) -> Row:
+def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features) -> Row:
     clips: dict[str, list[float]] = {m: [] for m in MEASURES}
     times: list[float] = []
     for shard in shards:
         found: dict[str, list[float]] = defaultdict(list)
         window = shard.window()
         previous: torch.Tensor | None = None
-        memory: Memory | None = None
+        memory = None
         for t in range(shard.frames):
             frame = _frame(window, t, told=method == "ours + instances")
             start = time.perf_counter()

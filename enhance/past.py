@@ -71,12 +71,7 @@ class Past:
 
     def fitting(self, rgb: torch.Tensor) -> Past:
         """What of it belongs to the coming frame `[B, 3, H, W]`: nothing after a cut or a jump, where the two do not look alike."""
-        now, last, seen = thin(rgb), thin(self.rgb), thin(self.seen)
-        last = torch.lerp(now, last, seen)
-        now, last = F.adaptive_avg_pool2d(now, BLOCKS), F.adaptive_avg_pool2d(last, BLOCKS)
-        apart = (now - last).abs().mean((1, 2, 3)) / seen.mean((1, 2, 3)).clamp_min(1e-3)
-        varies = torch.stack([(x - x.mean((2, 3), keepdim=True)).abs().mean((1, 2, 3)) for x in (now, last)]).mean(0)
-        fits = (apart < CUT * (varies + 0.02)).to(rgb.dtype)[:, None, None, None]
+        fits = alike(rgb, self.rgb, self.seen).to(rgb.dtype)[:, None, None, None]
         return replace(self, valid=self.valid * fits[:, None], seen=self.seen * fits, count=self.count * fits)
 
     def cropped(self, window: Window) -> Past:
@@ -108,3 +103,14 @@ class Past:
         latents = torch.cat([latent[:, None], self.latents], 1)[:, :longest]
         valid = torch.cat([known[:, None], self.valid], 1)[:, :longest]
         return Past(latents, valid, rgb, torch.ones_like(rgb[:, :1]), fields.detach(), count.detach())
+
+
+def alike(rgb: torch.Tensor, last: torch.Tensor, seen: torch.Tensor | None = None) -> torch.Tensor:
+    """Whether pictures `[B, 3, H, W]` show one place, bool `[B]`. `seen` `[B, 1, H, W]`: 1 where `last` is known, everywhere if None."""
+    now, then = thin(rgb), thin(last)
+    known = torch.ones_like(now[:, :1]) if seen is None else thin(seen)
+    then = torch.lerp(now, then, known)
+    now, then = F.adaptive_avg_pool2d(now, BLOCKS), F.adaptive_avg_pool2d(then, BLOCKS)
+    apart = (now - then).abs().mean((1, 2, 3)) / known.mean((1, 2, 3)).clamp_min(1e-3)
+    varies = torch.stack([(x - x.mean((2, 3), keepdim=True)).abs().mean((1, 2, 3)) for x in (now, then)]).mean(0)
+    return apart < CUT * (varies + 0.02)

@@ -25,6 +25,20 @@ def save_net(net: Net, path: str | Path, about: dict) -> None:
         half.write_bytes(save(state, {"format": FORMAT, "config": json.dumps(asdict(net.config)), "about": json.dumps(about)}))
 
 
+def is_net(path: str | Path) -> bool:
+    """Whether a file claims to be an enhancer of ours, or nothing else could be said of it than that it is none."""
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        return not path.is_dir()
+    try:
+        with safe_open(path, "pt") as file:
+            return (file.metadata() or {}).get("format") == FORMAT
+    except SafetensorError:
+        return path.suffix == ".safetensors"
+
+
 def load_net(path: str | Path) -> tuple[Net, dict]:
     """The network of a weights file, in float32 on the CPU, and what is said about it.
 

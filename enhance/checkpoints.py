@@ -1,0 +1,116 @@
+"""Which public model is it? Decided by a file's content; opened without ever running what is in it but TorchScript."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from enhance.public.layout import part
+from enhance.public.model import Model
+
+KNOWN = (
+    "NVIDIA Harmonizer (diffusion_harmonizer.pkl, harmonizer_nontemporal.pt), NVIDIA Fixer (pretrained_fixer.pkl with "
+    "base/tokenizer_fast.pth beside it), or the folder of Cosmos-Predict2 (model.pt with tokenizer/tokenizer.pth)"
+)
+
+TRAINING = ("net_disc", "optimizer", "optimizer_disc")
+"""What the trainings of Harmonizer, Fixer and Difix save beside the networks."""
+
+
+def open_public(path: str | Path) -> tuple[Model, dict]:
+    """The model of a public checkpoint, float32 on the CPU, and what is known of it.
+
+    A file or, where a release has several, its folder. ValueError where it is not whole, or none of those that are known.
+    """
+    path = Path(path)
+    model = _folder(path) if path.is_dir() else _file(path)
+    weights = sum(value.numel() for value in model.state_dict().values())
+    about = {"model": model.name, "file": str(path), "weights used": weights, "unverified": "never run with the released weights here"}
+    return model, about
+
+
+def _folder(path: Path) -> Model:
+    from enhance.public.harmonizer import read_cosmos
+
+    transformer, vae = path / "model.pt", path / "tokenizer" / "tokenizer.pth"
+    if transformer.is_file() and vae.is_file():
+        return read_cosmos(transformer, read_state(transformer), read_state(vae), "Cosmos-Predict2", 0)
+    raise ValueError(f"{path} holds no model that is known; give {KNOWN}")
+
+
+def _file(path: Path) -> Model:
+    from enhance.public.harmonizer import Scripted, read_cosmos, read_fixer
+
+    if is_torchscript(path):
+        return Scripted(path, _script(path))
+    state = read_state(path)
+    transformer, vae = state.get("state_dict_unet"), state.get("state_dict_vae")
+    if isinstance(transformer, Mapping) and isinstance(vae, Mapping):
+        strange = sorted(set(map(str, state)) - {"state_dict_unet", "state_dict_vae", *TRAINING})
+        if strange:
+            raise ValueError(f"{path} has the unknown part {strange[0]}; give {KNOWN}")
+        if "conv1.weight" in vae or "encoder.conv1.weight" in vae:
+            return read_cosmos(path, transformer, vae, "NVIDIA Harmonizer", 4)
+        if part(vae, "encoder.") and part(vae, "decoder."):
+            tokenizer = _tokenizer(path)
+            return read_fixer(path, transformer, vae, tokenizer, read_state(tokenizer))
+    if any(str(name).removeprefix("net.").startswith("blocks.") for name in state):
+        raise ValueError(f"{path} is the transformer of Cosmos-Predict2 alone; give its folder, with tokenizer/tokenizer.pth in it")
+    if "encoder.conv1.weight" in state:
+        raise ValueError(f"{path} is the Wan autoencoder alone; give the folder with model.pt in it, or a Harmonizer's .pkl")
+    first = ", ".join(map(str, list(state)[:3]))
+    raise ValueError(f"{path} is no enhancer that is known, it holds {first or 'nothing'}; give {KNOWN}")
+
+
+def _tokenizer(path: Path) -> Path:
+    """Where the tokenizer of a Fixer's base lies, in the folders that `hf download nvidia/Fixer` makes or beside the file."""
+    near = path.parent
+    places = [folder / "tokenizer_fast.pth" for folder in (near, near / "base", near.parent / "base")]
+    for place in places:
+        if place.is_file():
+            return place
+    raise ValueError(f"{path} is a Fixer, whose tokenizer's graph is in base/tokenizer_fast.pth of nvidia/Fixer; put that at {places[0]}")
+
+
+def is_torchscript(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+
+
+def _script(path: Path) -> torch.jit.ScriptModule:
+    try:
+        return torch.jit.load(str(path), map_location="cpu")
+    except RuntimeError as error:
+        raise ValueError(f"{path} is no whole TorchScript ({str(error).strip().splitlines()[0]}); fetch it again") from error
+
+
+def read_state(path: Path) -> dict:
+    """The tensors of a file that torch.save wrote, or of safetensors; large ones are mapped and read when they are used.
+
+    ValueError where it is cut off, holds anything but tensors, numbers, text and bytes in dicts and lists, or is something else.
+    """
+    if path.suffix == ".safetensors":
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            return load_file(path)
+        except SafetensorError as error:
+            raise ValueError(f"{path} is not a whole safetensors file ({error}); fetch it again") from error
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+    except pickle.UnpicklingError as error:
+        why = next((line.strip() for line in str(error).splitlines() if "GLOBAL" in line or "global" in line), "it is cut off or damaged")
+        raise ValueError(f"{path} does not open as tensors alone: {why}; fetch it again, or re-save its state dicts alone") from error
+    except (RuntimeError, EOFError, KeyError, ValueError, zipfile.BadZipFile, UnicodeDecodeError) as error:
+        why = (str(error).strip().splitlines() or ["it ends too early"])[0]
+        raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error
+    if not isinstance(state, Mapping):
+        raise ValueError(f"{path} holds a {type(state).__name__}, not tensors by name; give {KNOWN}")
+    return dict(state)

@@ -1,0 +1,59 @@
+"""The call that every enhancer has, and what a frame must be to be given to one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+
+from render.frame_types import Frame
+from scenes.checks import check_tensor
+
+
+class Steps(Protocol):
+    """An enhancer: frames of one clip in order, `better, memory = enhancer.step(frame, memory)`, memory None at its start.
+
+    about  what is known of the weights, json-like
+    """
+
+    about: dict
+    device: torch.device
+
+    def step(self, frame: Frame | torch.Tensor, memory: Any = None) -> tuple[torch.Tensor, Any]: ...
+
+
+@dataclass(frozen=True)
+class Given:
+    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, object mask and need `[H, W]`; None where it has none."""
+
+    rgb: torch.Tensor
+    flow: torch.Tensor | None = None
+    mask: torch.Tensor | None = None
+    need: torch.Tensor | None = None
+
+
+def checked(frame: Frame | torch.Tensor) -> Given:
+    """What a frame gives, checked."""
+    if isinstance(frame, Frame):
+        if frame.rgb is None:
+            raise ValueError("the frame has no rgb; render it with outputs=('rgb', ...)")
+        rgb, flow, instance, need = frame.rgb, frame.flow_prev, frame.instance, frame.need
+    else:
+        rgb, flow, instance, need = frame, None, None, None
+    check_tensor("rgb", rgb, ("H", "W", 3))
+    height, width = rgb.shape[:2]
+    if height == 0 or width == 0:
+        raise ValueError(f"rgb must hold pixels, got {width}x{height}")
+    if not rgb.is_floating_point():
+        raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
+    if not torch.isfinite(rgb.sum()) and not torch.isfinite(rgb).all():  # a sum is read once, and finite unless some value is not
+        bad = (~torch.isfinite(rgb)).any(-1).nonzero()[0].tolist()
+        raise ValueError(f"rgb holds a value that is not finite at row {bad[0]}, column {bad[1]}; enhance finite frames only")
+    if flow is not None:
+        check_tensor("flow_prev", flow, (height, width, 2))
+    if instance is not None:
+        check_tensor("instance", instance, (height, width))
+    if need is not None:
+        check_tensor("need", need, (height, width))
+    return Given(rgb, flow, None if instance is None else instance > 0, need)

@@ -1,0 +1,211 @@
+"""The public models: read strictly, and the same as their unmodified graphs."""
+
+import made_public as made
+import pytest
+import torch
+
+from enhance import Enhancer
+from enhance.checkpoints import open_public, read_state
+from enhance.public.cosmos import Denoiser
+from enhance.public.wan import MEAN, STD, Autoencoder
+
+ROUNDING = 5e-6
+"""Of float32 over sums of some hundred terms of size 1, taken in another order."""
+
+
+@pytest.fixture(scope="module")
+def nets():
+    return made.cosmos(1), made.wan(2)
+
+
+@pytest.fixture(scope="module")
+def harmonizer(nets, tmp_path_factory):
+    return made.harmonizer(tmp_path_factory.mktemp("harmonizer") / "diffusion_harmonizer.pkl", *nets)
+
+
+def picture(h=32, w=48, seed=0):
+    return torch.rand(h, w, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@torch.no_grad()
+def unmodified(nets, clip, sigma=0.25):
+    """The release's chain of whole graphs: `[V, H, W, 3]` in 0..1 to V frames, text of zeros, padding mask and all."""
+    net, vae = nets
+    mean, std = (torch.tensor(v).view(1, 16, 1, 1, 1) for v in (MEAN, STD))
+    z = (vae.encode(clip.permute(3, 0, 1, 2)[None] * 2 - 1).latent_dist.mode() - mean) / std
+    t = sigma / (1 + sigma)
+    x = torch.cat([(1 - t) * z, torch.zeros_like(z[:, :1])], 1)
+    clean = (1 - t) * z - t * net(x, torch.tensor([t]), torch.zeros(1, 512, net.config.text_embed_dim)).sample
+    return (vae.decode(clean * std + mean).sample[0] / 2 + 0.5).permute(1, 2, 3, 0).clamp(0, 1)
+
+
+def test_a_release_of_the_real_depth_has_as_many_tensors_as_its_authors_count(nets):
+    state = made.transformer_state(nets[0])
+    blocks = sum(name.startswith("blocks.") for name in state)
+    assert blocks == 2 * 20 and len(state) - blocks + 20 * 20 == 414  # "the dit_ema.* keys (~414)", NVIDIA/harmonizer
+    assert len(made.autoencoder_state(nets[1])) == 194  # of Wan2.1_VAE.pth
+
+
+@pytest.mark.parametrize("masks", [1, 2])
+def test_the_folded_transformer_is_the_whole_one(tmp_path, masks):
+    net = made.cosmos(3, masks)
+    z = torch.randn(1, 16, 2, 6, 10, generator=torch.Generator().manual_seed(0))
+    folded = Denoiser.read(tmp_path, made.transformer_state(net), sigma=0.25)
+    with torch.no_grad():
+        x = torch.cat([0.8 * z, torch.zeros(1, masks, 2, 6, 10)], 1)
+        whole = 0.8 * z - 0.2 * net(x, torch.tensor([0.2]), torch.zeros(1, 7, 20)).sample
+        assert (whole - 0.8 * z).abs().mean() > 0.1
+        assert torch.allclose(folded(z), whole, atol=ROUNDING)
+
+
+def test_text_of_zeros_adds_nothing_and_other_text_does(nets):
+    net = nets[0]
+    x, t = torch.randn(1, 17, 1, 4, 4, generator=torch.Generator().manual_seed(0)), torch.tensor([0.2])
+    with torch.no_grad():
+        nothing = net(x, t, torch.zeros(1, 512, 20)).sample
+        for block in net.transformer_blocks:
+            assert not block.attn2(torch.randn(1, 4, 48), torch.zeros(1, 512, 20)).any()
+        assert not torch.allclose(nothing, net(x, t, torch.ones(1, 512, 20)).sample, atol=1e-3)
+
+
+@pytest.mark.parametrize("frames", [1, 5])
+def test_the_autoencoder_is_the_whole_one_and_decodes_the_first_frame_alone(nets, tmp_path, frames):
+    vae = nets[1]
+    ours = Autoencoder.read(tmp_path, made.autoencoder_state(vae))
+    clip = torch.rand(1, 3, frames, 24, 40, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    mean, std = (torch.tensor(v).view(1, 16, 1, 1, 1) for v in (MEAN, STD))
+    with torch.no_grad():
+        latents, features = ours.encode(clip)
+        whole = vae.encode(clip).latent_dist.mode()
+        assert latents.shape[2] == (frames + 3) // 4
+        assert torch.allclose(latents * std + mean, whole, atol=ROUNDING)
+        assert torch.allclose(ours.decode(latents, features), vae._decode(whole).sample[:, :, 0], atol=ROUNDING)
+
+
+def test_an_autoencoder_of_single_frames_loses_nothing(nets, tmp_path):
+    state = made.autoencoder_state(nets[1])
+    clip = torch.rand(1, 3, 1, 16, 16) * 2 - 1
+    whole, single = Autoencoder.read(tmp_path, state), Autoencoder.read(tmp_path, state).single()
+    assert torch.equal(whole.encode(clip)[0], single.encode(clip)[0])
+    assert 2.5 * sum(p.numel() for p in single.encoder.parameters()) < sum(p.numel() for p in whole.encoder.parameters())
+
+
+def test_harmonizer_runs_as_its_release_does_alone_and_with_four_results(nets, harmonizer):
+    enhancer, memory, results = Enhancer.load(harmonizer, bfloat16=False), None, []
+    for i in range(6):
+        frame = (picture() + 0.02 * i).clamp(0, 1)
+        better, memory = enhancer.step(frame, memory)
+        past = results[::-1][:4] if len(results) >= 4 else []
+        assert torch.allclose(better, unmodified(nets, torch.stack([frame, *past]))[0], atol=1e-4), i
+        assert not torch.allclose(better, frame, atol=0.05)
+        results.append(better)
+    alone, _ = enhancer.step(frame)
+    assert not torch.allclose(alone, better, atol=1e-3)
+
+
+def test_history_can_be_left_out(harmonizer):
+    enhancer, memory = Enhancer.load(harmonizer, bfloat16=False, history=0), None
+    for _ in range(6):
+        better, memory = enhancer.step(picture(), memory)
+    assert torch.equal(better, enhancer.step(picture())[0])
+    with pytest.raises(ValueError, match="0 or 4"):
+        Enhancer.load(harmonizer, history=2)
+
+
+def test_a_cut_and_a_change_of_size_forget(harmonizer):
+    enhancer, memory = Enhancer.load(harmonizer, bfloat16=False), None
+    for _ in range(4):
+        _, memory = enhancer.step(picture(), memory)
+    assert len(memory.frames) == 4
+    cut = 0.3 * picture(seed=5) + 0.7 * torch.linspace(0, 1, 48)[:, None]
+    assert len(enhancer.step(cut, memory)[1].frames) == 1
+    other = picture(16, 16)
+    better, after = enhancer.step(other, memory)
+    assert len(after.frames) == 1 and torch.equal(better, enhancer.step(other)[0])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (16, 32), (33, 17)])
+def test_any_size_is_padded_and_cut_back(nets, harmonizer, size):
+    rgb = picture(*size)
+    better, _ = Enhancer.load(harmonizer, bfloat16=False).step(rgb)
+    height, width = (-(-n // 16) * 16 for n in size)
+    padded = rgb[torch.arange(height).clamp(max=size[0] - 1)][:, torch.arange(width).clamp(max=size[1] - 1)]
+    assert torch.allclose(better, unmodified(nets, padded[None])[0][: size[0], : size[1]], atol=1e-4)
+
+
+def test_bfloat16_is_near(harmonizer):
+    exact, _ = Enhancer.load(harmonizer, bfloat16=False).step(picture())
+    near, _ = Enhancer.load(harmonizer, bfloat16=True).step(picture())
+    assert near.dtype == torch.float32 and (near - exact).abs().mean() < 0.01
+
+
+def test_the_folder_of_the_base_loads(nets, tmp_path):
+    enhancer = Enhancer.load(made.base(tmp_path / "base", *nets), bfloat16=False)
+    assert enhancer.about["model"] == "Cosmos-Predict2" and enhancer.history == 0
+    assert torch.allclose(enhancer.step(picture())[0], unmodified(nets, picture()[None])[0], atol=1e-4)
+
+
+@pytest.fixture
+def parts(nets):
+    unet = made.prefixed("dit.", made.transformer_state(nets[0]))
+    return {"state_dict_unet": unet, "state_dict_vae": made.autoencoder_state(nets[1]), "optimizer": {}}
+
+
+def broken(parts, tmp_path, match):
+    torch.save(parts, tmp_path / "x.pkl")
+    with pytest.raises(ValueError, match=match) as found:
+        open_public(tmp_path / "x.pkl")
+    assert str(tmp_path / "x.pkl") in str(found.value)
+
+
+def test_what_is_missing_unknown_or_misshapen_is_named(parts, tmp_path):
+    unet, vae = parts["state_dict_unet"], parts["state_dict_vae"]
+    name = "blocks.1.cross_attn.output_proj.weight"
+    kept = unet.pop(f"dit.{name}")
+    broken(parts, tmp_path, f"lacks {name} of Cosmos-Predict2, which has 47 tensors; fetch")
+    unet[f"dit.{name}"] = kept.T[:3]
+    broken(parts, tmp_path, rf"{name} of Cosmos-Predict2 has shape \(3, 48\), wanted \(48, 48\)")
+    unet[f"dit.{name}"] = kept.int()
+    broken(parts, tmp_path, "floats, got torch.int32")
+    unet[f"dit.{name}"] = kept
+    unet["controlnet.weight"] = kept
+    broken(parts, tmp_path, "unknown controlnet.weight")
+    del unet["controlnet.weight"]
+    vae["decoder.middle.3.gamma"] = kept
+    broken(parts, tmp_path, "unknown decoder.middle.3.gamma of the Wan 2.1 autoencoder")
+    del vae["decoder.middle.3.gamma"]
+    vae["encoder.conv1.bias"] = vae["encoder.conv1.bias"] * torch.nan
+    broken(parts, tmp_path, "encoder.conv1.bias holds values that are not finite")
+
+
+def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer, tmp_path):
+    whole = harmonizer.read_bytes()
+    cut = tmp_path / "cut.pkl"
+    for length in (0, 10, len(whole) // 2, len(whole) - 30):
+        cut.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match="cut.pkl"):
+            open_public(cut)
+    cut.write_text("<html>Access to this model is restricted</html>")
+    with pytest.raises(ValueError, match="cut.pkl"):
+        open_public(cut)
+    torch.save({"state_dict_unet": print}, cut)
+    with pytest.raises(ValueError, match="print"):
+        read_state(cut)
+    torch.save({"layer.weight": torch.zeros(2)}, cut)
+    with pytest.raises(ValueError, match=r"layer\.weight; give NVIDIA Harmonizer"):
+        Enhancer.load(cut)
+    torch.save([torch.zeros(2)], cut)
+    with pytest.raises(ValueError, match="holds a list"):
+        open_public(cut)
+    with pytest.raises(ValueError, match="holds no model"):
+        Enhancer.load(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        Enhancer.load(tmp_path / "none.pkl")
+
+
+def test_half_a_model_says_where_the_other_half_belongs(nets, tmp_path):
+    folder = made.base(tmp_path / "base", *nets)
+    with pytest.raises(ValueError, match=r"give its folder, with tokenizer/tokenizer\.pth"):
+        open_public(folder / "model.pt")
+    with pytest.raises(ValueError, match="autoencoder alone"):
+        open_public(folder / "tokenizer" / "tokenizer.pth")
