@@ -14,7 +14,8 @@ from enhance.public.model import Model
 
 KNOWN = (
     "NVIDIA Harmonizer (diffusion_harmonizer.pkl, harmonizer_nontemporal.pt), NVIDIA Fixer (pretrained_fixer.pkl with "
-    "base/tokenizer_fast.pth beside it), or the folder of Cosmos-Predict2 (model.pt with tokenizer/tokenizer.pth)"
+    "base/tokenizer_fast.pth beside it), or the folder of Difix (nvidia/difix, nvidia/difix_ref) or Cosmos-Predict2 (model.pt with "
+    "tokenizer/tokenizer.pth)"
 )
 
 TRAINING = ("net_disc", "optimizer", "optimizer_disc")
@@ -34,12 +35,42 @@ def open_public(path: str | Path) -> tuple[Model, dict]:
 
 
 def _folder(path: Path) -> Model:
+    from enhance.public.difix import read_difix
     from enhance.public.harmonizer import read_cosmos
 
     transformer, vae = path / "model.pt", path / "tokenizer" / "tokenizer.pth"
     if transformer.is_file() and vae.is_file():
         return read_cosmos(transformer, read_state(transformer), read_state(vae), "Cosmos-Predict2", 0)
+    if (path / "unet" / "config.json").is_file():
+        return read_difix(path, read_state)
+    if (path / "transformer" / "config.json").is_file():
+        return _diffusers_cosmos(path)
     raise ValueError(f"{path} holds no model that is known; give {KNOWN}")
+
+
+def _diffusers_cosmos(path: Path) -> Model:
+    """Cosmos-Predict2 in the folders of diffusers, by its releases' names."""
+    from enhance.public.cosmos import STRETCH
+    from enhance.public.diffusers_names import AUTOENCODER, TRANSFORMER, released
+    from enhance.public.difix import config_of
+    from enhance.public.harmonizer import read_cosmos
+
+    config = config_of(path / "transformer" / "config.json")
+    stretch = STRETCH.get(config.get("in_channels", 16) - 15)  # Video2World's condition mask is among the channels here
+    wanted = {"_class_name": "CosmosTransformer3DModel", "extra_pos_embed_type": None, "rope_scale": [1.0, stretch, stretch]}
+    for name, value in wanted.items():
+        if config.get(name) != value:
+            raise ValueError(f"{path}/transformer: {name} is {config.get(name)!r}, {value!r} in Cosmos-Predict2; give {KNOWN}")
+    parts = [_shards(path / name) for name in ("transformer", "vae")]
+    return read_cosmos(path, released(parts[0], TRANSFORMER), released(parts[1], AUTOENCODER), "Cosmos-Predict2", 0)
+
+
+def _shards(folder: Path) -> dict:
+    """The tensors of a folder of diffusers, whose file may be cut in several."""
+    files = sorted(folder.glob("diffusion_pytorch_model*.safetensors"))
+    if not files:
+        raise ValueError(f"{folder} has no diffusion_pytorch_model.safetensors; fetch the model's folder again")
+    return {name: value for file in files for name, value in read_state(file).items()}
 
 
 def _file(path: Path) -> Model:
@@ -50,6 +81,8 @@ def _file(path: Path) -> Model:
     state = read_state(path)
     transformer, vae = state.get("state_dict_unet"), state.get("state_dict_vae")
     if isinstance(transformer, Mapping) and isinstance(vae, Mapping):
+        if "rank_vae" in state:
+            raise ValueError(f"{path} holds what Difix was trained by on top of SD-Turbo; give the folder nvidia/difix, which is whole")
         strange = sorted(set(map(str, state)) - {"state_dict_unet", "state_dict_vae", *TRAINING})
         if strange:
             raise ValueError(f"{path} has the unknown part {strange[0]}; give {KNOWN}")

@@ -94,7 +94,8 @@ class Sizes:
 
 
 def _kept(value: torch.Tensor) -> nn.Parameter:
-    return nn.Parameter(value.contiguous(), requires_grad=False)
+    """Copied, for the file is mapped and may change."""
+    return nn.Parameter(value.clone(), requires_grad=False)
 
 
 def _folded(w: State, name: str, shared: torch.Tensor, time: torch.Tensor) -> list[nn.Parameter]:

@@ -39,14 +39,19 @@ class PublicEnhancer:
         device: str | torch.device = "cpu",
         bfloat16: bool | None = None,
         history: int | None = None,
+        reference: torch.Tensor | None = None,
     ):
         """bfloat16: whether to compute in it; where that is fast, if None. history: results that the model takes beside the frame, 0 or
-        its own number; that, if None."""
+        its own number; that, if None. reference `[H, W, 3]` in 0..1: a clean picture of about the same view, for a model that takes
+        one (Difix with reference)."""
         self.device = torch.device(device)
         self.bfloat16 = has_bfloat16(self.device) if bfloat16 is None else bfloat16
         self.model = channels_last(model.eval().to(self.device, torch.bfloat16 if self.bfloat16 else torch.float32))
         self.about = about or {}
         self.history = model.history if history is None else history
+        self.reference = None if reference is None else checked(reference).rgb.to(self.device, torch.float32).clamp(0, 1)
+        if reference is not None and not model.takes_reference:
+            raise ValueError(f"{model.name} takes no reference picture; leave it out")
         if self.history not in (0, model.history):
             raise ValueError(f"history must be {' or '.join(str(n) for n in sorted({0, model.history}))} for {model.name}, got {history}")
 
@@ -64,6 +69,8 @@ class PublicEnhancer:
         rgb = checked(frame).rgb.to(self.device, torch.float32).clamp(0, 1)
         last = () if memory is None or not _follows(rgb, memory.given) else memory.frames
         clip = (rgb, *last) if self.history and len(last) == self.history else (rgb,)
+        if self.reference is not None:
+            clip = (rgb, _resized(self.reference, rgb.shape[:2]))
         out = in_parts(self.model, torch.stack(clip).permute(0, 3, 1, 2)[None], torch.bfloat16 if self.bfloat16 else torch.float32)
         better = out[0].permute(1, 2, 0).clamp(0, 1).contiguous()
         return better, Recent(rgb, (better, *last)[: max(self.history, 1)])
@@ -108,3 +115,8 @@ def _follows(rgb: torch.Tensor, before: torch.Tensor) -> bool:
     if rgb.shape != before.shape:
         return False
     return bool(alike(*(frame.permute(2, 0, 1)[None] for frame in (rgb, before))))
+
+
+def _resized(rgb: torch.Tensor, size: torch.Size | tuple[int, ...]) -> torch.Tensor:
+    """`[h, w, 3]` to `[H, W, 3]`."""
+    return F.interpolate(rgb.permute(2, 0, 1)[None], tuple(size), mode="bilinear", antialias=True)[0].permute(1, 2, 0)

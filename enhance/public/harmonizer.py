@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from enhance.public.cosmos import LATENT, PATCH, Denoiser
-from enhance.public.layout import finite, part, strict
+from enhance.public.layout import fill, finite, part, strict
 from enhance.public.model import Model
 from enhance.public.wan import STRIDE, Autoencoder
 
@@ -112,8 +112,7 @@ def read_fixer(path: Path, transformer: Mapping[str, object], vae: Mapping[str, 
             module = torch.jit.load(io.BytesIO(kept[half]), map_location="cpu").float().eval()
         except (RuntimeError, TypeError) as error:
             raise ValueError(f"{tokenizer}: its {half} is no whole TorchScript; fetch {TOKENIZER} again") from error
-        wanted = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-        module.load_state_dict(strict(path, f"the {half} of {TOKENIZER}", part(vae, f"{half}."), wanted))
+        fill(path, f"the {half} of {TOKENIZER}", module, part(vae, f"{half}."), assign=False)
         halves.append(module)
     others = [name for name in vae if not name.startswith(("encoder.", "decoder."))]
     strict(path, TOKENIZER, {name: vae[name] for name in others}, {})

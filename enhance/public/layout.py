@@ -35,6 +35,13 @@ def strict(path: Path, what: str, state: Mapping[str, object], wanted: Shapes, b
     return found
 
 
+def fill(path: Path, what: str, module: torch.nn.Module, state: Mapping[str, object], assign: bool = True) -> None:
+    """Give a module of that layout the tensors of `state`, in float32 and copied: a mapped file may change. ValueError as `strict`."""
+    wanted = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    found = strict(path, what, state, wanted)
+    module.load_state_dict({name: value.to(torch.float32, copy=True) for name, value in found.items()}, assign=assign)
+
+
 def finite(path: Path, module: torch.nn.Module) -> None:
     """ValueError where a weight is not finite."""
     for name, value in module.state_dict().items():

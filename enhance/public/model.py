@@ -12,12 +12,14 @@ class Model(nn.Module):
     multiple  of which both sides must be
     window    rows and columns that it takes, and no others; any if None
     history   how many of its last results it takes beside the frame: all of those, or none
+    takes_reference  whether a clean picture of the same place may come second
     """
 
     name: str
     multiple = 16
     window: tuple[int, int] | None = None
     history = 0
+    takes_reference = False
 
     def forward(self, clip: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError

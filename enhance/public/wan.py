@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from enhance.public.layout import finite, shape_of, strict
+from enhance.public.layout import fill, finite, shape_of
 
 NAME = "the Wan 2.1 autoencoder"
 LATENT = 16
@@ -193,8 +193,7 @@ class Autoencoder(nn.Module):
         width = shape_of(path, NAME, state, "encoder.conv1.weight", 5)[0]
         with torch.device("meta"):
             vae = cls(width, any(name.startswith("decoder.skip_conv_") for name in state))
-        wanted = {name: tuple(value.shape) for name, value in vae.state_dict().items()}
-        vae.load_state_dict({k: v.float() for k, v in strict(path, NAME, state, wanted).items()}, assign=True)
+        fill(path, NAME, vae, state)
         for layer in vae.decoder.upsamples:
             if hasattr(layer, "time_conv"):
                 del layer.time_conv

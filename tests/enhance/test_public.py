@@ -1,5 +1,7 @@
 """The public models: read strictly, and the same as their unmodified graphs."""
 
+import io
+
 import made_public as made
 import pytest
 import torch
@@ -7,6 +9,8 @@ import torch
 from enhance import Enhancer
 from enhance.checkpoints import open_public, read_state
 from enhance.public.cosmos import Denoiser
+from enhance.public.enhancer import PublicEnhancer
+from enhance.public.model import Model
 from enhance.public.wan import MEAN, STD, Autoencoder
 
 ROUNDING = 5e-6
@@ -209,3 +213,142 @@ def test_half_a_model_says_where_the_other_half_belongs(nets, tmp_path):
         open_public(folder / "model.pt")
     with pytest.raises(ValueError, match="autoencoder alone"):
         open_public(folder / "tokenizer" / "tokenizer.pth")
+
+
+def test_the_folders_of_diffusers_load_as_the_releases_do(nets, tmp_path):
+    import json
+
+    from safetensors.torch import save_file
+
+    net, vae = nets
+    weight = net.state_dict()["patch_embed.proj.weight"]
+    assert weight.shape[1] == 17 * 4  # as diffusers has it too, where it makes the mask channel itself
+    config = {"_class_name": "CosmosTransformer3DModel", "in_channels": 16, "extra_pos_embed_type": None, "rope_scale": [1.0, 4.0, 4.0]}
+    for name, module in (("transformer", net), ("vae", vae)):
+        (tmp_path / name).mkdir()
+        save_file(module.state_dict(), tmp_path / name / "diffusion_pytorch_model.safetensors")
+    with pytest.raises(ValueError, match="no model that is known"):
+        open_public(tmp_path)
+    (tmp_path / "transformer" / "config.json").write_text(json.dumps(config | {"rope_scale": [1.0, 3.0, 3.0]}))
+    with pytest.raises(ValueError, match=r"rope_scale is \[1.0, 3.0, 3.0\]"):
+        open_public(tmp_path)
+    (tmp_path / "transformer" / "config.json").write_text(json.dumps(config))
+    better, _ = Enhancer.load(tmp_path, bfloat16=False).step(picture())
+    assert torch.allclose(better, unmodified(nets, picture()[None])[0], atol=1e-4)
+
+
+class Half(torch.nn.Module):
+    """A tokenizer's half that shrinks or grows by 8."""
+
+    def __init__(self, inputs: int, outputs: int, scale: float):
+        super().__init__()
+        self.conv = torch.nn.Conv2d(inputs, outputs, 1)
+        self.scale = scale
+
+    def forward(self, x):
+        return self.conv(torch.nn.functional.interpolate(x, scale_factor=self.scale, mode="nearest"))
+
+
+@pytest.fixture
+def fixer(nets, tmp_path):
+    """The folders of nvidia/Fixer: its tensors, and its tokenizer's graph with weights from before it was trained further."""
+    torch.manual_seed(0)
+    trained = {"encoder": Half(3, 16, 0.125), "decoder": Half(16, 3, 8.0)}
+    statistics = [torch.randn(16), 1 + torch.rand(16)]
+    for name in ("base", "pretrained"):
+        (tmp_path / name).mkdir()
+    graphs = {}
+    for name, half in {"encoder": Half(3, 16, 0.125), "decoder": Half(16, 3, 8.0)}.items():
+        torch.jit.save(torch.jit.script(half), buffer := io.BytesIO())
+        graphs[name] = buffer.getvalue()
+    torch.save(graphs | {"mean_std": statistics}, tmp_path / "base" / "tokenizer_fast.pth")
+    vae = {f"{name}.{key}": value for name, half in trained.items() for key, value in half.state_dict().items()}
+    unet = made.prefixed("dit.", made.transformer_state(nets[0])) | made.prefixed("tokenizer.", vae)
+    path = tmp_path / "pretrained" / "pretrained_fixer.pkl"
+    torch.save({"state_dict_unet": unet, "state_dict_vae": vae, "net_disc": {}, "optimizer": {}, "optimizer_disc": {}}, path)
+    return path, trained, statistics
+
+
+@torch.no_grad()
+def test_fixer_runs_its_trained_tokenizer_and_the_whole_transformer(nets, fixer):
+    path, halves, (mean, std) = fixer
+    mean, std = mean.view(1, 16, 1, 1), std.view(1, 16, 1, 1)
+    z = (halves["encoder"](picture().permute(2, 0, 1)[None] * 2 - 1) - mean) / std
+    x = torch.cat([0.8 * z, torch.zeros_like(z[:, :1])], 1)[:, :, None]
+    clean = 0.8 * z - 0.2 * nets[0](x, torch.tensor([0.2]), torch.zeros(1, 512, 20)).sample[:, :, 0]
+    whole = (halves["decoder"](clean * std + mean)[0] / 2 + 0.5).permute(1, 2, 0).clamp(0, 1)
+    assert torch.allclose(Enhancer.load(path, bfloat16=False).step(picture())[0], whole, atol=1e-5)
+
+
+def test_a_fixer_says_where_its_tokenizer_belongs_and_what_is_wrong_with_it(fixer):
+    path = fixer[0]
+    tokenizer = path.parents[1] / "base" / "tokenizer_fast.pth"
+    kept = torch.load(tokenizer)  # read_state maps the file, which is written over here
+    torch.save(kept | {"encoder": kept["encoder"][:100]}, tokenizer)
+    with pytest.raises(ValueError, match="encoder is no whole TorchScript"):
+        open_public(path)
+    torch.save({"encoder": kept["encoder"]}, tokenizer)
+    with pytest.raises(ValueError, match="holds encoder, not encoder, decoder, mean_std"):
+        open_public(path)
+    tokenizer.unlink()
+    with pytest.raises(ValueError, match="base/tokenizer_fast.pth of nvidia/Fixer"):
+        open_public(path)
+
+
+class Exported(torch.nn.Module):
+    def forward(self, x):
+        assert x.shape[2] == 576 and x.shape[3] == 1024
+        return -x
+
+
+@pytest.mark.parametrize("size", [(20, 30), (576, 1024), (600, 1100)])
+def test_torchscript_is_given_the_size_that_it_was_exported_for(tmp_path, size):
+    torch.jit.save(torch.jit.script(Exported()), tmp_path / "harmonizer_nontemporal.pt")
+    rgb = picture(*size)
+    assert torch.allclose(Enhancer.load(tmp_path / "harmonizer_nontemporal.pt", bfloat16=False).step(rgb)[0], 1 - rgb, atol=1e-6)
+
+
+def test_torchscript_that_does_not_run_or_is_cut_off_is_refused(tmp_path):
+    class Half4(torch.nn.Module):
+        def forward(self, x):
+            return x[..., ::2]
+
+    path = tmp_path / "harmonizer_nontemporal.pt"
+    torch.jit.save(torch.jit.script(Half4()), path)
+    with pytest.raises(ValueError, match="use the .pkl"):
+        Enhancer.load(path, bfloat16=False).step(picture())
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match="fetch it again"):
+        open_public(path)
+
+
+class Ladder(Model):
+    """Leaves pictures as they are; notes the sizes that it saw."""
+
+    name = "ladder"
+
+    def __init__(self):
+        super().__init__()
+        self.seen = set()
+
+    def forward(self, clip):
+        self.seen.add(tuple(clip.shape[-2:]))
+        return clip[:, 0]
+
+
+@pytest.mark.parametrize("size", [(2160, 3840), (1281, 1300), (16, 2000), (1279, 17)])
+def test_larger_frames_are_worked_on_in_parts_that_meet_without_a_seam(size):
+    model, rgb = Ladder(), picture(*size)
+    out, _ = PublicEnhancer(model, bfloat16=False).step(rgb)
+    assert torch.allclose(out, rgb, atol=1e-6)
+    assert all(side % 16 == 0 and side <= 1280 for shape in model.seen for side in shape)
+
+
+def test_what_is_no_picture_is_refused(harmonizer):
+    enhancer = Enhancer.load(harmonizer, bfloat16=False)
+    rgb = picture()
+    rgb[4, 7, 1] = torch.nan
+    with pytest.raises(ValueError, match="row 4, column 7"):
+        enhancer.step(rgb)
+    with pytest.raises(ValueError, match="takes no reference"):
+        Enhancer.load(harmonizer, reference=picture())
