@@ -25,19 +25,19 @@ Changed = Callable[[torch.Tensor, torch.Tensor], Callable[[float], torch.Tensor]
 
 @torch.no_grad()
 def calibrate_colour(net: Net, clean: Sequence[Shard]) -> None:
-    """Set `net.shut_colour`: the least of SHUTS at which clean pictures keep CLEAN_DB, without a mask and with one."""
+    """Set `net.shut_colour`: the least of SHUTS at which clean pictures without a mask keep CLEAN_DB."""
 
     def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
         with autocast(rgb.device):
             fields = net.colour(thin(rgb), thin(told))
-        return lambda shut: recoloured(rgb, told, fields, torch.tensor([shut, shut]))
+        return lambda shut: recoloured(rgb, told, fields, torch.tensor(shut))
 
-    _choose(net.shut_colour, clean, changed)
+    _choose(net.shut_colour[None], clean, changed)
 
 
 @torch.no_grad()
 def calibrate_gate(net: Net, clean: Sequence[Shard]) -> None:
-    """Set `net.shut` in the same way, with altered colours undone or not as they are."""
+    """Set `net.shut` in the same way, without a mask and with one, with altered colours undone or not as they are."""
 
     def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
         mask = torch.where(told[:, 1:] > 0, told[:, :1], torch.nan)
@@ -49,8 +49,8 @@ def calibrate_gate(net: Net, clean: Sequence[Shard]) -> None:
 
 
 def _choose(pair: torch.Tensor, clean: Sequence[Shard], changed: Changed) -> None:
-    """Write into `pair` the numbers for pictures without and with a mask; nothing where there are no clean pictures."""
-    for knowing in (0, 1):
+    """Write into `pair` the numbers for pictures without and, if it has two, with a mask; nothing where there are no clean pictures."""
+    for knowing in range(len(pair)):
         errors = []
         for rgb, told in _pictures(clean, knowing):
             make = changed(rgb, told)

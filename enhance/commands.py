@@ -15,7 +15,7 @@ from scenes.options import Flag, Names, Output, Overwrite, written
 
 @dataclass
 class Pairs:
-    """Make training pairs for the enhancer from scenes and their recordings."""
+    """Make training pairs for the enhancer from scenes and their recordings, and pairs to measure it by from photos."""
 
     scenes: Positional[Annotated[tuple[Path, ...], arg(metavar="SCENE")]]
     """Scene folders; of several, each gets a folder of its own in the output."""
@@ -32,6 +32,8 @@ class Pairs:
     """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
     databank: Path | None = None
     """Assets that shadow puts in, beside those cut out of the scene."""
+    photos: tuple[Path, ...] = ()
+    """Folders of images, and videos, of places never trained on: pairs of single frames with a region in other colours."""
     size: Annotated[int, arg(metavar="PIXELS")] = 640
     """Width of the frames."""
     seed: int = 0
@@ -40,10 +42,11 @@ class Pairs:
     def run(self) -> None:
         from enhance.clips import PairConfig
         from enhance.pairs import check_kinds, kinds_for, make_pairs, open_reconstruction, prepare_sources
+        from enhance.photo_pairs import make_photo_pairs
         from recon import open_log
         from render.progress import Progress
 
-        if not self.scenes or len(self.scenes) != len(self.data):
+        if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
         check_kinds(self.kinds or ())
@@ -59,6 +62,7 @@ class Pairs:
                     steps.step(done - steps.done, name)
 
                 make_pairs(scene, log, out, kinds, self.cameras, self.seed, say, sources, PairConfig(width=self.size))
+        make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 
 
@@ -78,6 +82,8 @@ class Train:
     """Seed of the first weights and of every sample."""
     start: str | None = None
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
+    only: Names = None
+    """What of colour, objects, enhancer to train further; the rest of the weights stays as it is."""
     resume: Flag = False
     """Go on from the folder's checkpoint."""
 
@@ -101,6 +107,7 @@ class Train:
                     progress=say,
                     photos=self.photos,
                     start=self.start,
+                    only=self.only,
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch.nn import functional as F
 
 from enhance.net import MULTIPLE, Net
+from enhance.objects import Corrections, correct
 from enhance.past import Past
 from enhance.precision import channels_last, has_bfloat16
 from enhance.step import Steps, checked
@@ -28,12 +29,14 @@ class Memory:
     size   height and width of the frames in pixels
     flow   whether they had flow
     since  `[1, 2, H, W]` each: flows of the frames since then, that needed nothing and cost nothing
+    objects  by told object the correction of its colours so far
     """
 
     past: Past | None
     size: tuple[int, int]
     flow: bool
     since: tuple[torch.Tensor, ...] = ()
+    objects: Corrections = field(default_factory=dict)
 
 
 class Enhancer:
@@ -96,8 +99,12 @@ class Enhancer:
         tiles = Tiles.of(torch.ones(height, width) if given.need is None else given.need)
         if tiles.nothing():
             return rgb, self._skipped(memory, (height, width), flow)
+        corrections: Corrections = {}
+        if given.instance is not None:
+            planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), given.instance, memory.objects if memory else {})
+            rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
-        mask = None if given.mask is None else _pad(given.mask.to(self.device, torch.float32)[None, None], value=0)
+        mask = None if given.instance is None else _pad(given.instance.to(self.device, torch.float32)[None, None], value=0)
         past = None if memory is None else self._brought(memory, flow, padded)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             if tiles.everything():
@@ -106,7 +113,7 @@ class Enhancer:
             else:
                 better, after = self.net.parts(padded, mask, past, tiles)
         better = better[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
-        return better, Memory(after, (height, width), given.flow is not None)
+        return better, Memory(after, (height, width), given.flow is not None, objects=corrections)
 
     def _brought(self, memory: Memory, flow: torch.Tensor | None, rgb: torch.Tensor) -> Past | None:
         """The past of a memory as it would look in the frame `rgb`."""

@@ -7,9 +7,10 @@ features of the input frame, and of the last enhanced one moved to it, at every 
 
     output = base + gate * (residual + blend * (last - base)),   base = input + altered * colour
 
-where colour undoes altered colours (`ColourNet`), averaged over the last frames and kept to the mask where one is told; the residual
-is free; blending with the last picture keeps a clip calm; altered and gate are exactly 0 where the frame is to be left alone. Colour,
-residual and blend are zero in an untrained network, which therefore changes nothing.
+where colour undoes altered colours, averaged over the last frames: by fields (`ColourNet`) where no mask is told; told objects come
+here corrected already (`ObjectColour`). The residual is free; blending with the last picture keeps a clip calm; altered and gate are
+exactly 0 where the frame is to be left alone. Colour, residual and blend are zero in an untrained network, which therefore changes
+nothing.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from torch.nn import functional as F
 from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
 from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
+from enhance.objects import ObjectColour
 from enhance.past import Past
 from enhance.precision import lower
 from enhance.tiles import Tiles, coarser, sampled, within
@@ -51,13 +53,16 @@ class NetConfig:
     """Channels at quarter size."""
     eighth: int = 96
     """Channels at an eighth."""
+    looks: int = 96
+    """Channels of what is read of an object; a multiple of 4."""
 
 
 def told_of(rgb: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """A mask `[B, 1, H, W]`, NaN or None where unknown, as the network takes it: its values, and whether they are known `[B, 2, H, W]`."""
+    """A mask or objects' ids `[B, 1, H, W]`, NaN or None where unknown, as the network takes it: where it is above 0, and whether it is
+    known `[B, 2, H, W]`."""
     if mask is None:
         return rgb.new_zeros(rgb.shape[0], 2, *rgb.shape[-2:])
-    return torch.cat([torch.nan_to_num(mask), torch.isfinite(mask).to(rgb.dtype)], 1)
+    return torch.cat([mask > 0, torch.isfinite(mask)], 1).to(rgb.dtype)
 
 
 class Stem(nn.Module):
@@ -123,13 +128,12 @@ def of_mask(pair: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def recoloured(rgb: torch.Tensor, told: torch.Tensor, fields: torch.Tensor, shut: torch.Tensor) -> torch.Tensor:
-    """`rgb` `[B, 3, H, W]` with altered colours undone as `fields` say: where they are surely altered (`hard_gate` with `shut`, without
-    a mask and with one) and, where told `[B, 2, H, W]` (the mask and whether it is known) knows, within the mask."""
-    mask, known = told.split(1, 1)
-    altered = hard_gate(altered_logits(fields, rgb.shape[-2:]), of_mask(shut, known))
+    """`rgb` `[B, 3, H, W]` with altered colours undone as `fields` say, where they are surely altered (`hard_gate` with `shut`) and
+    told `[B, 2, H, W]` (the mask and whether it is known) knows of no mask: told objects were seen to before."""
+    altered = hard_gate(altered_logits(fields, rgb.shape[-2:]), shut) * (1 - told[:, 1:])
     if rgb.device.type == "cpu" and not altered.any():  # on CUDA, asking would cost more than it saves
         return rgb
-    return rgb + altered * (1 - known + mask) * colour_change(rgb, fields)
+    return rgb + altered * colour_change(rgb, fields)
 
 
 @dataclass(frozen=True)
@@ -153,8 +157,8 @@ class Enhanced:
 
 
 class Net(nn.Module):
-    """The whole network. `encoder` is the autoencoder's and `colour` is trained on thinned pictures, both before and then frozen;
-    everything else is trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one, and
+    """The whole network. `encoder` is the autoencoder's, `colour` is trained on thinned pictures, `objects` on objects, all before and
+    then frozen; everything else is trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one, and
     `shut_colour` the same of altered colours: both are set in training (`enhance.calibrate`)."""
 
     shut: torch.Tensor
@@ -166,6 +170,7 @@ class Net(nn.Module):
         self.config = config
         self.encoder = Encoder()
         self.colour = ColourNet()
+        self.objects = ObjectColour(config.looks)
         self.stem = Stem(config)
         self.embed = nn.Conv2d(LATENT, config.width, PATCH, stride=PATCH)
         self.age = nn.Parameter(torch.zeros(config.history, config.width))
@@ -174,14 +179,15 @@ class Net(nn.Module):
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
         self.register_buffer("shut", torch.tensor([0.5, 0.5]))
-        self.register_buffer("shut_colour", torch.tensor([2.0, 2.0]))
+        self.register_buffer("shut_colour", torch.tensor(2.0))
         zero(self.denoise)
 
     def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None = None, past: Past | None = None) -> Enhanced:
         """One frame.
 
         rgb   `[B, 3, H, W]`, sides multiples of 16
-        mask  `[B, 1, H, W]` in 0..1, where inserted or moving objects are; NaN throughout a frame, or None, where unknown
+        mask  `[B, 1, H, W]`, above 0 where inserted or moving objects are, their colours corrected (`enhance.objects.correct`); NaN
+              throughout a frame, or None, where unknown
         past  of the frames before, already moved to this one; None at the start
         """
         past = past or Past.none(rgb)

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
+from enhance.object_samples import Objects, ObjectSampler
 from enhance.shards import RENDERED, PairSet, Shard, Window
 
 KIND_WEIGHTS = {
@@ -23,12 +24,15 @@ PLACED = ("relight", "shadow", "reinsert")
 """Kinds that change a part of the frame; crops look for it."""
 AIMED = 0.8  # how often
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
+ALIEN = 254
+"""Id of an object that is none of the scene's."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (NaN where not told), flow, visible."""
+    """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (objects' ids from 1, NaN where not told), flow,
+    visible."""
 
     input: torch.Tensor
     target: torch.Tensor
@@ -91,6 +95,7 @@ class Sampler:
         self.shards = {kind: pairs.of(kind, "train") if pairs else [] for kind in KIND_WEIGHTS}
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
+        self._objects = ObjectSampler(self.shards, photos.frames if photos else [])
         if pairs and not any(self.shards.values()) and photos is None:
             raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')
 
@@ -116,6 +121,10 @@ class Sampler:
         rng = self.rng(step)
         drawn = [self._thinned(rng, height, width) for _ in range(count)]
         return Thinned(**{f.name: torch.stack([getattr(d, f.name) for d in drawn]) for f in fields(Thinned)})
+
+    def objects(self, step: int, count: int) -> Objects:
+        """Objects in wrong colours or in their own."""
+        return self._objects.draw(self.rng(step), count)
 
     def _thinned(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
         if self.shards["relight"] and rng.random() < 0.2:
@@ -170,22 +179,22 @@ class Sampler:
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
         w = _regraded(rng, w)
-        objects = (w.instance > 0).float()
+        objects = w.instance.clamp_min(0).float()
         if kind == "isp":
             region = self._moving_mask(rng, w)
-            damaged, told = alter(w.target, region, random_isp(rng)), torch.maximum((region > 0.5).float(), objects)
+            damaged, told = alter(w.target, region, random_isp(rng)), _with_alien(objects, region)
             if rng.random() < 0.25:
-                told = (region > 0.5).float()
+                told = _with_alien(torch.zeros_like(objects), region)
         elif kind in RENDERED:
             damaged, region, told = w.input, torch.ones_like(w.region), objects
             if rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
                 alien = self._moving_mask(rng, w)
-                damaged, told = alter(damaged, alien, random_isp(rng)), torch.maximum((alien > 0.5).float(), objects)
+                damaged, told = alter(damaged, alien, random_isp(rng)), _with_alien(objects, alien)
         elif kind in PLACED:
             damaged, region, told = w.input, w.region, objects
         else:
             damaged, region = w.target, torch.zeros_like(w.region)
-            told = objects if objects.any() and rng.random() < 0.5 else (self._moving_mask(rng, w) > 0.5).float()
+            told = objects if objects.any() and rng.random() < 0.5 else _with_alien(torch.zeros_like(objects), self._moving_mask(rng, w))
         damaged = (damaged * 255).round() / 255
         mask = told if rng.random() < MASK_KNOWN else torch.full_like(told, torch.nan)
         return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
@@ -213,6 +222,11 @@ class Sampler:
             drift = torch.nan_to_num(w.flow[t]).mean((1, 2))
             masks.append(torch.roll(masks[-1], (-round(float(drift[1])), -round(float(drift[0]))), (-2, -1)))
         return torch.cat(masks)
+
+
+def _with_alien(objects: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
+    """Ids of objects, and a further one where `region` reaches beyond them."""
+    return torch.where((objects == 0) & (region > 0.5), float(ALIEN), objects)
 
 
 def _grid(rng: np.random.Generator, sides: tuple[int, int], height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -25,11 +25,11 @@ class Steps(Protocol):
 
 @dataclass(frozen=True)
 class Given:
-    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, object mask and need `[H, W]`; None where it has none."""
+    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, objects' ids and need `[H, W]`; None where it has none."""
 
     rgb: torch.Tensor
     flow: torch.Tensor | None = None
-    mask: torch.Tensor | None = None
+    instance: torch.Tensor | None = None
     need: torch.Tensor | None = None
 
 
@@ -56,4 +56,4 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         check_tensor("instance", instance, (height, width))
     if need is not None:
         check_tensor("need", need, (height, width))
-    return Given(rgb, flow, None if instance is None else instance > 0, need)
+    return Given(rgb, flow, instance, need)

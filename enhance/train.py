@@ -1,4 +1,5 @@
-"""Training: the autoencoder on single images, the colour network on thinned pictures, then, with both frozen, the enhancer on pairs.
+"""Training: the autoencoder on single images, the colour network on thinned pictures, the objects' colours on objects, then, with
+these frozen, the enhancer on pairs.
 
 The enhancer's batches alternate: images without a past, and clips that the network walks through with its own earlier outputs as
 their past, with any number of latents from 0 to K, so that it never sees a past better than the one it will make itself.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,15 +22,20 @@ from enhance.calibrate import calibrate_colour, calibrate_gate
 from enhance.colour import altered_logits, colour_change
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
+from enhance.objects import changed, corrected
 from enhance.past import Past
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shards import PairSet
 from enhance.weights_file import BUILTIN, load_net, save_net
 from scenes.atomic import atomic_file
+from scenes.names import unknown
 
-STAGES = ("autoencoder", "colour", "enhancer")
-FROZEN = ("encoder.", "colour.")  # parts of the network that the last stage leaves as they are
+NEAR_ENOUGH = 3e-4
+"""Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
+STAGES = ("autoencoder", "colour", "objects", "enhancer")
+RATES = {"autoencoder": 2.5, "objects": 2.0}  # of the highest rate
+FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
 
 
 @dataclass(frozen=True)
@@ -38,10 +44,10 @@ class TrainConfig:
 
     autoencoder: float = 0.07
     """Share of the budget for the autoencoder."""
-    colour: float = 0.55
+    colour: float = 0.35
     """Share of the budget for the colour network."""
-    colour_further: float = 0.3
-    """That share where trained weights are trained further, for which the autoencoder stays as it is."""
+    objects: float = 0.25
+    """Share of the budget for objects' colours."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
     images: int = 8
@@ -50,6 +56,8 @@ class TrainConfig:
     """Clips of smallest crops in a temporal batch."""
     thinned: int = 24
     """Thinned pictures in a batch of the colour network."""
+    looked_at: int = 32
+    """Objects in a batch of objects' colours."""
     frames: int = 4
     """Frames of a training clip."""
     temporal_every: int = 4
@@ -77,9 +85,9 @@ class TrainConfig:
 class _Run:
     """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
 
-    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, further: bool):
+    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, stages: Sequence[str]):
         torch.manual_seed(seed)
-        self.config, self.minutes, self.steps, self.seed, self.further = config, minutes, steps, seed, further
+        self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
         self.autoencoder = channels_last(Autoencoder())
         self.average = Net(net.config)
         self.average.load_state_dict(net.state_dict())
@@ -89,6 +97,7 @@ class _Run:
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
             "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
+            "objects": torch.optim.AdamW(self.net.objects.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "enhancer": torch.optim.AdamW(
                 [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
             ),
@@ -119,10 +128,11 @@ class _Run:
             raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
 
     def share(self, stage: str) -> float:
-        """A stage's share of the budget."""
-        first = 0.0 if self.further else self.config.autoencoder
-        colour = self.config.colour_further if self.further else self.config.colour
-        return {"autoencoder": first, "colour": colour, "enhancer": 1 - first - colour}[stage]
+        """A stage's share of the budget, of which those that are left out take nothing."""
+        c = self.config
+        all_of = {"autoencoder": c.autoencoder, "colour": c.colour, "objects": c.objects}
+        all_of["enhancer"] = 1 - sum(all_of.values())
+        return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 
     def done(self, stage: str) -> float:
         """How much of a stage's budget is spent, from 0 to 1."""
@@ -148,6 +158,7 @@ def train(
     net: NetConfig | None = None,
     save_every: float = 60.0,
     start: str | Path | None = None,
+    only: Sequence[str] | None = None,
 ) -> Path:
     """Train on pairs and further photos; returns `out/enhancer.safetensors`.
 
@@ -158,6 +169,7 @@ def train(
     about     written into the weights' header, beside the data's attribution
     progress  called with the share done, 0..1, and a line of words
     start     weights to train further, "builtin" or a file; their autoencoder is kept
+    only      of STAGES those to train, which takes weights to start from; the others' parts stay as they are
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
     """
@@ -165,6 +177,11 @@ def train(
         raise ValueError("give the training budget either as minutes or as steps")
     if not (minutes or steps or 0) > 0:
         raise ValueError(f"the training budget must be positive, got {minutes or steps}")
+    for stage in only or ():
+        if stage not in STAGES[1:]:
+            raise ValueError(unknown("stage", stage, "what can be trained further", STAGES[1:]))
+    if only and start is None:
+        raise ValueError("a stage alone takes weights to start from; pass start, as builtin")
     out = Path(out)
     checkpoint = out / "checkpoint.pt"
     if checkpoint.exists() and not resume:
@@ -176,7 +193,7 @@ def train(
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    run = _Run(config or TrainConfig(), begun, minutes, steps, seed, further=start is not None)
+    run = _Run(config or TrainConfig(), begun, minutes, steps, seed, only or (STAGES if start is None else STAGES[1:]))
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
@@ -184,9 +201,11 @@ def train(
     try:
         _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
         _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
-        if not run.further:
+        if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
-        calibrate_colour(run.net, clean)
+        if "colour" in run.stages:
+            calibrate_colour(run.net, clean)
+        _stage(run, "objects", lambda step: _objects_step(run, sampler, step), checkpoint, save_every, report)
         now = run.net.state_dict()
         frozen = {k: v for k, v in now.items() if k.startswith((*FROZEN, "shut_colour"))}
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
@@ -197,7 +216,8 @@ def train(
     except KeyboardInterrupt:
         run.save(checkpoint)
         raise
-    calibrate_gate(run.average, clean)
+    if "enhancer" in run.stages:
+        calibrate_gate(run.average, clean)
     run.save(checkpoint)
     weights = out / "enhancer.safetensors"
     shards = pair_set.of(split="train") if pair_set else []
@@ -225,7 +245,7 @@ def _stage(run: _Run, name: str, step: Callable[[int], float], checkpoint: Path,
 
 def _set_rate(run: _Run, stage: str) -> None:
     """Warm up over 100 steps, then half a cosine down to a hundredth."""
-    highest = run.config.rate * (2.5 if stage == "autoencoder" else 0.5 if run.further else 1)
+    highest = run.config.rate * RATES.get(stage, 1.0) * (1.0 if "autoencoder" in run.stages else 0.5)
     rate = highest * min(1.0, (run.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * run.done(stage)))
     for group in run.optimiser[stage].param_groups:
         group["lr"] = float(rate)
@@ -262,6 +282,14 @@ def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
     return _update(run, "colour", [loss + 0.1 * where_loss(logits, drawn.region)])
 
 
+def _objects_step(run: _Run, sampler: Sampler, step: int) -> float:
+    drawn = sampler.objects(4 * step + 3, run.config.looked_at)
+    with autocast(drawn.given.device):
+        coefficients = run.net.objects(drawn.evidence)
+    error = (drawn.given + changed(drawn.given, drawn.height, coefficients) - drawn.target).square().mean((1, 2))
+    return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
+
+
 CROPS = (1.0, 1.0, 1.5, 2.0)
 """Sides of the crops that batches are made of, against the smallest: attention must work on small pictures and on large ones."""
 
@@ -292,7 +320,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
     moved = rng.random() < 0.75
     past: Past | None = None
     for t in range(frames):
-        given, target, region = sample.input[:, t], sample.target[:, t], sample.region[:, t]
+        given, target, region = corrected(net.objects, sample.input[:, t], sample.mask[:, t]), sample.target[:, t], sample.region[:, t]
         previous = past.rgb if past is not None else None
         if past is not None:
             past = replace(past, latents=past.latents[:, :longest], valid=past.valid[:, :longest])

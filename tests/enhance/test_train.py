@@ -15,7 +15,7 @@ from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import TrainConfig, train
 from enhance.weights_file import load_net
 
-QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2)
+QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2, looked_at=2)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
 
 
 def test_training_undoes_a_constant_error(pairs, tmp_path):
-    config = replace(QUICK, autoencoder=0.05, colour=0.05, rate=3e-3)
+    config = replace(QUICK, autoencoder=0.05, colour=0.04, objects=0.01, rate=3e-3)
     weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
     rows = evaluate(pairs, Enhancer.load(weights))
     assert [r.method for r in rows] == ["identity", "ours", "ours + instances"] * 3

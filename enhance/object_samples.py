@@ -1,0 +1,133 @@
+"""Objects in wrong colours, drawn for training: those of stored clips, and any region of a photo, each time altered anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from enhance.isp import alter, random_isp
+from enhance.masks import random_mask
+from enhance.objects import Box, Evidence, boxes, evidence, spots, whole_of
+from enhance.shards import Shard
+
+PIXELS = 384
+"""Pixels of an object by which a correction is judged."""
+STORED = 0.3  # how often the stored damage of relit, re-inserted and placed objects is drawn
+ANY_REGION = 0.15  # how often the object is any region of a picture
+COARSE = 4  # how much smaller than the picture that region is drawn
+VARIANTS = 3  # how often an object is used, each time in other colours
+RIGHT = 0.35  # how often an object is right as it is
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
+
+    evidence: Evidence
+    given: torch.Tensor
+    target: torch.Tensor
+    height: torch.Tensor
+
+
+class ObjectSampler:
+    """Draws objects of the training clips by kind, and of further photos."""
+
+    def __init__(self, shards: dict[str, list[Shard]], photos: list[np.ndarray]):
+        self.shards, self.photos = shards, photos
+        self.places = {kind: [s for s in shards.get(kind, ()) if s.meta.get("instances")] for kind in ("relight", "reinsert", "shadow")}
+        self.plain = [s for kind in ("clean", "isp") for s in shards.get(kind, ())]
+
+    def draw(self, rng: np.random.Generator, count: int) -> Objects:
+        drawn: list[tuple] = []
+        while len(drawn) < count:
+            drawn += self._object(rng)
+        e, *pixels = zip(*drawn[:count], strict=True)
+        return Objects(Evidence.stacked(list(e)), *(torch.stack(p) for p in pixels))
+
+    def _object(self, rng: np.random.Generator) -> list[tuple]:
+        """An object, VARIANTS times; nothing where the picture drawn has none."""
+        kinds = [k for k, found in self.places.items() if found]
+        if kinds and rng.random() < STORED:
+            kind = kinds[rng.integers(len(kinds))]
+            shard = self.places[kind][rng.integers(len(self.places[kind]))]
+            t = int(rng.integers(shard.frames))
+            given, instance = shard.frame("input", t)
+            wanted = given if kind == "shadow" else shard.frame("target", t)[0]
+            some = shard.meta["instances"] if rng.random() < 0.7 else None
+            fresh = kind == "shadow"
+        else:
+            given, instance = self._picture(rng)
+            wanted, some, fresh = given, None, True
+        found = boxes(torch.where(instance == 255, 0, instance.int()))
+        ids = [i for i in found if some is None or i in some]
+        if not ids:
+            return []
+        areas = np.array([float((instance == i).sum()) for i in ids]) ** 0.5
+        pick = ids[rng.choice(len(ids), p=areas / areas.sum())]
+        return self._altered(rng, given, wanted, instance, pick, found[pick], fresh)
+
+    def _picture(self, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """A right picture and its objects, or a region of it as if it were one."""
+        region = rng.random() < ANY_REGION
+        if self.plain and (not self.photos or not region or rng.random() < 0.5):
+            shard = self.plain[rng.integers(len(self.plain))]
+            rgb, instance = shard.frame("target", int(rng.integers(shard.frames)))
+        else:
+            rgb = torch.from_numpy(self.photos[rng.integers(len(self.photos))])
+            instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
+        if region or not self.plain:
+            mask = torch.from_numpy(random_mask(rng, instance.shape[0] // COARSE, instance.shape[1] // COARSE))
+            instance = (F.interpolate(mask[None, None], instance.shape, mode="bilinear")[0, 0] > 0.5).to(torch.uint8)
+        return rgb, instance
+
+    def _altered(
+        self,
+        rng: np.random.Generator,
+        given: torch.Tensor,
+        wanted: torch.Tensor,
+        instance: torch.Tensor,
+        pick: int,
+        box: Box,
+        fresh: bool,
+    ) -> list[tuple]:
+        ids = instance[box.outer_rows, box.outer_columns].int()
+        mask = ids == pick
+        share = float(mask.sum()) / instance.numel()
+        at = spots(mask, box, share)
+        judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
+        y, x = torch.cat([at.yx, judged]).unbind(1)
+        strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]
+        thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1).float() / 255
+        soft = F.avg_pool2d(mask[None].float(), 3, 1, 1)[0] if rng.random() < 0.7 else mask.float()
+        others = ((ids > 0) & (ids < 255) & ~mask)[y, x][None, None].float()
+        height = (judged[:, 0] + box.outer_rows.start + 0.5 - box.rows.start) / (box.rows.stop - box.rows.start) * 2 - 1
+        drawn = []
+        for _ in range(VARIANTS):
+            (seen, target), whole = strips, thin
+            if rng.random() < 0.65:  # the whole picture in another light: what counts is the difference within it
+                grade = random_isp(rng, 0.7)
+                seen, target, whole = grade(seen), grade(target), grade(whole)
+            if fresh and rng.random() > RIGHT:
+                isp = random_isp(rng)
+                seen = alter(seen, soft[y, x][None, None], isp)
+                if others.any() and rng.random() < 0.4:
+                    seen = alter(seen, others, isp if rng.random() < 0.5 else random_isp(rng))
+            seen, target = seen[:, 0].T, target[:, 0].T
+            seen = ((seen * 255).round() + torch.from_numpy(rng.random(seen.shape, dtype=np.float32)) - 0.5) / 255
+            read = _flipped(rng, evidence(seen[:-PIXELS], at, whole_of(whole)))
+            drawn.append((read, seen[-PIXELS:], target[-PIXELS:], height))
+        return drawn
+
+
+def _flipped(rng: np.random.Generator, e: Evidence) -> Evidence:
+    """Now and then mirrored left to right."""
+    if rng.random() < 0.5:
+        return e
+    place, inside, around, whole = (v.clone() for v in (e.place, e.inside, e.around, e.whole))
+    place[..., [1, 3]] *= -1
+    for v in (inside, around, whole):
+        v[..., 4] *= -1
+    return Evidence(e.seam, place, e.known, inside, around, whole)

@@ -1,0 +1,250 @@
+"""Colours of an object that was put in: what its seam, its own pixels and its surroundings say, and a small network that listens.
+
+Where the mask is told, altered colours are a problem of few numbers: one tone curve and saturation for the whole object. What tells
+them is fine detail of which a thinned picture shows nothing: along the seam, surfaces go on beyond the mask and only their colours
+jump. So the network reads a few hundred pixels of full sharpness: profiles across the seam, pixels inside, around and anywhere.
+Trained to be near in the picture, it corrects less the less sure it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import torch
+from scipy import ndimage
+from torch import nn
+from torch.nn import functional as F
+
+from enhance.colour import LUMA
+
+SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
+"""How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
+REACH = 4
+"""Pixels of a profile on either side of the seam."""
+DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
+FEWEST = 64
+"""Pixels that an object must have: what is smaller stays as it is."""
+COEFFICIENTS = 15
+STEADY = 8
+"""Frames over which an object's correction is averaged, at most."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is read of B objects: colours are -1..1, places -1..1 in the object's box.
+
+    seam    `[B, SEAM, 8, 4]`: colours from REACH pixels inside to REACH outside, and whether each is in the object
+    place   `[B, SEAM, 4]`: where the profile is, and its direction
+    known   bool `[B, SEAM]`: which profiles there are
+    inside  `[B, INSIDE, 6]`, around `[B, AROUND, 6]`: colour, place, and the logarithm of the object's share of the frame
+    whole   `[B, ROWS * COLUMNS, 5]`: colour, and place in the frame
+    """
+
+    seam: torch.Tensor
+    place: torch.Tensor
+    known: torch.Tensor
+    inside: torch.Tensor
+    around: torch.Tensor
+    whole: torch.Tensor
+
+    @classmethod
+    def stacked(cls, parts: list[Evidence]) -> Evidence:
+        return cls(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Box:
+    """An object's own rows and columns of a frame, and those with what is around it."""
+
+    rows: slice
+    columns: slice
+    outer_rows: slice
+    outer_columns: slice
+
+    @classmethod
+    def around(cls, rows: slice, columns: slice, height: int, width: int) -> Box:
+        wide = max(8, (rows.stop - rows.start) // 2), max(8, (columns.stop - columns.start) // 2)
+        grown = [slice(max(0, s.start - by), min(n, s.stop + by)) for s, by, n in zip((rows, columns), wide, (height, width), strict=True)]
+        return cls(rows, columns, *grown)
+
+
+def boxes(instance: torch.Tensor) -> dict[int, Box]:
+    """Of every object of FEWEST pixels and more in `[H, W]`, by its id above 0."""
+    ids = instance.clamp_min(0).int().cpu().numpy()
+    height, width = ids.shape
+    found = {}
+    for i, box in enumerate(ndimage.find_objects(ids)):
+        if box is not None and int((ids[box] == i + 1).sum()) >= FEWEST:
+            found[i + 1] = Box.around(box[0], box[1], height, width)
+    return found
+
+
+def whole_of(rgb: torch.Tensor) -> torch.Tensor:
+    """A grid of a frame's `[3, H, W]` pixels as Evidence has it, `[1, ROWS * COLUMNS, 5]`."""
+    y, x = ((torch.arange(n, device=rgb.device) + 0.5) / n for n in (ROWS, COLUMNS))
+    colours = rgb[:, (y * rgb.shape[1]).long()[:, None], (x * rgb.shape[2]).long()]
+    places = torch.stack(torch.meshgrid(y, x, indexing="ij")) * 2 - 1
+    return torch.cat([colours * 2 - 1, places]).flatten(1).T[None]
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Where an object is looked at.
+
+    yx      `[N, 2]`: rows and columns of the box's outer part: of the seam's profiles, of pixels inside, and around
+    place   `[M, 2]`: profiles' and pixels' places in the box, -1..1
+    along   `[SEAM, 2]`: the direction of each profile, outwards
+    within  `[SEAM, 8]`: which of a profile's pixels are in the object
+    known   bool `[SEAM]`: which profiles there are
+    size    logarithm of the object's share of the frame, near 0
+    """
+
+    yx: torch.Tensor
+    place: torch.Tensor
+    along: torch.Tensor
+    within: torch.Tensor
+    known: torch.Tensor
+    size: float
+
+
+def spots(mask: torch.Tensor, box: Box, share: float) -> Spots:
+    """Of an object with bool `mask` `[h, w]` in the box's outer part and with its share of the frame."""
+    edges, known = _edges(mask)
+    steps = torch.arange(1 - REACH, REACH + 1, device=mask.device)
+    y = (edges[:, :1] + steps * edges[:, 2:3]).clamp(0, mask.shape[0] - 1)
+    x = (edges[:, 1:2] + steps * edges[:, 3:]).clamp(0, mask.shape[1] - 1)
+    pixels = [_spread(mask.nonzero(), INSIDE), _spread((mask if mask.all() else ~mask).nonzero(), AROUND)]
+    top, left = box.rows.start - box.outer_rows.start, box.columns.start - box.outer_columns.start
+    corner = torch.tensor([top, left], device=mask.device)
+    extent = torch.tensor([box.rows.stop - box.rows.start, box.columns.stop - box.columns.start], device=mask.device)
+    return Spots(
+        torch.cat([torch.stack([y, x], -1).flatten(0, 1), *pixels]),
+        (torch.cat([edges[:, :2], *pixels]) + 0.5 - corner) / extent * 2 - 1,
+        edges[:, 2:].float(),
+        mask[y, x],
+        known,
+        math.log(share) / 4 + 1,
+    )
+
+
+def evidence(colours: torch.Tensor, at: Spots, whole: torch.Tensor) -> Evidence:
+    """Of one object: `colours` `[N, 3]` of its spots, and `whole_of` the frame."""
+    profiles, pixels = (colours * 2 - 1).split([2 * REACH * SEAM, INSIDE + AROUND])
+    places, around = at.place.split([SEAM, INSIDE + AROUND])
+    pixels = torch.cat([pixels, around, torch.full_like(around[:, :1], at.size)], 1)
+    inside, outside = pixels.split([INSIDE, AROUND])
+    seam = torch.cat([profiles.view(SEAM, 2 * REACH, 3), at.within[..., None].to(colours.dtype)], 2)
+    return Evidence(seam[None], torch.cat([places, at.along], 1)[None], at.known[None], inside[None], outside[None], whole)
+
+
+def _edges(mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pixels of `mask` at its seam `[SEAM, 4]`, with the way out along rows or columns, and which of them there are; where the picture
+    ends is no seam."""
+    h, w = mask.shape
+    further = F.pad(mask, (1, 1, 1, 1), value=True)
+    found = []
+    for dy, dx in DIRECTIONS:
+        yx = (mask & ~further[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]).nonzero()
+        found.append(torch.cat([yx, torch.tensor([[dy, dx]], device=yx.device).expand(len(yx), 2)], 1))
+    edges = torch.cat(found)
+    count = min(SEAM, len(edges))
+    known = torch.arange(SEAM, device=mask.device) < count
+    return F.pad(_spread(edges, count) if count else edges, (0, 0, 0, SEAM - count)), known
+
+
+def _spread(rows: torch.Tensor, count: int) -> torch.Tensor:
+    """`count` of the rows, evenly spaced."""
+    at = (torch.arange(count, device=rows.device) + 0.5) / count * len(rows)
+    return rows[at.long()]
+
+
+def _reader(channels: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(channels, width), nn.SiLU(), nn.Linear(width, width), nn.LayerNorm(width))
+
+
+class _Round(nn.Module):
+    """Questions attend to what was read, then to each other."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.asked, self.mixed, self.thought = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        self.read = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.mix = nn.MultiheadAttention(width, heads, batch_first=True)
+        self.think = nn.Sequential(nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
+
+    def forward(self, x: torch.Tensor, tokens: torch.Tensor, unknown: torch.Tensor) -> torch.Tensor:
+        x = x + self.read(self.asked(x), tokens, tokens, key_padding_mask=unknown, need_weights=False)[0]
+        q = self.mixed(x)
+        x = x + self.mix(q, q, q, need_weights=False)[0]
+        return x + self.think(self.thought(x))
+
+
+class ObjectColour(nn.Module):
+    """Evidence to coefficients `[B, 15]` of a colour change for the whole object; zero at first."""
+
+    def __init__(self, width: int = 96, heads: int = 4, questions: int = 12, rounds: int = 3):
+        super().__init__()
+        self.seam = _reader(2 * REACH * 4 + 4, width)
+        self.inside = _reader(6, width)
+        self.around = _reader(6, width)
+        self.whole = _reader(5, width)
+        self.questions = nn.Parameter(torch.randn(questions, width))
+        self.rounds = nn.ModuleList(_Round(width, heads) for _ in range(rounds))
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.Flatten(), nn.Linear(questions * width, width), nn.SiLU())
+        self.last = nn.Linear(width, COEFFICIENTS)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, e: Evidence) -> torch.Tensor:
+        seam = self.seam(torch.cat([e.seam.flatten(2), e.place], 2))
+        tokens = torch.cat([seam, self.inside(e.inside), self.around(e.around), self.whole(e.whole)], 1)
+        unknown = F.pad(~e.known, (0, tokens.shape[1] - e.known.shape[1]), value=False)
+        x = self.questions.expand(len(tokens), -1, -1)
+        for each in self.rounds:
+            x = each(x, tokens, unknown)
+        return self.last(self.head(x)).float()
+
+
+def changed(rgb: torch.Tensor, height: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+    """What `coefficients` `[B, 15]` add to `rgb` `[B, N, 3]` at heights `[B, N]`, -1 at the object's top and 1 at its base: per channel
+    a + b x + c x^2 + d (luma - x) + e height x."""
+    a, b, c, d, e = (coefficients[:, None, i : i + 3] for i in range(0, COEFFICIENTS, 3))
+    luma = (rgb @ rgb.new_tensor(LUMA))[..., None]
+    return a + rgb * (b + c * rgb + e * height[..., None]) + d * (luma - rgb)
+
+
+Corrections = Mapping[int, tuple[torch.Tensor, int]]
+"""By object the mean of its coefficients over the last frames, and of how many."""
+
+
+def corrected(net: ObjectColour, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    """Frames `[B, 3, H, W]` without a past, with objects by their ids `[B, 1, H, W]`, NaN where not told, as `correct` makes them."""
+    return torch.stack([correct(net, x, torch.nan_to_num(i[0]), {})[0] for x, i in zip(rgb, ids, strict=True)])
+
+
+@torch.no_grad()
+def correct(net: ObjectColour, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
+    """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there, and their corrections."""
+    found = boxes(instance)
+    if not found:
+        return rgb, {}
+    whole, read, masks = whole_of(rgb), [], {}
+    for i, box in found.items():
+        outer = box.outer_rows, box.outer_columns
+        masks[i] = instance[outer] == i
+        at = spots(masks[i], box, float(masks[i].sum()) / instance.numel())
+        y, x = at.yx.unbind(1)
+        read.append(evidence(rgb[(slice(None), *outer)][:, y, x].T, at, whole))
+    out, after = rgb.clone(), {}
+    for (i, box), now in zip(found.items(), net(Evidence.stacked(read)), strict=True):
+        mean, count = before.get(i, (now, 0))
+        mean = mean + (now - mean) / (count + 1)
+        after[i] = mean, min(count + 1, STEADY - 1)
+        y, x = masks[i].nonzero().unbind(1)
+        y, x = y + box.outer_rows.start, x + box.outer_columns.start
+        height = (y + 0.5 - box.rows.start) / (box.rows.stop - box.rows.start) * 2 - 1
+        given = rgb[:, y, x].T
+        out[:, y, x] = (given + changed(given[None], height[None], mean[None])[0]).T.clamp(0, 1)
+    return out, after

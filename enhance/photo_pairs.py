@@ -1,0 +1,51 @@
+"""Pairs of places that were never reconstructed: photos and frames of videos, in which a region is in other colours or right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from enhance.isp import alter, random_isp
+from enhance.masks import random_mask
+from enhance.samples import Photos
+from enhance.shards import to_bytes, write_shard
+
+STRIDE = 8
+KINDS_OF_PHOTOS = ("isp", "clean")
+
+
+def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0, width: int = 640) -> Path:
+    """Of every photo in the folders and every STRIDE-th frame of the videos `paths`, `width` pixels wide, a clip of one frame of
+    KINDS_OF_PHOTOS in the folder `out`, which is returned. The same region is told as instance 1 in both; in "clean" it is as it was.
+
+    They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path
+    holds no photos.
+    """
+    out = Path(out)
+    for path in map(Path, paths):
+        for i, photo in enumerate(Photos((path,), STRIDE, width).frames):
+            rng = np.random.default_rng([seed, i])
+            target = torch.from_numpy(photo).permute(2, 0, 1).float() / 255
+            region = torch.from_numpy(random_mask(rng, *photo.shape[:2]))[None]
+            isp = random_isp(rng)
+            meta = {"split": "held out", "camera": path.stem, "start": i, "seed": seed, "instances": [1]}
+            _write(out, "isp", alter(target, region, isp), target, region, region, {**meta, "isp": vars(isp)})
+            _write(out, "clean", target, target, region, torch.zeros_like(region), meta)
+    return out
+
+
+def _write(out: Path, kind: str, given: torch.Tensor, target: torch.Tensor, told: torch.Tensor, region: torch.Tensor, meta: dict) -> None:
+    _, height, width = target.shape
+    tensors = {
+        "input": to_bytes(given.permute(1, 2, 0))[None],
+        "target": to_bytes(target.permute(1, 2, 0))[None],
+        "region": to_bytes(region),
+        "instance": (told > 0.5).to(torch.uint8),
+        "flow": torch.full((1, height, width, 2), torch.nan, dtype=torch.float16),
+        "visible": torch.zeros(1, height, width, dtype=torch.uint8),
+        "depth": torch.full((1, height, width), torch.inf, dtype=torch.float16),
+    }
+    write_shard(out / kind / f"{meta['camera']}_{meta['start']:04d}.safetensors", tensors, {"kind": kind, **meta})

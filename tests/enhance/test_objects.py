@@ -1,0 +1,132 @@
+"""Colours of told objects: what is read of them, and what is done."""
+
+import numpy as np
+import torch
+
+from enhance.object_samples import PIXELS, ObjectSampler
+from enhance.objects import FEWEST, REACH, SEAM, Evidence, ObjectColour, boxes, changed, correct, corrected, evidence, spots, whole_of
+
+
+def scene(top=10, left=20, height=16, width=24, seed=0):
+    """A picture `[3, 64, 96]` and the ids of one object in it."""
+    rgb = torch.rand(3, 64, 96, generator=torch.Generator().manual_seed(seed))
+    instance = torch.zeros(64, 96, dtype=torch.int32)
+    instance[top : top + height, left : left + width] = 5
+    return rgb, instance
+
+
+def read(rgb, instance):
+    (box,) = boxes(instance).values()
+    crop = rgb[:, box.outer_rows, box.outer_columns]
+    mask = instance[box.outer_rows, box.outer_columns] > 0
+    at = spots(mask, box, float(mask.sum()) / instance.numel())
+    return evidence(crop[:, at.yx[:, 0], at.yx[:, 1]].T, at, whole_of(rgb)), at
+
+
+def stirred():
+    torch.manual_seed(0)
+    net = ObjectColour(width=16, heads=2, questions=2, rounds=1).eval()
+    torch.nn.init.normal_(net.last.weight, std=0.05)
+    return net
+
+
+def test_a_new_network_changes_nothing():
+    rgb, instance = scene()
+    assert torch.equal(correct(ObjectColour(), rgb, instance, {})[0], rgb)
+
+
+def test_profiles_lead_out_of_the_object():
+    e, at = read(*scene())
+    assert int(at.known.sum()) == 2 * (16 + 24)
+    seen = e.seam[0][at.known]
+    assert (seen[:, :REACH, 3] == 1).all() and (seen[:, REACH:, 3] == 0).all()
+
+
+def test_a_profile_shows_the_pixels_on_its_way():
+    rgb, instance = scene()
+    rgb[:, :, 43], rgb[:, :, 44] = 0.25, 0.75  # the object's last column, and the next
+    e, at = read(rgb, instance)
+    rightwards = e.seam[0][at.known & (at.along[:, 1] == 1)]
+    assert (rightwards[:, REACH - 1, :3] == -0.5).all() and (rightwards[:, REACH, :3] == 0.5).all()
+
+
+def test_where_the_picture_ends_is_no_seam():
+    _, at = read(*scene(top=0, left=0, height=64, width=96))
+    assert not at.known.any()
+    _, at = read(*scene(top=0, left=0, height=64, width=48))
+    assert int(at.known.sum()) == 64 and (at.along[at.known] == torch.tensor([0.0, 1.0])).all()
+
+
+def test_what_is_no_seam_has_no_influence():
+    net, (e, _) = stirred(), read(*scene(top=0, left=0, height=64, width=96))
+    other = Evidence(e.seam + 1, e.place - 1, e.known, e.inside, e.around, e.whole)
+    assert torch.allclose(net(e), net(other), atol=1e-6)
+
+
+def test_only_told_objects_change_and_small_ones_do_not():
+    rgb, instance = scene()
+    instance[50:54, 50:60] = 7
+    assert FEWEST > 4 * 10
+    better, found = correct(stirred(), rgb, instance, {})
+    assert set(found) == {5}
+    differs = (better != rgb).any(0)
+    assert differs[instance == 5].float().mean() > 0.9 and not differs[instance != 5].any()
+
+
+def test_where_no_mask_is_told_nothing_changes():
+    rgb, _ = scene()
+    assert torch.equal(corrected(stirred(), rgb[None], torch.full((1, 1, 64, 96), torch.nan))[0], rgb)
+
+
+def test_an_object_s_corrections_are_averaged_over_frames():
+    net, (first, instance), (second, _) = stirred(), scene(seed=1), scene(seed=2)
+    _, once = correct(net, first, instance, {})
+    _, alone = correct(net, second, instance, {})
+    _, both = correct(net, second, instance, once)
+    assert torch.allclose(both[5][0], (once[5][0] + alone[5][0]) / 2, atol=1e-6) and both[5][1] == 2
+    _, gone = correct(net, second, torch.zeros_like(instance), both)
+    assert gone == {}
+
+
+def test_coefficients_offset_scale_and_grey():
+    rgb, height = torch.rand(1, 50, 3), torch.linspace(-1, 1, 50)[None]
+    c = torch.zeros(1, 15)
+    c[:, 0], c[:, 4] = 0.1, -0.5
+    assert torch.allclose(changed(rgb, height, c), torch.stack([torch.full((1, 50), 0.1), -0.5 * rgb[..., 1], 0 * rgb[..., 2]], -1))
+    c = torch.zeros(1, 15)
+    c[:, 9:12] = 1
+    grey = rgb + changed(rgb, height, c)
+    assert torch.allclose(grey, grey[..., :1].expand_as(grey), atol=1e-6)
+    c = torch.zeros(1, 15)
+    c[:, 12:] = 0.5
+    assert torch.allclose(changed(rgb, height, c), 0.5 * height[..., None] * rgb)
+
+
+def test_draws_repeat_and_are_right_or_wrong():
+    photos = [np.random.default_rng(i).integers(0, 255, (120, 160, 3), dtype=np.uint8) for i in range(2)]
+    sampler = ObjectSampler({}, photos)
+    drawn, again = (sampler.draw(np.random.default_rng(3), 24) for _ in range(2))
+    assert torch.equal(drawn.given, again.given) and torch.equal(drawn.evidence.seam, again.evidence.seam)
+    assert drawn.given.shape == (24, PIXELS, 3) and drawn.evidence.seam.shape == (24, SEAM, 2 * REACH, 4)
+    apart = (drawn.given - drawn.target).abs().amax((1, 2))
+    assert 0 < (apart < 2 / 255).float().mean() < 1
+
+
+def test_it_learns_an_exposure_from_the_seam():
+    """Flat pictures in which the object is darker by half or not: the profiles tell."""
+    torch.manual_seed(0)
+    net = ObjectColour(width=16, heads=2, questions=2, rounds=1)
+    optimiser = torch.optim.Adam(net.parameters(), 3e-3)
+    drawn = [(k, 0.3 + 0.6 * i / 15) for i in range(16) for k in (0.5, 1.0)]
+    read_of = []
+    for k, level in drawn:
+        _, instance = scene()
+        read_of.append(read(torch.where(instance == 5, k * level, level).expand(3, -1, -1), instance)[0])
+    e = Evidence.stacked(read_of)
+    given, target = (torch.tensor(v)[:, None, None].expand(-1, 8, 3) for v in ([k * v for k, v in drawn], [v for _, v in drawn]))
+    for _ in range(80):
+        loss = (given + changed(given, torch.zeros(32, 8), net(e)) - target).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert loss < 0.3 * (given - target).abs().mean()
