@@ -41,9 +41,14 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
     for c, name in enumerate(frames.names):
         camera, views = log.camera(name), frames.of(c)
         places = np.array([v.index for v in views])
-        nearest = np.abs(sweep[:, None] - places[None]).argmin(1) if len(sweep) else np.zeros(0, np.int64)
-        for k in np.unique(nearest):
-            view, mine = views[k], np.flatnonzero(nearest == k)
+        # sweeps are few and points many: each sweep is asked once, and the points are sorted by the view that shows them
+        of_sweep = np.abs(np.arange(sweep.max(initial=0) + 1)[:, None] - places[None]).argmin(1).astype(np.int32)
+        nearest = of_sweep[sweep]
+        order = np.argsort(nearest, kind="stable")
+        begins = np.searchsorted(nearest[order], np.arange(len(views) + 1))
+        for view, mine in zip(views, np.split(order, begins[1:-1]), strict=True):
+            if not len(mine):
+                continue
             cam = camera.camera(view.index, frames.width, frames.height)
             back = inverse(cam.world_from_cam)
             if local_pose is not None:
@@ -52,7 +57,8 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
                     continue
                 back = back @ placed
             row, column, z, seen = project(points[mine], back.numpy(), cam)
-            seen &= z <= nearest_box(cam, movers)[row, column]
+            if movers:
+                seen &= z <= nearest_box(cam, movers)[row, column]
             # a point whose pixel is sky stands on an edge that the pixel misses
             step = np.array(view.image.shape[:2]) / view.sky.shape
             seen &= ~view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
