@@ -27,7 +27,8 @@ BOX_MARGIN = 0.25
 
 @dataclass
 class Growth:
-    """How hard pictures pulled at each splat since the last densification: sum of gradients in pixels, and times seen."""
+    """How hard pictures pulled at each splat since the last densification: sum of gradients in pixels, far splats by their smaller motion
+    in it, and times seen."""
 
     pull: torch.Tensor
     seen: torch.Tensor
@@ -36,29 +37,14 @@ class Growth:
     def none(count: int) -> Growth:
         return Growth(torch.zeros(count), torch.zeros(count))
 
-    def see(self, gradient: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-        """Count one picture's gradient of means `[N, 3]`, far splats by their smaller motion in it; 1 where a splat is seen, else 0."""
-        size = gradient.norm(dim=1) * reach
-        self.pull += size
-        seen = (size > 0).to(size)
-        self.seen += seen
-        return seen
-
     def tensors(self) -> dict[str, torch.Tensor]:
         return {"pull": self.pull, "seen": self.seen}
 
 
-def adjusted(splats: Splats) -> None:
-    """Keep scales within what the cameras can tell, in place."""
-    scales, reach = splats.fields["log_scales"], splats.reach.log()[:, None]
-    torch.minimum(scales, reach + float(np.log(LARGEST)), out=scales)
-    torch.maximum(scales, reach + float(np.log(THINNEST)), out=scales)
-    middle = scales.sum(1) - scales.amax(1) - scales.amin(1)
-    torch.minimum(scales, (middle + float(np.log(LONGEST)))[:, None], out=scales)
-
-
-def grow(splats: Splats, moments: dict, growth: Growth, budget: int, rounds_left: int, boxes: list[np.ndarray]):
-    """Splats after one round, and their Adam moments: new splats start with none.
+def grow(
+    splats: Splats, carried: dict[str, torch.Tensor], growth: Growth, budget: int, rounds_left: int, boxes: list[np.ndarray]
+) -> tuple[Splats, dict[str, torch.Tensor]]:
+    """Splats after one round, and what each carries with it, `[N, ...]`, of which new splats start with zeros.
 
     Dropped: fainter than `FAINT`, outside their actor's box. Split: those with the largest mean pull, as many as make the budget
     last `rounds_left` rounds, in two along their longest axis.
@@ -90,9 +76,7 @@ def grow(splats: Splats, moments: dict, growth: Growth, budget: int, rounds_left
 
     after = {k: assembled(fields[k], children[k]) for k in FIELDS}
     sizes = torch.bincount(assembled(group, group[parents]), minlength=len(splats.sizes)).tolist()
-    carried = {}
-    for k, pair in moments.items():
-        carried[k] = tuple(None if m is None else assembled(m, torch.zeros_like(m[parents])) for m in pair)
+    carried = {k: assembled(t, torch.zeros_like(t[parents])) for k, t in carried.items()}
     return Splats(after, sizes, assembled(splats.reach, splats.reach[parents])), carried
 
 

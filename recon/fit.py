@@ -11,24 +11,26 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 
-from recon.densify import Growth, adjusted, grow
+from recon.densify import Growth, grow
+from recon.descent import Descent, rates_at
+from recon.develop import developed
 from recon.frames import Frames, View
+from recon.kernels.descent import Rates
+from recon.kernels.develop import SKY_STEP
 from recon.losses import PictureLoss
-from recon.model import FIELDS, Splats, draw, placed_groups
-from recon.motion import REFINED, Motion
+from recon.model import Splats, draw, placed_groups
+from recon.motion import REFINED, Moment, Motion
+from recon.sight import Eye, in_sight
 from render.rays import world_directions
 from scenes.camera import Camera
-from scenes.sky import sample_equirect
-
-SKY_STEP = 8
-"""Pixels between sky samples; between them the sky is interpolated. It is smooth, and a lookup a pixel would cost as much as the splats."""
+from scenes.poses import inverse
 
 
 @dataclass(frozen=True)
 class FitConfig:
     """How long and how finely to fit."""
 
-    steps: int = 5000
+    steps: int = 4000
     """Pictures rendered and compared."""
     budget: int = 220_000
     """Splats at most, all groups together."""
@@ -52,6 +54,9 @@ class FitConfig:
     """Of the order of views."""
 
 
+WINDOW = (180, 320)
+"""Rows and columns of the part of a picture in which similarity is taken."""
+
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
 
@@ -64,10 +69,7 @@ ASIDE, ASIDE_EVERY = 3.0, 4
 HORIZON = -0.01
 """Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
 
-FADE = 0.003
-"""Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
-
-RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "dc": 5e-3, "rest": 5e-4}
+RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "colours": 5e-3, "harmonics": 5e-4}
 """Adam's step a field; of means in parts of each splat's reach: 0.1 pixel."""
 
 
@@ -88,7 +90,7 @@ class Fit:
         self.step_count = 0
         self.training = frames.training()
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.growth = Growth.none(len(splats))
+        self.growth, self.descent = Growth.none(len(splats)), Descent.begin(splats)
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
@@ -100,11 +102,10 @@ class Fit:
         return torch.where(self.motion.speeds()[drawn] > 0.5, 1.0, self.config.still_weight)
 
     def _optimise(self) -> None:
-        """Optimisers over the present tensors. The splats' own is made anew whenever their number changes; its moments are carried over."""
+        """Optimisers of what all pictures share; the splats have their own."""
         poses, exposures = self.motion.parameters(self.config.refine), [self.exposures] * ("exposures" in self.config.refine)
-        for tensor in [*self.splats.fields.values(), self.sky, *exposures, *poses]:
+        for tensor in [self.sky, *exposures, *poses]:
             tensor.requires_grad_(True)
-        self.splat_adam = adam([{"params": [self.splats.fields[k]], "lr": RATES[k]} for k in FIELDS], eps=1e-15)
         self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": exposures, "lr": 5e-4}], eps=1e-12)
         self.pose_adam = adam([{"params": poses, "lr": 0.03}], eps=1e-12)
 
@@ -128,60 +129,69 @@ class Fit:
         view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
         camera = self.motion.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
-        rgb, alpha = self.render(view, camera)
+        aside = self._aside(view, camera) if self.step_count % ASIDE_EVERY == 0 else None
+        ends = self.motion.readout(view, camera)
+        rates = self._rates()
+        which, shown = self._in_sight(view, camera, ends, aside, rates)
+        rgb, alpha = self._render(shown, view, camera, ends)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
-        if self.step_count % ASIDE_EVERY == 0:
-            haze = haze + SOLID_WEIGHT * self._gaps_aside(view, camera)
+        if aside is not None:
+            haze = haze + SOLID_WEIGHT * self._gaps(shown, view, aside)
         (loss + haze + self.motion.unrest() + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        self.descent.follow(self.splats, which, shown, rates, self.growth)
         self._follow()
         self.step_count += 1
         value = float(loss.detach())
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
 
-    def render(self, view: View, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-        """Picture `[H, W, 3]` and alpha of a view by the present state, exposed as its camera exposes."""
-        placed = placed_groups(self.splats.groups(self.sh_count()), self.motion.actor_poses(view, camera))
-        rgb, alpha = draw(self.motion.as_read(placed, view, camera), camera, "rgb", "alpha")
-        rgb = rgb + (1 - alpha)[..., None] * self._sky_behind(camera)
-        exposure = self.exposures[view.camera]
-        return rgb @ exposure[:, :3].T + exposure[:, 3], alpha
+    def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None, rates: Rates) -> tuple[torch.Tensor, Splats]:
+        """Indices of the splats that a step may see, which catch up, and copies of them to be differentiated."""
+        middle = inverse(camera.world_from_cam.detach())
+        first, last = (back for back, _ in ends) if ends else (middle, middle)
+        eyes: list[Eye] = [(camera, first, last)]
+        actors = self.motion.near(view, camera).tolist()
+        if aside is not None:
+            beside = inverse(aside.world_from_cam)
+            eyes.append((aside, beside, beside))
+            actors += self.motion.near(view, aside).tolist()
+        which = in_sight(self.splats, eyes, [i + 1 for i in actors])
+        self.descent.catch_up(self.splats, which, self.sh_count(), rates)
+        return which, self.splats.select(which, self.sh_count())
+
+    def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes."""
+        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        rgb, alpha = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha")
+        shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
+        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha
 
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
         return (world_directions(small)[..., 2] < 0) & ~view.sky
 
-    def _gaps_aside(self, view: View, camera: Camera) -> torch.Tensor:
-        """Mean of 1 - alpha below the horizon, of a small picture taken up to `ASIDE` metres to the left or right of a view."""
+    def _aside(self, view: View, camera: Camera) -> Camera:
+        """A small picture's camera up to `ASIDE` metres to the left or right of a view."""
         metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
         pose = camera.world_from_cam.detach().clone()
         pose[:3, 3] += metres * self.motion.left(view)
-        small = replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
-        placed = placed_groups(self.splats.groups(self.sh_count()), self.motion.actor_poses(view, small))
-        (alpha,) = draw(placed, small, "alpha")
-        return ((1 - alpha) * (world_directions(small)[..., 2] < HORIZON)).mean()
+        return replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
 
-    def _sky_behind(self, camera: Camera) -> torch.Tensor:
-        """Sky colour `[H, W, 3]` at every pixel: sampled every few pixels, at others each time, or those between would never learn."""
-        shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator)
-        sides = torch.tensor([camera.height, camera.width])
-        y, x = (SKY_STEP * (torch.arange(n) + 0.5) - float(s) for n, s in zip((sides // SKY_STEP + 2).tolist(), shift, strict=True))
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double()
-        rays = camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].detach().T
-        colours = sample_equirect(self.sky, rays).permute(2, 0, 1)[None]
-        fine = F.interpolate(colours, scale_factor=SKY_STEP, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
-        top, left = shift.tolist()
-        return fine[top : top + camera.height, left : left + camera.width]
+    def _gaps(self, shown: Splats, view: View, camera: Camera) -> torch.Tensor:
+        """Mean of 1 - alpha below the horizon as a camera sees a view's moment."""
+        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        (alpha,) = draw(placed, camera, "alpha")
+        return ((1 - alpha) * (world_directions(camera)[..., 2] < HORIZON)).mean()
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
 
     def _target(self, view: View, shrink: int) -> torch.Tensor:
         if shrink == 1:
-            return view.image.float() / 255
+            return view.image.float().mul_(1 / 255)
         key = (shrink, self.motion.row[view.camera, view.index])
         if key not in self._pyramid:
             width, height = self._size(shrink)
@@ -192,33 +202,24 @@ class Fit:
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
         """Where similarity is taken: all of a small picture, a random part of a large one."""
-        height, width = min(camera.height, 270), min(camera.width, 480)
+        height, width = min(camera.height, WINDOW[0]), min(camera.width, WINDOW[1])
         top, left = (int(torch.randint(0, n + 1, (1,), generator=self.generator)) for n in (camera.height - height, camera.width - width))
         return top, left, height, width
 
-    def _follow(self) -> None:
-        fields, decay = self.splats.fields, 0.01**self.progress
-        assert fields["means"].grad is not None
-        seen = self.growth.see(fields["means"].grad, self.splats.reach)
+    def _rates(self) -> Rates:
         settle = 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
-        for group, name in zip(self.splat_adam.param_groups, FIELDS, strict=True):
-            group["lr"] = RATES[name] * (decay if name == "means" else settle)
-        before = fields["means"].detach().clone()
-        if fields["rest"].grad is None:
-            fields["rest"].grad = torch.zeros_like(fields["rest"])
-        self.splat_adam.step()
-        with torch.no_grad():
-            # Adam's step has one length for all; a far splat must move further to move a pixel
-            fields["means"].sub_(before).mul_(self.splats.reach[:, None]).add_(before)
-            fields["logits"].sub_(seen, alpha=FADE)
-            adjusted(self.splats)
+        steps = {name: rate * (0.01**self.progress if name == "means" else settle) for name, rate in RATES.items()}
+        return rates_at(self.step_count + 1, steps)
+
+    def _follow(self) -> None:
+        """The steps of what all pictures share."""
         if self.exposures.grad is not None:
             self.exposures.grad[0] = 0  # the first camera is the reference
         self.rest_adam.step()
         if self.progress >= self.config.poses_from:
             self.pose_adam.param_groups[0]["lr"] = 0.03 * max(0.1, 1 - self.progress)
             self.pose_adam.step()
-        for optimiser in (self.splat_adam, self.rest_adam, self.pose_adam):
+        for optimiser in (self.rest_adam, self.pose_adam):
             optimiser.zero_grad(set_to_none=True)
 
     # ---- growth
@@ -229,31 +230,23 @@ class Fit:
     def _grow(self) -> None:
         """Split where the gradient pulls, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
-        moments = {k: self.splat_adam.state.get(self.splats.fields[k], {}) for k in FIELDS}
-        steps = {k: m.get("step") for k, m in moments.items()}
-        pairs = {k: (m.get("exp_avg"), m.get("exp_avg_sq")) for k, m in moments.items()}
-        self.splats, carried = grow(self.splats, pairs, self.growth, self.config.budget, left, self.motion.boxes)
-        self.growth = Growth.none(len(self.splats))
-        for tensor in self.splats.fields.values():
-            tensor.requires_grad_(True)
-        self.splat_adam = adam([{"params": [self.splats.fields[k]], "lr": RATES[k]} for k in FIELDS], eps=1e-15)
-        for k, (first, second) in carried.items():
-            if first is not None:
-                self.splat_adam.state[self.splats.fields[k]] = {"step": steps[k], "exp_avg": first, "exp_avg_sq": second}
+        self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
+        self.growth, self.descent = Growth.none(len(self.splats)), Descent(**carried)
 
     # ---- checkpoints
 
     def tensors(self) -> dict:
         """All that changes, as tensors and numbers: what a checkpoint holds."""
         return {
-            "fields": {k: v.detach() for k, v in self.splats.fields.items()},
+            "fields": self.splats.fields,
             "sizes": self.splats.sizes,
             "reach": self.splats.reach,
             "growth": self.growth.tensors(),
+            "descent": self.descent.tensors(),
             "sky": self.sky.detach(),
             "exposures": self.exposures.detach(),
             "motion": self.motion.tensors(),
-            "adam": [o.state_dict() for o in (self.splat_adam, self.rest_adam, self.pose_adam)],
+            "adam": [o.state_dict() for o in (self.rest_adam, self.pose_adam)],
             "generator": self.generator.get_state(),
             "step": self.step_count,
             "loss": self.recent_loss,
@@ -262,11 +255,11 @@ class Fit:
     def restore(self, state: dict) -> None:
         """Go on from `tensors()` of another run: the same steps follow as would have followed there."""
         self.splats = Splats(state["fields"], state["sizes"], state["reach"])
-        self.growth = Growth(**state["growth"])
+        self.growth, self.descent = Growth(**state["growth"]), Descent(**state["descent"])
         self.sky, self.exposures = state["sky"], state["exposures"]
         self.motion.restore(state["motion"])
         self._optimise()
-        for optimiser, saved in zip((self.splat_adam, self.rest_adam, self.pose_adam), state["adam"], strict=True):
+        for optimiser, saved in zip((self.rest_adam, self.pose_adam), state["adam"], strict=True):
             optimiser.load_state_dict(saved)
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]

@@ -50,7 +50,7 @@ class PictureLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rendered, recorded, dissimilarity: float, window: tuple[int, int, int, int]):
         difference = rendered - recorded
-        loss = (1 - dissimilarity) * difference.abs().mean()
+        loss = (1 - dissimilarity) * torch.linalg.vector_norm(difference, 1) / difference.numel()
         gradient = difference.sign_().mul_((1 - dissimilarity) / difference.numel())
         if dissimilarity > 0:
             top, left, height, width = window

@@ -13,14 +13,14 @@ from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import interpolate
 from scenes.trajectory import Trajectory
 
-FIELDS = ("means", "quats", "log_scales", "logits", "dc", "rest")
+FIELDS = ("means", "quats", "log_scales", "logits", "sh")
 
 
 @dataclass
 class Splats:
-    """Splats of all groups (background first, then the actors) in one set of tensors, so that one optimiser step moves all.
+    """Splats of all groups (background first, then the actors) in one set of tensors, so that one step moves all.
 
-    means `[N, 3]`, quats `[N, 4]`, log_scales `[N, 3]`, logits `[N]`, dc `[N, 1, 3]`, rest `[N, K - 1, 3]`; sizes: splats a group;
+    means `[N, 3]`, quats `[N, 4]`, log_scales `[N, 3]`, logits `[N]`, sh `[N, K, 3]`; sizes: splats a group;
     reach `[N]`: metres that 1000 pixels of the sharpest camera span where it comes nearest, by which steps and limits of a splat scale.
     """
 
@@ -31,18 +31,23 @@ class Splats:
     @staticmethod
     def of(groups: list[Gaussians], reach: list[torch.Tensor]) -> Splats:
         g = Gaussians.cat(groups)
-        fields = dict(means=g.means, quats=g.quats, log_scales=g.log_scales, logits=g.logit_opacities, dc=g.sh[:, :1], rest=g.sh[:, 1:])
-        return Splats({k: v.clone() for k, v in fields.items()}, [len(p) for p in groups], torch.cat(reach))
+        fields = (g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
+        return Splats({k: v.clone() for k, v in zip(FIELDS, fields, strict=True)}, [len(p) for p in groups], torch.cat(reach))
 
     def __len__(self) -> int:
         return len(self.reach)
 
     def groups(self, sh_count: int) -> list[Gaussians]:
         """The splats of each group with the first `sh_count` coefficients; gradients flow back through one split a field."""
-        f = self.fields
-        sh = f["dc"] if sh_count == 1 else torch.cat([f["dc"], f["rest"][:, : sh_count - 1]], 1)
-        parts = [torch.split(t, self.sizes) for t in (f["means"], f["quats"], f["log_scales"], f["logits"], sh)]
-        return [Gaussians(*part) for part in zip(*parts, strict=True)]
+        *rest, sh = (self.fields[name] for name in FIELDS)
+        sh = sh if sh.shape[1] == sh_count else sh[:, :sh_count]
+        return [Gaussians(*part) for part in zip(*(torch.split(t, self.sizes) for t in (*rest, sh)), strict=True)]
+
+    def select(self, which: torch.Tensor, sh_count: int) -> Splats:
+        """Copies of the splats at rising indices `which`, with the first `sh_count` coefficients, for a step to differentiate."""
+        fields = {k: (v[:, :sh_count] if k == "sh" else v).detach().index_select(0, which).requires_grad_() for k, v in self.fields.items()}
+        ends = torch.searchsorted(which, torch.tensor(self.sizes).cumsum(0))
+        return Splats(fields, ends.diff(prepend=ends.new_zeros(1)).tolist(), self.reach.index_select(0, which))
 
     def group_of(self) -> torch.Tensor:
         """Group index `[N]` of every splat."""

@@ -35,10 +35,15 @@ NEARBY_US = 50_000
 """Half the time over which a speed is taken."""
 
 
+Moment = tuple[torch.Tensor, dict[int, torch.Tensor]]
+"""cam_from_world `[4, 4]`, and the actors' poses by group."""
+
+
 class Motion:
     """Poses of cameras and actors at every view's moment and shortly before and after, differentiable in their corrections.
 
-    ego.deltas `[K, 6]`, each actor's deltas, extrinsics `[C, 6]` a camera, clocks `[C]`: how much later than recorded it took its pictures.
+    ego.deltas `[K, 6]`, paths `[sum of K, 6]` of all actors one after the other, extrinsics `[C, 6]` a camera, clocks `[C]`: how much later
+    than recorded it took its pictures.
     """
 
     def __init__(self, frames: Frames, rig: dict[str, RigCamera], ego: Knots, actors: list[Knots], boxes: list[np.ndarray]):
@@ -49,10 +54,20 @@ class Motion:
         times = np.array([v.time_us for v in views])
         self.row = {(v.camera, v.index): i for i, v in enumerate(views)}
         self._body = ego.base(times)
-        self._boxes = [knots.base(times) for knots in actors]
-        self._covers = np.array([[k.trajectory.covers(t) for k in actors] for t in times]).reshape(len(times), len(actors))
         self._drift = drift(ego, times)
-        self._drifts = [drift(knots, times) for knots in actors]
+        # of all actors at every view `[V, A, ...]`
+        counts = [len(knots.deltas) for knots in actors]
+        self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.paths = torch.zeros(int(self._first[-1]), 6)
+        between = [torch.arange(a + 1, a + n - 1) for a, n in zip(self._first.tolist(), counts, strict=False) if n > 2]
+        self._inner = torch.cat([torch.zeros(0, dtype=torch.int64), *between])
+        bases = [knots.base(times) for knots in actors]
+        self._boxes, knot, share = (torch.stack(parts, 1) for parts in zip(*bases, strict=True)) if bases else _nobody(len(times))
+        first, last = torch.from_numpy(self._first[:-1]), torch.from_numpy(self._first[1:] - 1)
+        self._knots, self._shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)]), share.float()[..., None]
+        self._drifts = torch.stack([drift(knots, times) for knots in actors], 1) if actors else torch.zeros(len(times), 0, 6)
+        self._covers = torch.tensor([[k.trajectory.covers(t) for k in actors] for t in times]).reshape(len(times), len(actors))
+        self._radii = torch.tensor([float(np.linalg.norm(box)) for box in boxes], dtype=torch.float64)
 
     def speeds(self) -> torch.Tensor:
         """Metres a second `[V]` of the body at every view."""
@@ -67,35 +82,39 @@ class Motion:
         mount = rig.body_from_cam @ small_poses(scaled(self.extrinsics[view.camera], *EXTRINSIC))
         return Camera(rig.lens, rig.width, rig.height, poses[row] @ small_poses(delta) @ mount, time_us=view.time_us)
 
-    def actor_poses(self, view: View, camera: Camera, later_us: float = 0.0) -> dict[int, torch.Tensor]:
-        """Poses by group of the actors that may be in the camera's view at the view's moment, or `later_us` after it."""
+    def near(self, view: View, camera: Camera) -> torch.Tensor:
+        """Which actors may be in a camera's view at the view's moment, int64."""
         row = self.row[view.camera, view.index]
         from_world = inverse(camera.world_from_cam.detach())
-        near, deltas = [], []
-        for i in np.flatnonzero(self._covers[row]).tolist():
-            poses, knots, shares = self._boxes[i]
-            x, _, z = (from_world @ poses[row])[:3, 3].tolist()
-            radius = float(np.linalg.norm(self.boxes[i]))
-            if z > -radius and abs(x) - radius * 1.5 < max(z, 0) * camera.width / (1.6 * camera.lens.focal()[0]) + radius:
-                near.append(i)
-                deltas.append(self.actors[i].correction(knots[row], shares[row]))
-        if not near:
-            return {}
-        late = self.clocks[view.camera] + later_us / CLOCK_US
-        moved = small_poses(scaled(torch.stack(deltas), *ACTOR) + torch.stack([self._drifts[i][row] for i in near]) * late)
-        return {i + 1: self._boxes[i][0][row] @ m for i, m in zip(near, moved, strict=True)}
+        x, _, z = (self._boxes[row, :, :3, 3] @ from_world[:3, :3].T + from_world[:3, 3]).unbind(-1)
+        aside = x.abs() - 1.5 * self._radii < z.clamp_min(0) * (camera.width / (1.6 * camera.lens.focal()[0])) + self._radii
+        return (self._covers[row] & (z > -self._radii) & aside).nonzero()[:, 0]
 
-    def as_read(self, placed: list[Placed], view: View, camera: Camera) -> list[Placed]:
-        """What stands before a view's camera, its splats moved to where they were when their rows were read."""
-        rig = self.rig[view.camera]
-        if not rig.readout_us or self.speeds()[self.row[view.camera, view.index]] < SLOW:
+    def actor_poses(self, view: View, camera: Camera, later_us: float = 0.0) -> dict[int, torch.Tensor]:
+        """Poses by group of the actors that may be in the camera's view at the view's moment, or `later_us` after it."""
+        row, near = self.row[view.camera, view.index], self.near(view, camera)
+        before, after = self._knots[:, row, near]
+        share, late = self._shares[row, near], self.clocks[view.camera] + later_us / CLOCK_US
+        deltas = self.paths[before] * (1 - share) + self.paths[after] * share
+        poses = self._boxes[row, near] @ small_poses(scaled(deltas, *ACTOR) + self._drifts[row, near] * late)
+        return {i + 1: pose for i, pose in zip(near.tolist(), poses.unbind(), strict=True)}
+
+    @torch.no_grad()
+    def readout(self, view: View, camera: Camera) -> list[Moment]:
+        """cam_from_world, and the actors' poses, as the readout of a view begins and as it ends; nothing where it is instant."""
+        half = self.rig[view.camera].readout_us / 2
+        if not half or self.speeds()[self.row[view.camera, view.index]] < SLOW:
+            return []
+        return [(inverse(self.camera(view, late).world_from_cam), self.actor_poses(view, camera, late)) for late in (-half, half)]
+
+    def as_read(self, placed: list[Placed], ends: list[Moment], view: View, camera: Camera) -> list[Placed]:
+        """What stands before a view's camera, its splats moved to where they were when their rows were read; ends: of `readout`."""
+        if not ends:
             return placed
-        ends = [(self.camera(view, late), self.actor_poses(view, camera, late)) for late in (-rig.readout_us / 2, rig.readout_us / 2)]
-        from_world = [(inverse(c.world_from_cam.detach()), poses) for c, poses in ends]
         moved = []
         for p in placed:
-            first, last = (back @ (poses[p.instance].detach() if p.instance else p.world_from_local) for back, poses in from_world)
-            moved.append(replace(p, gaussians=as_read(p.gaussians, first, last, camera, rig.shutter)))
+            first, last = (back @ (poses[p.instance] if p.instance else p.world_from_local) for back, poses in ends)
+            moved.append(replace(p, gaussians=as_read(p.gaussians, first, last, camera, self.rig[view.camera].shutter)))
         return moved
 
     def left(self, view: View) -> torch.Tensor:
@@ -108,13 +127,14 @@ class Motion:
         several = len(self.rig) > 1
         kinds = {
             "body": [self.ego.deltas], "mounts": [self.extrinsics] * several, "clocks": [self.clocks] * several,
-            "actors": [a.deltas for a in self.actors],
+            "actors": [self.paths] * bool(self.actors),
         }  # fmt: skip
         return [tensor for kind, tensors in kinds.items() if kind in refine for tensor in tensors]
 
     def unrest(self) -> torch.Tensor:
         """What corrections cost that shake, and clocks that are off."""
-        return CALM * sum((k.unrest() for k in (self.ego, *self.actors)), self.clocks.square().sum())
+        bend = self.paths[self._inner + 1] - 2 * self.paths[self._inner] + self.paths[self._inner - 1]
+        return CALM * (self.ego.unrest() + bend.square().sum() + self.clocks.square().sum())
 
     # ---- what it comes to
 
@@ -124,6 +144,7 @@ class Motion:
 
     def trajectory(self, actor: int) -> Trajectory:
         """An actor's corrected trajectory."""
+        self.actors[actor].deltas = self.paths[self._first[actor] : self._first[actor + 1]].detach()
         return self.actors[actor].corrected(*ACTOR)
 
     def mounted(self, camera: int, times_us: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -136,13 +157,16 @@ class Motion:
     def tensors(self) -> dict:
         return {
             "extrinsics": self.extrinsics.detach(), "clocks": self.clocks.detach(),
-            "ego": self.ego.deltas.detach(), "actors": [a.deltas.detach() for a in self.actors],
+            "ego": self.ego.deltas.detach(), "actors": self.paths.detach(),
         }  # fmt: skip
 
     def restore(self, state: dict) -> None:
-        self.extrinsics, self.clocks, self.ego.deltas = state["extrinsics"], state["clocks"], state["ego"]
-        for knots, deltas in zip(self.actors, state["actors"], strict=True):
-            knots.deltas = deltas
+        self.extrinsics, self.clocks, self.ego.deltas, self.paths = (state[k] for k in ("extrinsics", "clocks", "ego", "actors"))
+
+
+def _nobody(views: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """As `Knots.base`, of no actor."""
+    return torch.zeros(views, 0, 4, 4, dtype=torch.float64), torch.zeros(views, 0, dtype=torch.int64), torch.zeros(views, 0)
 
 
 def drift(knots: Knots, times_us: np.ndarray) -> torch.Tensor:

@@ -39,7 +39,7 @@ def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> lis
     placed = list(placed)
     if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
         return placed
-    sides = _sides(camera, model)
+    sides = view_sides(camera, model)
     there = [p for p in placed if len(p.gaussians)]
     seen = [part for p, beyond in zip(there, _beyond(there, camera, sides), strict=True) for part in _parts(p, beyond)]
     return seen or [replace(placed[0], gaussians=placed[0].gaussians.map(lambda t: t[:0]))]
@@ -54,7 +54,7 @@ def differentiated(placed: Sequence[Placed], camera: Camera) -> bool:
     return any(t is not None and t.requires_grad for t in tensors)
 
 
-def _sides(camera: Camera, model: SplatModel) -> torch.Tensor:
+def view_sides(camera: Camera, model: SplatModel) -> torch.Tensor:
     """Unit normals `[5, 3]`, out of the view, of the planes through the eye that bound it, and of the plane of the camera."""
     left, right, top, bottom = view_box(camera.lens, camera.width, camera.height, 4 * math.sqrt(model.dilation) + 1)
     normals = [[1, 0, -right], [-1, 0, left], [0, 1, -bottom], [0, -1, top], [0, 0, -1]]

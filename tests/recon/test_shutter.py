@@ -79,7 +79,9 @@ def test_corrections_move_the_camera_in_the_bodys_own_frame():
 def test_a_shutter_that_takes_all_rows_at_once_moves_nothing():
     scene, views, path = motion()
     placed = scene.placed(views[3].time_us)
-    assert path.as_read(placed, views[3], path.camera(views[3])) is placed
+    camera = path.camera(views[3])
+    assert path.as_read(placed, path.readout(views[3], camera), views[3], camera) is placed
     _, views, path = motion(30_000)
-    moved = path.as_read(placed, views[3], path.camera(views[3]))
+    camera = path.camera(views[3])
+    moved = path.as_read(placed, path.readout(views[3], camera), views[3], camera)
     assert all(not torch.equal(a.gaussians.means, b.gaussians.means) for a, b in zip(placed, moved, strict=True))

@@ -1,0 +1,41 @@
+"""Which splats a picture may show: the others need not be drawn, and have no gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+
+from recon.kernels.sight import mark
+from recon.model import MODEL, Splats
+from render.cull import view_sides
+from render.launch import run, stage, view
+from scenes.camera import Camera
+from scenes.lenses import OpenCV, Pinhole
+
+Eye = tuple[Camera, torch.Tensor, torch.Tensor]
+"""A camera, and cam_from_world `[4, 4]` as the readout of its picture begins and as it ends."""
+
+
+def in_sight(splats: Splats, eyes: Sequence[Eye], actors: Sequence[int]) -> torch.Tensor:
+    """Indices int64 `[M]`, rising, of the background's splats that one of `eyes` may see, and of all splats of the groups `actors`."""
+    seen = torch.zeros(len(splats), dtype=torch.uint8)
+    still = splats.sizes[0]
+    if all(isinstance(camera.lens, Pinhole | OpenCV) for camera, *_ in eyes):
+        sides = torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes])
+        device = splats.reach.device
+        with stage(device):
+            fields = [view(splats.fields[name], wp.vec3) for name in ("means", "log_scales")]
+            run(mark, still, [*fields, view(sides, wp.vec4), view(seen, wp.uint8)], device)
+    else:
+        seen[:still] = 1
+    for group in actors:
+        begin = sum(splats.sizes[:group])
+        seen[begin : begin + splats.sizes[group]] = 1
+    return seen.nonzero()[:, 0]
+
+
+def _planes(camera: Camera, cam_from_world: torch.Tensor) -> torch.Tensor:
+    """The sides of the view in the world, float32 `[S, 4]`: unit normal and distance."""
+    return (view_sides(camera, MODEL) @ cam_from_world[:3]).float()
