@@ -110,7 +110,7 @@ class Render:
     enhance: Flag = False
     """Repair and harmonize the frames."""
     weights: str = "builtin"
-    """The enhancer's weights: builtin, or a file that sidestep train wrote."""
+    """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     no_shadows: Flag = False
     """Leave out the shadows of inserted assets."""
     start: Time = 0

@@ -6,32 +6,42 @@ import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from enhance.public.layout import part
 from enhance.public.model import Model
+from enhance.step import Steps
+
+if TYPE_CHECKING:
+    from enhance.public.white_box import WhiteBox
 
 KNOWN = (
     "NVIDIA Harmonizer (diffusion_harmonizer.pkl, harmonizer_nontemporal.pt), NVIDIA Fixer (pretrained_fixer.pkl with "
-    "base/tokenizer_fast.pth beside it), or the folder of Difix (nvidia/difix, nvidia/difix_ref) or Cosmos-Predict2 (model.pt with "
-    "tokenizer/tokenizer.pth)"
+    "base/tokenizer_fast.pth beside it), the folder of Difix (nvidia/difix, nvidia/difix_ref) or Cosmos-Predict2 (model.pt with "
+    "tokenizer/tokenizer.pth), or harmonizer.pth of Ke et al."
 )
 
 TRAINING = ("net_disc", "optimizer", "optimizer_disc")
 """What the trainings of Harmonizer, Fixer and Difix save beside the networks."""
 
 
-def open_public(path: str | Path) -> tuple[Model, dict]:
-    """The model of a public checkpoint, float32 on the CPU, and what is known of it.
+def open_public(path: str | Path, device: str | torch.device = "cpu", **how) -> Steps:
+    """The enhancer of a public checkpoint: a file or, where a release has several, its folder.
 
-    A file or, where a release has several, its folder. ValueError where it is not whole, or none of those that are known.
+    `how`: as `PublicEnhancer` takes it. ValueError where it is not whole, or none of those that are known.
     """
+    from enhance.public.enhancer import PublicEnhancer
+    from enhance.public.white_box import WhiteBox, WhiteBoxEnhancer
+
     path = Path(path)
     model = _folder(path) if path.is_dir() else _file(path)
-    weights = sum(value.numel() for value in model.state_dict().values())
+    weights = sum(value.numel() for value in model.parameters())
     about = {"model": model.name, "file": str(path), "weights used": weights, "unverified": "never run with the released weights here"}
-    return model, about
+    if isinstance(model, WhiteBox):
+        return WhiteBoxEnhancer(model, about, device, **how)
+    return PublicEnhancer(model, about, device, **how)
 
 
 def _folder(path: Path) -> Model:
@@ -73,8 +83,9 @@ def _shards(folder: Path) -> dict:
     return {name: value for file in files for name, value in read_state(file).items()}
 
 
-def _file(path: Path) -> Model:
+def _file(path: Path) -> Model | WhiteBox:
     from enhance.public.harmonizer import Scripted, read_cosmos, read_fixer
+    from enhance.public.white_box import WhiteBox
 
     if is_torchscript(path):
         return Scripted(path, _script(path))
@@ -91,6 +102,8 @@ def _file(path: Path) -> Model:
         if part(vae, "encoder.") and part(vae, "decoder."):
             tokenizer = _tokenizer(path)
             return read_fixer(path, transformer, vae, tokenizer, read_state(tokenizer))
+    if "regressor.f.weight" in state:
+        return WhiteBox.read(path, state)
     if any(str(name).removeprefix("net.").startswith("blocks.") for name in state):
         raise ValueError(f"{path} is the transformer of Cosmos-Predict2 alone; give its folder, with tokenizer/tokenizer.pth in it")
     if "encoder.conv1.weight" in state:

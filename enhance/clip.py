@@ -9,8 +9,23 @@ from pathlib import Path
 from enhance.enhancer import Enhancer
 from enhance.step import Steps
 from render.frame_types import Frame
+from scenes.opening import warn
 
 READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb
+
+
+HUGE = 50_000_000
+"""Weights from which a model is no matter of milliseconds on a CPU."""
+
+
+def load_saying(weights: str, device: str = "cpu") -> Steps:
+    """The enhancer of `Enhancer.load`; a warning where it is far too large for the device to be quick."""
+    enhancer = Enhancer.load(weights, device)
+    count = enhancer.about.get("weights used", 0)
+    if count > HUGE and enhancer.device.type == "cpu":
+        name, size = enhancer.about["model"], f"{count / 1e6:.0f} million weights, {count * 4 / 2**30:.1f} GiB in float32"
+        warn([f"{name} ({size}) redraws every pixel: seconds to minutes a frame on this CPU; --weights builtin is made for it"])
+    return enhancer
 
 
 def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
@@ -23,7 +38,7 @@ def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
 
 def enhancement(weights: str, device: str = "cpu") -> tuple[Callable[[Iterable[Frame]], Iterator[Frame]], tuple[str, ...]]:
     """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads."""
-    enhancer = Enhancer.load(weights, device)
+    enhancer = load_saying(weights, device)
     return lambda frames: enhance_frames(frames, enhancer), READS
 
 

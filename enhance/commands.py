@@ -123,17 +123,16 @@ class Enhance:
     output: Output
     """The enhanced video, as clean.mp4."""
     weights: str = "builtin"
-    """The enhancer's weights: builtin, or a file that sidestep train wrote."""
+    """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     overwrite: Overwrite = False
     """Replace an existing file."""
 
     def run(self) -> None:
         fresh(self.output, self.overwrite)
-        from enhance import Enhancer
-        from enhance.clip import enhance_video
+        from enhance.clip import enhance_video, load_saying
         from render.progress import Progress
         from render.video import read_video
 
         with Progress(f"enhance {self.clip.name}", read_video(self.clip).count) as steps:
-            count = enhance_video(self.clip, self.output, Enhancer.load(self.weights), lambda done, total: steps.step())
+            count = enhance_video(self.clip, self.output, load_saying(self.weights), lambda done, total: steps.step())
         print(f"wrote {self.output}, {count} frames")

@@ -101,9 +101,10 @@ NEEDS = (
 )
 
 UNVERIFIED = (
-    "unverified: NVIDIA Harmonizer, NVIDIA Fixer, Cosmos-Predict2 and Difix as --weights. Their files were not at hand: layouts and graphs "
-    "are tested on small random ones, against diffusers' own classes; no released weight was ever read, no picture of theirs compared. Of "
-    "harmonizer_nontemporal.pt it is not published what it takes: [1, 3, 576, 1024] in -1..1 is a guess"
+    "unverified: the public models as --weights (NVIDIA Harmonizer and Fixer, Cosmos-Predict2, Difix, Ke et al.'s Harmonizer). Their files "
+    "were not at hand: layouts and graphs are tested on small random ones, against diffusers' own classes where there are any; no released "
+    "weight was ever read, no picture of theirs compared. Of harmonizer_nontemporal.pt it is not published what it takes: "
+    "[1, 3, 576, 1024] in -1..1 is a guess"
 )
 """What works only as far as it could be tried, said to whoever asks what works."""
 

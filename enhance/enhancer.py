@@ -70,10 +70,8 @@ class Enhancer:
             net, about = load_net(BUILTIN if weights == "builtin" else weights)
             return cls(net, about, device, **how)
         from enhance.checkpoints import open_public
-        from enhance.public.enhancer import PublicEnhancer
 
-        model, about = open_public(weights)
-        return PublicEnhancer(model, about, device, **how)
+        return open_public(weights, device, **how)
 
     @torch.inference_mode()
     def step(self, frame: Frame | torch.Tensor, memory: Memory | None = None) -> tuple[torch.Tensor, Memory]:

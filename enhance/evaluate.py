@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,7 +33,8 @@ EVERY = 3
 SMALLEST = 200
 """Pixels that a region must have to be measured by itself."""
 
-METHODS = ("identity", "ours", "ours + instances")
+TOLD = "ours + instances"
+METHODS = ("identity", "ours", TOLD)
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,10 @@ def evaluate(
     split: str = "held out",
     limit: int | None = None,
     progress: Callable[[str], None] | None = None,
+    beside: Mapping[str, Steps] | None = None,
 ) -> list[Row]:
-    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is.
+    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; then for
+    those `beside` it by name, told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
@@ -85,13 +88,13 @@ def evaluate(
     def features(rgb: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return encoder.features(rgb)[:2]
 
-    rows = []
+    rows, others = [], dict(beside or {})
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
-        for method in METHODS if shards else ():
+        for method in (*METHODS, *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
-            rows.append(_row(kind, method, shards, enhancer, features))
+            rows.append(_row(kind, method, shards, others.get(method, enhancer), features))
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
@@ -116,7 +119,7 @@ def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, featu
         previous: torch.Tensor | None = None
         memory = None
         for t in range(shard.frames):
-            frame = _frame(window, t, told=method == "ours + instances")
+            frame = _frame(window, t, told=method not in METHODS or method == TOLD)
             start = time.perf_counter()
             if method == "identity":
                 better = window.input[t].permute(1, 2, 0)
@@ -194,14 +197,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m enhance.evaluate", description=__doc__)
     parser.add_argument("pairs", type=Path, nargs="+", help="folders that sidestep pairs made")
-    parser.add_argument("--weights", default="builtin", help="builtin, or a file that sidestep train wrote")
+    parser.add_argument("--weights", default="builtin", help="builtin, a file that sidestep train wrote, or a public model's")
+    parser.add_argument("--beside", default=[], action="append", help="a public model's checkpoint as a further row; may be repeated")
     parser.add_argument("--limit", type=int, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
     parser.add_argument("--rollout", type=Path, help="a video that is enhanced back and forth for 500 frames: what drifts?")
     options = parser.parse_args(arguments)
     try:
         pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights)
-        rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr))
+        beside = {f"{one.about['model']} ({Path(path).name})": one for path in options.beside if (one := Enhancer.load(path))}
+        rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
         if options.rollout:
             print(drift_text(drift(enhancer, options.rollout)))

@@ -35,11 +35,11 @@ def strict(path: Path, what: str, state: Mapping[str, object], wanted: Shapes, b
     return found
 
 
-def fill(path: Path, what: str, module: torch.nn.Module, state: Mapping[str, object], assign: bool = True) -> None:
+def fill(path: Path, what: str, module: torch.nn.Module, state: Mapping[str, object], assign: bool = True, beside: str = "") -> None:
     """Give a module of that layout the tensors of `state`, in float32 and copied: a mapped file may change. ValueError as `strict`."""
-    wanted = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-    found = strict(path, what, state, wanted)
-    module.load_state_dict({name: value.to(torch.float32, copy=True) for name, value in found.items()}, assign=assign)
+    wanted = {name: tuple(value.shape) for name, value in module.state_dict().items() if not (beside and re.fullmatch(beside, name))}
+    found = strict(path, what, state, wanted, beside)
+    module.load_state_dict({name: value.to(torch.float32, copy=True) for name, value in found.items()}, strict=False, assign=assign)
 
 
 def finite(path: Path, module: torch.nn.Module) -> None:

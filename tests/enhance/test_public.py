@@ -352,3 +352,25 @@ def test_what_is_no_picture_is_refused(harmonizer):
         enhancer.step(rgb)
     with pytest.raises(ValueError, match="takes no reference"):
         Enhancer.load(harmonizer, reference=picture())
+
+
+def test_a_huge_model_says_so_before_it_begins(harmonizer, monkeypatch, capsys):
+    from enhance.clip import load_saying
+
+    load_saying(str(harmonizer))
+    assert not capsys.readouterr().err
+    monkeypatch.setattr("enhance.clip.HUGE", 10_000)
+    load_saying(str(harmonizer))
+    said = capsys.readouterr().err
+    assert "NVIDIA Harmonizer" in said and "million weights" in said and "--weights builtin" in said
+
+
+def test_a_clip_is_enhanced_by_any_of_them(harmonizer, tmp_path):
+    from enhance import enhance_video
+    from render.video import VideoWriter, read_video
+
+    with VideoWriter(tmp_path / "clip.mp4", 10, 48, 32) as writer:
+        for i in range(3):
+            writer.write(picture() * (1 - 0.02 * i))
+    assert enhance_video(tmp_path / "clip.mp4", tmp_path / "clean.mp4", Enhancer.load(harmonizer)) == 3
+    assert [tuple(rgb.shape) for rgb in read_video(tmp_path / "clean.mp4")] == 3 * [(32, 48, 3)]

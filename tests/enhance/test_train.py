@@ -11,6 +11,7 @@ from small_net import SMALL
 
 from enhance.enhancer import Enhancer
 from enhance.evaluate import evaluate, table
+from enhance.net import Net
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import TrainConfig, train
 from enhance.weights_file import load_net
@@ -140,3 +141,16 @@ def test_a_broken_checkpoint_is_refused_by_name(pairs, trained, tmp_path, spoil)
     (tmp_path / "checkpoint.pt").write_bytes(spoil((trained / "checkpoint.pt").read_bytes()))
     with pytest.raises(ValueError, match="checkpoint.pt is not a checkpoint of this training"):
         train(pairs, tmp_path, steps=3, config=QUICK, net=SMALL, resume=True)
+
+
+def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
+    class Told:
+        about, device = {}, torch.device("cpu")
+
+        def step(self, frame, memory=None):
+            assert frame.instance is not None and (memory is None) == (frame.flow_prev is None)
+            return frame.rgb * 0.5, True
+
+    rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
+    assert [r.method for r in rows] == ["identity", "ours", "ours + instances", "half"] * 3
+    assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)
