@@ -108,7 +108,7 @@ class Render:
     """An asset to insert for this clip, as car/0003@12m,3.5m,yaw=5deg,speed=8m/s or car/0003@trajectory=t.csv; metres are forward and left
     of the unshifted body at the clip's first frame."""
     enhance: Flag = False
-    """Repair and harmonize the frames."""
+    """Repair and harmonize the frames, with detail from the photos that the scene keeps."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     no_shadows: Flag = False
@@ -153,13 +153,17 @@ class Render:
         width, height = self.size or (None, None)
         finish: Finish | None = None
         needs: tuple[str, ...] = ()
+        scene = scene.to(self.device)
+        facts: dict[str, object] = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
         if self.enhance:
             from enhance.clip import enhancement
+            from render.album import references_of
 
-            finish, needs = enhancement(self.weights, self.device)
-        facts = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
+            references = references_of(self.scene, scene)
+            finish, needs = enhancement(self.weights, self.device, references)
+            facts["photos"] = len(references.shots) if references else 0
         record(
-            scene.to(self.device), self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
+            scene, self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
             not self.no_shadows, finish, needs, facts, warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]

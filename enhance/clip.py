@@ -9,9 +9,11 @@ from pathlib import Path
 from enhance.enhancer import Enhancer
 from enhance.step import Steps
 from render.frame_types import Frame
+from render.references import READS as NEEDED
+from render.references import References
 from scenes.opening import warn
 
-READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb
+READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb, and beside what references read
 
 
 HUGE = 50_000_000
@@ -36,10 +38,15 @@ def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
         yield replace(frame, rgb=better)
 
 
-def enhancement(weights: str, device: str = "cpu") -> tuple[Callable[[Iterable[Frame]], Iterator[Frame]], tuple[str, ...]]:
-    """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads."""
+def enhancement(
+    weights: str, device: str = "cpu", references: References | None = None
+) -> tuple[Callable[[Iterable[Frame]], Iterator[Frame]], tuple[str, ...]]:
+    """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads. references: of the scene, if it
+    has photos."""
     enhancer = load_saying(weights, device)
-    return lambda frames: enhance_frames(frames, enhancer), READS
+    if references is None:
+        return lambda frames: enhance_frames(frames, enhancer), READS
+    return lambda frames: enhance_frames(references.along(frames), enhancer), (*READS, *NEEDED)
 
 
 def enhance_video(

@@ -16,6 +16,7 @@ from enhance.isp import alter, random_isp
 from enhance.lighting import Illumination, random_sky, relit, smoothed, under
 from enhance.refits import Refit
 from enhance.shards import to_bytes
+from render.references import READS, References, Shot
 from scenes.asset import Asset
 from scenes.scene import Scene
 from scenes.sky import Sky
@@ -26,13 +27,15 @@ class Sources:
     """What damage is made from beside the scene and its photos.
 
     early   the scene stopped early, for underfit (without any, splats are spoilt by rule instead)
+    shots   the recording's photos, which underfit's views may be compared with
     refits  by kind the reconstructions from less (`enhance.refits`)
     skies   HDR skies, for relight and shadow, beside made-up ones
     own     assets cut out of the scene, by track, for reinsert
     assets  those that may be put anywhere, for shadow
     """
 
-    early: Sequence[Scene] = ()
+    early: Sequence[Refit] = ()
+    shots: Sequence[Shot] = ()
     refits: Mapping[str, Sequence[Refit]] = field(default_factory=dict)
     skies: Sequence[Sky] = ()
     own: Mapping[str, Asset] = field(default_factory=dict)
@@ -42,13 +45,16 @@ class Sources:
 @dataclass(frozen=True)
 class Damage:
     """uint8 frames `[T, H, W, 3]` as they are and as they should be, the changed region `[T, H, W]` in 0..1, and what was done in words;
-    scene: what the frames show, where that is not the clip's own."""
+    scene: what the frames show, where that is not the clip's own. Where photos say more than the frames (`render.references`): what,
+    uint8 like them, and how much that is to be trusted `[T, H, W]` in 0..1."""
 
     input: torch.Tensor
     target: torch.Tensor
     region: torch.Tensor
     what: dict
     scene: Scene | None = None
+    reference: torch.Tensor | None = None
+    trust: torch.Tensor | None = None
 
 
 def make(kind: str, clip: Clip, sources: Sources) -> Damage:
@@ -66,28 +72,33 @@ def _underfit(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
     what: dict[str, object]
     if sources.early and rng.random() < 0.7:
         pick = int(rng.integers(len(sources.early)))
-        scene, what = sources.early[pick], {"underfit": "stopped early", "scene": str(sources.early[pick].meta.get("name", pick))}
+        references = sources.early[pick].references
+        what = {"underfit": "stopped early", "scene": str(references.recorded.meta.get("name", pick))}
     else:
         how = random_underfit(rng)
-        scene, what = unfinish(clip.scene, how, int(rng.integers(2**31))), {"underfit": vars(how)}
-    return _rendered(clip, scene, what)
+        references = References(sources.shots, unfinish(clip.scene, how, int(rng.integers(2**31))))
+        what = {"underfit": vars(how)}
+    return _rendered(clip, references, what)
 
 
 def _refitted(kind: str) -> Callable[[Clip, np.random.Generator, Sources], Damage]:
     def damage(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
         """What a reconstruction from less shows of the clip's views."""
-        fair = [refit.scene for refit in sources.refits.get(kind, ()) if clip.name in refit.cameras]
+        fair = [refit.references for refit in sources.refits.get(kind, ()) if clip.name in refit.cameras]
         if not fair:
             raise ValueError(f"{kind} pairs of {clip.name} need a reconstruction from less; pass sources.refits (enhance.refits)")
-        scene = fair[int(rng.integers(len(fair)))]
-        return _rendered(clip, scene, {"scene": str(scene.meta.get("name", kind))})
+        references = fair[int(rng.integers(len(fair)))]
+        return _rendered(clip, references, {"scene": str(references.recorded.meta.get("name", kind))})
 
     return damage
 
 
-def _rendered(clip: Clip, scene: Scene, what: dict) -> Damage:
-    frames = [frame.rgb for frame in clip.render(scene, "rgb")]
-    return Damage(torch.stack([to_bytes(rgb) for rgb in frames if rgb is not None]), clip.photos, torch.ones(clip.photos.shape[:3]), what)
+def _rendered(clip: Clip, references: References, what: dict) -> Damage:
+    """What a scene shows, and what the pictures that it was made from say of it, but never the photo that is the target."""
+    frames = list(references.along(clip.render(references.recorded, *READS), clip.cameras))
+    rgb, reference = (torch.stack([to_bytes(getattr(f, name)) for f in frames]) for name in ("rgb", "reference"))
+    trust = torch.stack([f.trust for f in frames if f.trust is not None])
+    return Damage(rgb, clip.photos, torch.ones(clip.photos.shape[:3]), what, None, reference, trust)
 
 
 def _isp(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:

@@ -78,13 +78,14 @@ class Enhancer:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 
         frame   rgb `[H, W, 3]` display-referred, of any size (beyond 1280 pixels a side it is worked on in parts), or a rendered
-                Frame: its flow_prev then moves the memory exactly, its instance says where objects were put, and its need where
-                there is anything to do at all, all three optional. Without flow the memory stays in place.
+                Frame: its flow_prev then moves the memory exactly, its instance says where objects were put, its need where there is
+                anything to do at all, and its reference what photos show there (`render/references.py`), all optional. Without flow the
+                memory stays in place.
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Pixels whose gate is 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame
-        that needs nothing costs nothing. Raises ValueError for values that are not finite.
+        Pixels whose gate and trust are 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1);
+        a frame that needs nothing costs nothing. Raises ValueError for values that are not finite.
         """
         given = checked(frame)
         height, width = given.rgb.shape[:2]
@@ -97,6 +98,9 @@ class Enhancer:
         tiles = Tiles.of(torch.ones(height, width) if given.need is None else given.need)
         if tiles.nothing():
             return rgb, self._skipped(memory, (height, width), flow)
+        if given.reference is not None:
+            reference, trust = (x.to(rgb) for x in given.reference)
+            rgb = torch.lerp(rgb, reference.clamp(0, 1), (trust * tiles.pixels().to(trust))[..., None])
         corrections: Corrections = {}
         if given.instance is not None:
             planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), given.instance, memory.objects if memory else {})

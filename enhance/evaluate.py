@@ -7,7 +7,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from enhance.drift import drift, drift_text
 from enhance.enhancer import Enhancer
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
-from enhance.shards import KINDS, PairSet, Shard, Window
+from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
 from enhance.step import Steps
 from enhance.weights_file import BUILTIN, load_net
 from render.compare import psnr, ssim
@@ -35,6 +35,8 @@ SMALLEST = 200
 
 TOLD = "ours + instances"
 METHODS = ("identity", "ours", TOLD)
+PHOTOS = ("references alone", "ours + references")
+"""Where a rendered scene has photos: what those say of the frame, and that enhanced."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ def evaluate(
     progress: Callable[[str], None] | None = None,
     beside: Mapping[str, Steps] | None = None,
 ) -> list[Row]:
-    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; then for
-    those `beside` it by name, told the instances too.
+    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of rendered
+    kinds for what photos say, and the enhancer told that; then for those `beside` it by name, told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
@@ -91,7 +93,7 @@ def evaluate(
     rows, others = [], dict(beside or {})
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
-        for method in (*METHODS, *others) if shards else ():
+        for method in (*METHODS, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
             rows.append(_row(kind, method, shards, others.get(method, enhancer), features))
@@ -119,10 +121,12 @@ def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, featu
         previous: torch.Tensor | None = None
         memory = None
         for t in range(shard.frames):
-            frame = _frame(window, t, told=method not in METHODS or method == TOLD)
+            frame = _frame(window, t, told=method not in (*METHODS, *PHOTOS) or method == TOLD, referenced=method in PHOTOS)
             start = time.perf_counter()
             if method == "identity":
                 better = window.input[t].permute(1, 2, 0)
+            elif method == PHOTOS[0]:
+                better = torch.lerp(window.input[t], window.reference[t], window.trust[t]).permute(1, 2, 0)
             else:
                 better, memory = enhancer.step(frame, memory)
             times.append(1000 * (time.perf_counter() - start))
@@ -161,12 +165,15 @@ def _mean(values: list[float], measure: str) -> float:
     return float(np.mean(values))
 
 
-def _frame(window: Window, t: int, told: bool) -> Frame:
+def _frame(window: Window, t: int, told: bool, referenced: bool) -> Frame:
     rgb = window.input[t].permute(1, 2, 0).contiguous()
     height, width = rgb.shape[:2]
     somewhere = Camera(Pinhole(1.0, 1.0, width / 2, height / 2), width, height, torch.eye(4, dtype=torch.float64))
     flow = window.flow[t].permute(1, 2, 0) if t else None
-    return Frame(somewhere, rgb=rgb, flow_prev=flow, instance=window.instance[t, 0] if told else None)
+    frame = Frame(somewhere, rgb=rgb, flow_prev=flow, instance=window.instance[t, 0] if told else None)
+    if not referenced:
+        return frame
+    return replace(frame, reference=window.reference[t].permute(1, 2, 0), trust=window.trust[t, 0])
 
 
 def table(rows: Sequence[Row]) -> str:

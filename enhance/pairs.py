@@ -11,11 +11,12 @@ from torch.nn import functional as F
 
 from enhance.clips import Clip, PairConfig
 from enhance.damage import Damage, Sources, make
-from enhance.refits import REFITS, refits
+from enhance.refits import REFITS, Refit, as_reconstructed, refits, shots_of
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.assets import FEWEST_SPLATS, candidates
 from recon.log import Log
+from render.references import References
 from scenes.atomic import atomic_file
 from scenes.databank import Databank
 from scenes.files import load
@@ -92,13 +93,15 @@ def prepare_sources(
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
     early = stopped_early(log, folder / "early", names) if "underfit" in kinds else []
+    shots = shots_of(as_reconstructed(log, scene), scene) if "underfit" in kinds else []
+    unfinished = [Refit(References(shots, s), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
     made = {kind: refits(kind, scene, log, folder / "refits") for kind in REFITS if kind in kinds}
     found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
     own = {c.track: c.asset for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS}
     bank = Databank(databank) if databank is not None else None
     stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
     anywhere = [c.asset for c in found if not c.flaw] + stored
-    return Sources([s for s in map(load, early) if isinstance(s, Scene)], made, [_sky(path) for path in skies], own, anywhere)
+    return Sources(unfinished, shots, made, [_sky(path) for path in skies], own, anywhere)
 
 
 def kinds_for(scene: Scene, log: Log) -> tuple[str, ...]:
@@ -131,6 +134,8 @@ def _sky(path: str | Path, width: int = 256) -> Sky:
 
 def _write(path: Path, kind: str, clip: Clip, damage: Damage) -> None:
     tensors = {"input": damage.input, "target": damage.target, "region": to_bytes(damage.region), **clip.geometry(damage.scene)}
+    if damage.reference is not None and damage.trust is not None:
+        tensors |= {"reference": damage.reference, "trust": to_bytes(damage.trust)}
     write_shard(path, tensors, {"kind": kind, **clip.meta, **damage.what})
 
 

@@ -10,15 +10,18 @@ The poses are those of the finished scene and are not corrected again, so that w
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from enhance.clips import scene_time
 from recon.build import assemble, begin, choose
 from recon.fit import FitConfig
 from recon.log import Log, LogCamera, Track
 from render import render_frame
 from render.progress import Progress
+from render.references import References, Shot
 from render.video import write_image
 from scenes.files import load, save
 from scenes.scene import Scene
@@ -38,9 +41,9 @@ SIZE = (480, 270)
 
 @dataclass(frozen=True)
 class Refit:
-    """A scene made from less, and the cameras whose recorded views it is fair to render from it."""
+    """A scene made from less with the pictures that it was made from, and the cameras whose recorded views it is fair to render from it."""
 
-    scene: Scene
+    references: References
     cameras: tuple[str, ...]
 
 
@@ -60,17 +63,27 @@ def refits(
             _fit(part, path, config, size)
         loaded = load(path)
         assert isinstance(loaded, Scene)
-        made.append(Refit(loaded, shown))
+        made.append(Refit(References(shots_of(part, scene), loaded), shown))
     return made
 
 
+def shots_of(log: Log, scene: Scene) -> list[Shot]:
+    """The pictures of a recording that `as_reconstructed` brought to the poses of a `scene`, with that scene's exposures."""
+    return [
+        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure), partial(camera.image, i))
+        for name, camera in log.cameras.items()
+        for i in range(len(camera))
+    ]
+
+
 def as_reconstructed(log: Log, scene: Scene) -> Log:
-    """The recording at the poses that the scene's fit corrected, with the scene's cameras only."""
+    """The recording at the poses and by the clocks that the scene's fit corrected, with the scene's cameras only."""
     cameras = {}
     for name in scene.rig:
         camera = log.camera(name)
-        poses = torch.stack([scene.camera(name, int(t)).world_from_cam for t in camera.times_us])
-        cameras[name] = replace(camera, world_from_cam=poses)
+        times = [scene_time(scene, name, int(t)) for t in camera.times_us]
+        poses = torch.stack([scene.camera(name, t).world_from_cam for t in times])
+        cameras[name] = replace(camera, times_us=torch.tensor(times), world_from_cam=poses)
     paths = {actor.track: actor.trajectory for actor in scene.actors}
 
     def corrected(track: Track) -> Track:

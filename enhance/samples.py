@@ -24,6 +24,7 @@ PLACED = ("relight", "shadow", "reinsert")
 """Kinds that change a part of the frame; crops look for it."""
 AIMED = 0.8  # how often
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
+REFERENCED = 0.5  # how often a rendered frame comes as photos beside it have bettered it
 ALIEN = 254
 """Id of an object that is none of the scene's."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -82,7 +83,8 @@ class Photos:
         flow[0] = torch.nan
         seen = torch.ones(frames, 1, size, size)
         seen[0] = 0
-        return Window(rgb, rgb, torch.zeros_like(seen), torch.zeros(frames, 1, size, size, dtype=torch.int16), flow, seen)
+        nowhere = torch.zeros_like(seen)
+        return Window(rgb, rgb, nowhere, nowhere.to(torch.int16), flow, seen, rgb, nowhere)
 
 
 class Sampler:
@@ -187,6 +189,8 @@ class Sampler:
                 told = _with_alien(torch.zeros_like(objects), region)
         elif kind in RENDERED:
             damaged, region, told = w.input, torch.ones_like(w.region), objects
+            if rng.random() < REFERENCED:
+                damaged = torch.lerp(damaged, w.reference, w.trust)
             if rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
                 alien = self._moving_mask(rng, w)
                 damaged, told = alter(damaged, alien, random_isp(rng)), _with_alien(objects, alien)
@@ -253,7 +257,7 @@ def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed:
         return window
     pad = (0, size - w, 0, size - h)
     return Window(
-        **{name: F.pad(getattr(window, name), pad, mode="replicate") for name in ("input", "target", "region")},
+        **{name: F.pad(getattr(window, name), pad, mode="replicate") for name in ("input", "target", "region", "reference", "trust")},
         instance=F.pad(window.instance, pad, value=-1),
         flow=F.pad(window.flow, pad, value=torch.nan),
         visible=F.pad(window.visible, pad),
@@ -268,7 +272,7 @@ def _regraded(rng: np.random.Generator, w: Window) -> Window:
     if rng.random() < 0.35:
         return w
     grade = random_isp(rng, 0.7)
-    return replace(w, target=grade(w.target), input=grade(w.input))
+    return replace(w, target=grade(w.target), input=grade(w.input), reference=grade(w.reference))
 
 
 def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:

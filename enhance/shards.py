@@ -10,6 +10,11 @@ flow      float16 `[T, H, W, 2]`  exact flow to the previous frame, pixels; NaN 
 visible   uint8 `[T, H, W]`       1 where the previous frame shows the same point
 depth     float16 `[T, H, W]`     z in metres, inf where nothing is (clips made before it was kept lack it)
 
+and, of rendered frames whose scene has photos,
+
+reference uint8 `[T, H, W, 3]`    what those say of the view (`render.references`), never the target itself
+trust     uint8 `[T, H, W]`       how far to go there from the input, 0..255
+
 and `<name>.json` says kind, split ("train" or "held out"), camera, times, seed and what was done.
 """
 
@@ -37,6 +42,7 @@ FIELDS = {
     "visible": torch.uint8,
 }
 STORED = FIELDS | {"depth": torch.float16}
+REFERENCES = {"reference": torch.uint8, "trust": torch.uint8}
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,8 @@ class Window:
     instance       `[T, 1, h, w]` int16, -1 where none
     flow           `[T, 2, h, w]` pixels to the previous frame, NaN where unknown
     visible        `[T, 1, h, w]` 0 or 1
+    reference      `[T, 3, h, w]` in 0..1; the input where there is none
+    trust          `[T, 1, h, w]` in 0..1; 0 where there is none
     """
 
     input: torch.Tensor
@@ -56,6 +64,8 @@ class Window:
     instance: torch.Tensor
     flow: torch.Tensor
     visible: torch.Tensor
+    reference: torch.Tensor
+    trust: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -77,8 +87,10 @@ class Shard:
         t = slice(start, start + (frames or self.frames - start))
         y, x = slice(top, top + (height or self.height - top)), slice(left, left + (width or self.width - left))
         with safe_open(self.path, "pt") as file:
-            part = {name: file.get_slice(name)[t, y, x] for name in FIELDS}
-        colour = {name: part[name].permute(0, 3, 1, 2).float() / 255 for name in ("input", "target")}
+            known = FIELDS | (REFERENCES if "trust" in file.keys() else {})  # noqa: SIM118 - not a dict
+            part = {name: file.get_slice(name)[t, y, x] for name in known}
+        part = {"reference": part["input"], "trust": torch.zeros_like(part["region"])} | part
+        colour = {name: part[name].permute(0, 3, 1, 2).float() / 255 for name in ("input", "target", "reference")}
         instance = part["instance"][:, None].to(torch.int16)
         flow = part["flow"].permute(0, 3, 1, 2).float()
         flow[0] = torch.nan  # the frame before the window is not part of it
@@ -90,6 +102,7 @@ class Shard:
             instance=torch.where(instance == 255, -1, instance),
             flow=flow,
             visible=visible,
+            trust=part["trust"][:, None].float() / 255,
         )
 
     def changed(self, index: int) -> torch.Tensor:
@@ -111,12 +124,13 @@ def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> Non
     """Store one clip; the json file is written last, so a shard without one is unfinished and is made again."""
     from safetensors.torch import save
 
-    for name, dtype in STORED.items():
+    stored = STORED | (REFERENCES if "trust" in tensors else {})
+    for name, dtype in stored.items():
         check_tensor(name, tensors[name], ("T", "H", "W", {"flow": 2}.get(name, 3)) if tensors[name].ndim == 4 else ("T", "H", "W"), dtype)
     path.parent.mkdir(parents=True, exist_ok=True)
     t, h, w = tensors["region"].shape
     with atomic_file(path) as half:
-        half.write_bytes(save({name: tensors[name].contiguous() for name in STORED}))
+        half.write_bytes(save({name: tensors[name].contiguous() for name in stored}))
     with atomic_file(path.with_suffix(".json")) as half:
         Path(half).write_text(json.dumps({"frames": t, "height": h, "width": w, **meta}, indent=1))
 

@@ -25,12 +25,14 @@ class Steps(Protocol):
 
 @dataclass(frozen=True)
 class Given:
-    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, objects' ids and need `[H, W]`; None where it has none."""
+    """Of a frame: rgb `[H, W, 3]`, flow `[H, W, 2]`, objects' ids and need `[H, W]`, and reference `[H, W, 3]` with trust `[H, W]`; None
+    where it has none."""
 
     rgb: torch.Tensor
     flow: torch.Tensor | None = None
     instance: torch.Tensor | None = None
     need: torch.Tensor | None = None
+    reference: tuple[torch.Tensor, torch.Tensor] | None = None
 
 
 def checked(frame: Frame | torch.Tensor) -> Given:
@@ -39,8 +41,9 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         if frame.rgb is None:
             raise ValueError("the frame has no rgb; render it with outputs=('rgb', ...)")
         rgb, flow, instance, need = frame.rgb, frame.flow_prev, frame.instance, frame.need
+        reference = None if frame.reference is None or frame.trust is None else (frame.reference, frame.trust)
     else:
-        rgb, flow, instance, need = frame, None, None, None
+        rgb, flow, instance, need, reference = frame, None, None, None, None
     check_tensor("rgb", rgb, ("H", "W", 3))
     height, width = rgb.shape[:2]
     if height == 0 or width == 0:
@@ -56,4 +59,7 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         check_tensor("instance", instance, (height, width))
     if need is not None:
         check_tensor("need", need, (height, width))
-    return Given(rgb, flow, instance, need)
+    if reference is not None:
+        check_tensor("reference", reference[0], (height, width, 3))
+        check_tensor("trust", reference[1], (height, width))
+    return Given(rgb, flow, instance, need, reference)

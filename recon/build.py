@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from recon.album import keep_album
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
 from recon.fit import Fit, FitConfig, run
 from recon.frames import Frames, load_frames
@@ -57,6 +58,8 @@ def reconstruct(
     same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
 
+    The folder keeps the photos that were fitted to, too: the enhancer looks detail up there.
+
     Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
     """
     output = Path(output)
@@ -96,6 +99,8 @@ def reconstruct(
         scene.meta["off_path"] = off_path_table(scene, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     save(scene, output, overwrite, half)
+    with Progress("photos", total=len(fit.frames.training())) as steps:
+        keep_album(scene, fit.frames, start.rig, output, steps.step)
     checkpoint.unlink(missing_ok=True)
     return scene
 

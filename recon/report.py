@@ -47,9 +47,7 @@ def read_out(scene: Scene, camera: Camera, rig: RigCamera) -> Scene:
     """The scene that a global shutter sees as `rig`'s shutter sees this one, the middle of its readout being the camera's moment."""
     if not rig.readout_us:
         return scene
-    first, last = (camera.time_us + sign * rig.readout_us // 2 for sign in (-1, 1))
-    mount = inverse(scene.ego.at(camera.time_us)) @ camera.world_from_cam
-    backs = [inverse(scene.ego.near(t) @ mount) for t in (first, last)]
+    (first, last), backs = readout_ends(scene, camera, rig)
 
     def moved(splats: Gaussians, poses: list[torch.Tensor]) -> Gaussians:
         return as_read(splats, backs[0] @ poses[0], backs[1] @ poses[1], camera, rig.shutter)
@@ -63,6 +61,13 @@ def read_out(scene: Scene, camera: Camera, rig: RigCamera) -> Scene:
     ]
     background = replace(scene.background, gaussians=moved(scene.background.gaussians, [still, still]))
     return replace(scene, background=background, actors=tuple(actors))
+
+
+def readout_ends(scene: Scene, camera: Camera, rig: RigCamera) -> tuple[tuple[int, int], tuple[torch.Tensor, torch.Tensor]]:
+    """When the first and the last row (column) are read if the middle one is at `camera`'s moment, and cam_from_world `[4, 4]` then."""
+    first, last = (camera.time_us + sign * rig.readout_us // 2 for sign in (-1, 1))
+    mount = inverse(scene.ego.at(camera.time_us)) @ camera.world_from_cam
+    return (first, last), (inverse(scene.ego.near(first) @ mount), inverse(scene.ego.near(last) @ mount))
 
 
 def _driving(scene: Scene, view: View) -> bool:

@@ -23,14 +23,18 @@ def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: 
 
     first, last: cam_from_local `[4, 4]` when the first and the last row (column) of `camera` is read.
     """
+    return replace(splats, means=splats.means + readout_shift(splats.means, first, last, camera, shutter))
+
+
+@torch.no_grad()
+def readout_shift(points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> torch.Tensor:
+    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`."""
     middle, travel = (0.5 * (first + last)).float(), (last - first).float()
-    with torch.no_grad():
-        seen = splats.means @ middle[:3, :3].T + middle[:3, 3]
-        ahead = seen[:, 2:] > NEAR
-        axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
-        share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
-        # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
-        share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
-        local = middle[:3, :3].T @ travel[:3]
-        shift = share * (splats.means @ local[:, :3].T + local[:, 3])
-    return replace(splats, means=splats.means + shift)
+    seen = points @ middle[:3, :3].T + middle[:3, 3]
+    ahead = seen[:, 2:] > NEAR
+    axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
+    share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
+    # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
+    share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
+    local = middle[:3, :3].T @ travel[:3]
+    return share * (points @ local[:, :3].T + local[:, 3])

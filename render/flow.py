@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch.nn import functional as F
 
 from render.rays import camera_origins, camera_rays
 from scenes.camera import Camera
@@ -30,11 +31,9 @@ class Correspondence:
         """bool `[H, W]`: the point falls into the other image, and there `depth` `[H', W']` shows nothing nearer in all four pixels
         around it. Sky hides nothing and is hidden by all."""
         height, width = depth.shape
-        corner = torch.floor(torch.nan_to_num(self.pixels, nan=-9.0).clamp(-9, 1e6) - 0.5).long()
-        around = [
-            depth[(corner[..., 1] + dy).clamp(0, height - 1), (corner[..., 0] + dx).clamp(0, width - 1)] for dx in (0, 1) for dy in (0, 1)
-        ]
-        farthest = torch.stack(around).amax(0)
+        corner = torch.floor(torch.nan_to_num(self.pixels, nan=-9.0).clamp(-9, 1e6) + 0.5).long()
+        around = F.max_pool2d(F.pad(depth[None, None], (1, 1, 1, 1), value=-torch.inf), 2, 1)[0, 0]  # of the pixels that meet in a corner
+        farthest = around[corner[..., 1].clamp(0, height), corner[..., 0].clamp(0, width)]
         size = torch.tensor([width, height], device=depth.device)
         inside = ((self.pixels >= 0) & (self.pixels <= size)).all(-1)
         return inside & (farthest >= (1 - HIDES) * self.other.lens.depth(self.points))
@@ -65,8 +64,11 @@ def correspond(
         if p.instance not in seen:
             continue
         end = moved.get(p.instance, p.world_from_local)
-        motion = (other_from_world @ end @ inverse(p.world_from_local) @ camera.world_from_cam).to(device, torch.float32)
         mine = (instance == p.instance) & ~sky
+        if torch.equal(end, p.world_from_local):  # what stands is most of the picture, and need not be taken out of it
+            out += mine[..., None] * (other_from_world @ camera.world_from_cam)[:3, 3].to(device, torch.float32)
+            continue
+        motion = (other_from_world @ end @ inverse(p.world_from_local) @ camera.world_from_cam).to(device, torch.float32)
         out[mine] = points[mine] @ motion[:3, :3].T + motion[:3, 3]
     pixels = other.lens.project(out)
     flow = torch.where(other.lens.valid(out)[..., None], pixels - camera.lens.project(points), torch.nan).to(torch.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
@@ -56,6 +56,9 @@ class Frame:
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
     visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32; instance_alpha `[H, W, P]` what each
     placed instance adds to alpha; need `[H, W]` 0 to 1, how badly the place is supported by photos (`render/need.py`).
+
+    No outputs, but added to frames that are to be enhanced (`render/references.py`): reference `[H, W, 3]`, what the drive's photos say the
+    view looks like, and trust `[H, W]` 0 to 1, how far to go from rgb to it.
     """
 
     camera: Camera
@@ -72,8 +75,10 @@ class Frame:
     instance: torch.Tensor | None = None
     instance_alpha: torch.Tensor | None = None
     need: torch.Tensor | None = None
+    reference: torch.Tensor | None = None
+    trust: torch.Tensor | None = None
 
     def outputs(self) -> dict[str, torch.Tensor]:
         """The outputs that were computed, by name."""
-        have = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "camera"}
+        have = {name: getattr(self, name) for name in OUTPUTS}
         return {name: value for name, value in have.items() if value is not None}

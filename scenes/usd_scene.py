@@ -76,6 +76,14 @@ def load_scene(path: Path, clean: Clean = Gaussians.checked) -> Scene:
         return _read_scene(stage, path, meta, clean)
 
 
+def load_recorded(path: Path, clean: Clean = Gaussians.checked) -> Scene:
+    """The scene of a folder as it was reconstructed, without its edits."""
+    meta = read_metadata(path)
+    file = path / RECORDED if (path / RECORDED).is_file() else path / "scene.usda"  # a scene of before has no edits yet
+    with open_stage(file) as stage:
+        return _read_scene(stage, path, meta, clean)
+
+
 def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene:
     try:
         origin, model = int(meta["origin_us"]), SplatModel(**meta["model"])

@@ -171,3 +171,16 @@ def test_a_small_motion_is_no_cut(enhancer):
     _, memory = enhancer.step(striped(1))
     after, _ = enhancer.step(striped(1).roll(3, 1), memory)
     assert not torch.allclose(after, enhancer.step(striped(1).roll(3, 1))[0], atol=2e-3)
+
+
+def test_what_photos_say_is_followed_as_far_as_it_is_trusted_where_there_is_need():
+    rgb, reference = picture(64, 64), picture(64, 64, seed=1)
+    trust, need = torch.zeros(64, 64), torch.ones(64, 64)
+    trust[:, 16:], need[:32] = 0.5, 0
+    plain = Enhancer(Net(SMALL))
+    better, _ = plain.step(frame(rgb, reference=reference, trust=trust))
+    assert torch.equal(better[:, :16], rgb[:, :16]) and torch.allclose(better[:, 16:], (rgb + reference)[:, 16:] / 2, atol=1e-6)
+    part, _ = plain.step(frame(rgb, reference=reference, trust=trust, need=need))
+    assert torch.equal(part[:32], rgb[:32]) and torch.equal(part[32:], better[32:])
+    with pytest.raises(ValueError, match="trust"):
+        plain.step(frame(rgb, reference=reference, trust=trust[:5]))

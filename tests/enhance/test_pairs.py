@@ -13,10 +13,11 @@ from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
 from enhance.pairs import kinds_for, make_pairs, prepare_sources
-from enhance.refits import REFITS, Refit
+from enhance.refits import REFITS, Refit, shots_of
 from enhance.shards import KINDS, PairSet
 from recon.log import Log, LogCamera
 from render import render_frame
+from render.references import References
 from render.video import write_image
 
 CONFIG = PairConfig(width=96, frames=3, every=4)
@@ -37,11 +38,13 @@ def recording(street, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def sources(street):
+def sources(street, recording):
     """Spoilt splats stand in for fits from less, which have tests of their own."""
-    spoilt = Refit(unfinish(street, Underfit(thin=0.5, colour=0.2), 0), ("front_camera", "left_camera"))
+    shots = shots_of(recording, street)
+    spoilt = Refit(References(shots, unfinish(street, Underfit(thin=0.5, colour=0.2), 0)), ("front_camera", "left_camera"))
     own = {a.track: a.asset for a in street.actors}
-    return Sources(refits={kind: [spoilt] for kind in REFITS}, skies=[random_sky(np.random.default_rng(3))], own=own, assets=[car()])
+    refits = {kind: [spoilt] for kind in REFITS}
+    return Sources(shots=shots, refits=refits, skies=[random_sky(np.random.default_rng(3))], own=own, assets=[car()])
 
 
 @pytest.fixture(scope="module")
@@ -148,9 +151,10 @@ def test_flow_moves_the_previous_target_onto_this_one(folder):
     assert (w.target[1:] - moved).abs()[seen.expand(-1, 3, -1, -1)].mean() < still
 
 
-def test_the_same_seed_makes_the_same_pairs_and_another_others(street, recording, folder, tmp_path):
-    one = make_pairs(street, recording, tmp_path / "one", kinds=("underfit",), cameras=["left_camera"], seed=1, config=CONFIG)
-    two = make_pairs(street, recording, tmp_path / "two", kinds=("underfit",), cameras=["left_camera"], seed=2, config=CONFIG)
+def test_the_same_seed_makes_the_same_pairs_and_another_others(street, recording, sources, folder, tmp_path):
+    how = {"kinds": ("underfit",), "cameras": ["left_camera"], "sources": sources, "config": CONFIG}
+    one = make_pairs(street, recording, tmp_path / "one", seed=1, **how)
+    two = make_pairs(street, recording, tmp_path / "two", seed=2, **how)
     name = "underfit/left_camera_0004.safetensors"
     assert (one / name).read_bytes() == (folder / name).read_bytes() != (two / name).read_bytes()
 

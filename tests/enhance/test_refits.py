@@ -54,8 +54,8 @@ def test_a_refit_lies_where_the_scene_lies_and_is_kept(log, street, tmp_path, mo
     (made,) = refits("sparse", street, log, tmp_path, QUICK, SIZE)
     assert made.cameras == tuple(street.rig)
     camera = street.camera("front_camera", int(street.frame_times("front_camera")[2])).resized(*SIZE)
-    assert psnr(render_frame(made.scene, camera).rgb, render_frame(street, camera).rgb) > 15
-    moved = inverse(made.scene.ego.at(camera.time_us)) @ street.ego.at(camera.time_us)
+    assert psnr(render_frame(made.references.recorded, camera).rgb, render_frame(street, camera).rgb) > 15
+    moved = inverse(made.references.recorded.ego.at(camera.time_us)) @ street.ego.at(camera.time_us)
     assert torch.allclose(moved, torch.eye(4, dtype=torch.float64), atol=0.02)  # poses were not corrected again
     monkeypatch.setattr(Fit, "step", None)
     assert len(refits("sparse", street, log, tmp_path, QUICK, SIZE)) == 1

@@ -12,6 +12,7 @@ from recon.checkpoint import checkpoint_path
 from recon.fit import Fit, FitConfig
 from recon.model import Knots, small_poses
 from render import render_frame
+from render.album import references_of
 from render.compare import psnr
 from scenes import Scene, load
 from scenes.poses import inverse
@@ -34,6 +35,14 @@ def test_a_drive_becomes_a_scene_on_disk(whole):
     assert list(scene.rig) == ["front_camera"] and scene.meta["licence"] == "CC BY 4.0"
     assert len(scene.background.gaussians) > 300 and len(made.actors) == 1 and len(made.actors[0].asset.gaussians) > 50
     assert [p["track"] for p in scene.meta["parked"]] == ["veh_1"] or [p["track"] for p in scene.meta["parked"]] == ["veh_2"]
+
+
+def test_photos_are_kept_that_were_not_held_out(whole):
+    out, made = whole
+    references = references_of(out, load(out))
+    times = made.frame_times("front_camera").tolist()
+    assert sorted(references.times.tolist()) == [t for i, t in enumerate(times) if i % 4]
+    assert references.shots[0].read(*SIZE).shape == (SIZE[1], SIZE[0], 3)
 
 
 def test_held_out_frames_are_reported_with_the_mean_image(whole):

@@ -5,6 +5,7 @@ import torch
 from randomized import gaussians
 from street import START_US, rig, street
 
+from recon.album import at_once
 from recon.frames import Frames, View
 from recon.model import Knots
 from recon.motion import EGO, Motion
@@ -44,6 +45,18 @@ def test_a_scene_read_out_looks_as_the_exact_shutter_shows_it():
         ours, instant = (render_frame(s, middle).rgb for s in (read_out(scene, middle, camera), scene))
     assert psnr(ours, exact) > psnr(instant, exact) + 6
     assert read_out(scene, middle, scene.rig["left_camera"]) is scene
+
+
+def test_a_photo_read_row_by_row_is_brought_to_one_moment():
+    scene = street()
+    camera = replace(scene.rig["left_camera"], shutter="rows", readout_us=60_000)
+    t = START_US + 420_000
+    with torch.no_grad():
+        photo = render_frame(scene, camera.along(scene.ego, t - 30_000)).rgb.clamp(0, 1)
+        middle = scene.camera("left_camera", t)
+        instant = render_frame(scene, middle).rgb
+    assert psnr(at_once(scene, middle, camera, photo), instant) > psnr(photo, instant) + 5
+    assert at_once(scene, middle, scene.rig["left_camera"], photo) is photo
 
 
 def motion(readout_us=0):

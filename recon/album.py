@@ -1,0 +1,70 @@
+"""The fit's photos as the finished scene's cameras would have taken them, kept beside it (`render/album.py`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch.nn import functional as F
+
+from recon.frames import Frames
+from recon.report import readout_ends
+from recon.shutter import readout_shift
+from render import render_frame
+from render.album import keep_photos
+from render.rays import camera_rays
+from scenes.camera import Camera, RigCamera
+from scenes.poses import inverse
+from scenes.scene import Scene
+
+FAR = 1000.0
+"""Metres at which the sky is taken to be."""
+
+
+def keep_album(scene: Scene, frames: Frames, rig: dict[str, RigCamera], folder: Path, report: Callable[[], None] = lambda: None) -> None:
+    """Keep the photos that a scene was fitted to in its folder; never those that were held out, which its quality is measured on.
+
+    rig: the log's cameras, which say how the photos' rows were read. `report` is called after each photo.
+    """
+
+    def photos() -> Iterator[tuple[str, int, torch.Tensor]]:
+        for c, name in enumerate(frames.names):
+            mine = [v for v in frames.views if v.camera == c]
+            for view, time_us in zip(mine, scene.frame_times(name).tolist(), strict=True):
+                if not view.held_out:
+                    yield name, time_us, at_once(scene, scene.camera(name, time_us), rig[name], view.image.float() / 255)
+                    report()
+
+    keep_photos(folder, photos())
+
+
+@torch.no_grad()
+def at_once(scene: Scene, camera: Camera, rig: RigCamera, photo: torch.Tensor) -> torch.Tensor:
+    """A photo `[H, W, 3]` whose rows `rig`'s shutter read one after the other, as `camera` takes it at one go: each pixel looks where the
+    surface that it shows was when its row was read. As it is where the shutter is global."""
+    if not rig.readout_us:
+        return photo
+    (first, last), backs = readout_ends(scene, camera, rig)
+    frame = render_frame(scene, camera, ("depth", "instance"))
+    assert frame.depth is not None and frame.instance is not None
+    sky = frame.depth.isinf() | (frame.instance < 0)
+    rays = camera_rays(camera)
+    points = rays * torch.where(sky, FAR, frame.depth)[..., None]
+    moved = points.clone()
+    for p in scene.placed(camera.time_us):
+        mine = (frame.instance == p.instance) | sky if p.instance == 0 else frame.instance == p.instance
+        if not mine.any():
+            continue
+        still = p.world_from_local
+        path = scene.actors[p.instance - 1].trajectory if p.instance else None
+        poses = [still if path is None else path.near(t) for t in (first, last)]
+        local = inverse(camera.world_from_cam) @ still
+        back = inverse(local).float()
+        at = points[mine] @ back[:3, :3].T + back[:3, 3]
+        at = at + readout_shift(at, backs[0] @ poses[0], backs[1] @ poses[1], camera, rig.shutter)
+        moved[mine] = at @ local[:3, :3].T.float() + local[:3, 3].float()
+    grid = camera.lens.project(moved) / torch.tensor([camera.width, camera.height]) * 2 - 1
+    grid = torch.nan_to_num(grid, nan=-1.0)[None].float()
+    whole = F.grid_sample(photo.permute(2, 0, 1)[None], grid, mode="bicubic", padding_mode="border", align_corners=False)
+    return whole[0].permute(1, 2, 0).clamp(0, 1)

@@ -1,0 +1,54 @@
+"""The photos that a scene was made from, kept in its folder as `photos/<camera>/<microseconds>.jpg`: references need no recording.
+
+A scene that was moved to another machine, or whose recording is gone, still has them; one without, as of old, simply has no references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from render.references import References, Shot
+from render.video import write_image
+from scenes.atomic import atomic_folder
+from scenes.files import Dropping
+from scenes.scene import Scene
+from scenes.usd_scene import load_recorded
+
+FOLDER = "photos"
+
+
+def keep_photos(folder: Path, photos: Iterable[tuple[str, int, torch.Tensor]]) -> None:
+    """Write camera, moment by the scene's clock and picture `[H, W, 3]` in 0..1 of each photo to a scene's folder, all or none."""
+    with atomic_folder(folder / FOLDER, replace=True) as album:
+        for camera, time_us, rgb in photos:
+            (album / camera).mkdir(exist_ok=True)
+            write_image(album / camera / f"{time_us}.jpg", rgb)
+
+
+def references_of(folder: Path, scene: Scene) -> References | None:
+    """The references of a `scene` that was loaded from a folder, and perhaps changed since; None where no photos were kept."""
+    shots = [
+        Shot(scene.camera(name, int(file.stem)), partial(_read, file))
+        for name in scene.rig
+        for file in sorted((folder / FOLDER / name).glob("*.jpg"))
+    ]
+    if not shots:
+        return None
+    device = scene.background.gaussians.means.device
+    recorded = load_recorded(folder, Dropping()).to(device)
+    return References(shots, recorded, scene)
+
+
+def _read(file: Path, width: int, height: int) -> np.ndarray:
+    try:
+        with Image.open(file) as opened:
+            picture = opened.convert("RGB")
+    except (OSError, SyntaxError, ValueError) as problem:
+        raise ValueError(f"{file} does not decode as an image ({problem}); remove it, and the photo is done without") from None
+    return np.asarray(picture if picture.size == (width, height) else picture.resize((width, height), Image.Resampling.BOX))

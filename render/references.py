@@ -1,0 +1,224 @@
+"""What the photos of a drive know of a rendered view: detail that splats blur, brought there by the render's own depth.
+
+A photo and the render at its place differ by what the splats do not explain. That difference is moved into the view, not the photo
+itself: it has hardly any low frequencies, so nothing jumps where a photo ends, and exposures, edits and shadows of inserted objects stay
+as they were rendered. An actor's difference moves with the actor; where another instance, or nothing that a photo shows, is drawn, there is
+none. Photos are chosen and faded in and out as views of an unstructured lumigraph (Buehler et al. 2001) and summed as a Wiener filter sums
+estimates of known noise, which grows with parallax: it was measured on drive 002's side cameras, on frames that no fit had seen.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from render.flow import correspond
+from render.frame import render_frame
+from render.frame_types import Frame
+from render.rays import camera_rays
+from scenes.asset import Asset
+from scenes.camera import Camera
+from scenes.gaussians import Placed
+from scenes.poses import inverse
+from scenes.scene import Scene
+
+READS = ("rgb", "alpha", "depth", "instance")
+"""Outputs of the frames that references are found for."""
+
+PHOTOS = 3
+"""Photos that a view is given; a further one's score is where they fade to nothing."""
+
+NOISE = 0.2
+"""Error of a moved difference at no parallax, against its size: of 1 / (1 + NOISE) of it one is sure."""
+
+PARALLAX = 0.15
+"""Way from eye to eye, in distances to what is seen, that adds as much error again as the difference is large."""
+
+NEAR, SPEED = 0.5, 2.0
+"""Metres that are near, and metres a second: a photo of another moment counts as farther by what may have moved since."""
+
+FARTHEST = 200.0
+"""Metres at which the sky is taken to be when photos are chosen."""
+
+COVERED, RIM = 0.3, 2
+"""Alpha above which something stands before the sky, and pixels around it whose detail may be its own and go astray with the sky."""
+
+GRID = 12, 20
+"""Points of a view, down and across, by which photos are chosen."""
+
+BORDER = 0.1
+"""Part of a photo's side over which a point counts as leaving it: a step of GRID."""
+
+GONE = -2
+"""Instance of a photo's actor that the frames do not show."""
+
+CARRIED = 0.5
+"""Of the detail of the frame before, moved along: it calms what photos that are faded in and out make flicker."""
+
+KEPT = 12
+"""Photos whose difference is kept for the next frames."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photo that a scene was made from: the scene's camera there, at the photo's own size, and `read(width, height)`, which gives it at
+    a size as uint8 `[H, W, 3]`."""
+
+    camera: Camera
+    read: Callable[[int, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A view from which detail is moved: its camera, the detail `[1, C, H, W]`, depth `[H, W]`, inf at the sky, instances `[H, W]` by the
+    frames' ids, and what was placed there by those ids."""
+
+    camera: Camera
+    detail: torch.Tensor
+    depth: torch.Tensor
+    instance: torch.Tensor
+    placed: list[Placed]
+
+
+class References:
+    """The shots of a scene, for the frames of clips of it."""
+
+    def __init__(self, shots: Sequence[Shot], recorded: Scene, shown: Scene | None = None):
+        """recorded: the scene as it was when the photos were taken; shown: as the frames show it, with edits; the same where None."""
+        self.shots, self.recorded, self.shown = list(shots), recorded, shown or recorded
+        now = {actor.track: (i + 1, actor.asset) for i, actor in enumerate(self.shown.actors)}
+        ids = [_id_of(actor.asset, *now.get(actor.track, (GONE, None))) for actor in recorded.actors]
+        self.ids = torch.tensor([0, *ids, -1])  # the last is the sky's, -1
+        self.eyes = torch.tensor([s.camera.world_from_cam[:3, 3].tolist() for s in shots], dtype=torch.float64).reshape(-1, 3)
+        self.times = torch.tensor([s.camera.time_us for s in shots])
+        self.alike: dict[tuple, list[int]] = {}
+        for i, shot in enumerate(shots):
+            self.alike.setdefault((shot.camera.lens.key(), shot.camera.width, shot.camera.height), []).append(i)
+        self.kept: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
+
+    @torch.no_grad()
+    def along(self, frames: Iterable[Frame], predicted: Sequence[Camera] = ()) -> Iterator[Frame]:
+        """The frames of a clip, which have the outputs READS, each with its `reference` and `trust` as soon as it comes.
+
+        predicted: the clip's cameras, where its photos are to be predicted: then neither a frame's own photo is looked at nor those of the
+        frames to come, whose detail would be carried over to them.
+        """
+        last: _Seen | None = None
+        for i, frame in enumerate(frames):
+            detail = self._detail(frame, predicted[i:])
+            if last is not None:
+                carried, shown = self._moved(frame, last)
+                detail = torch.lerp(detail, carried, CARRIED * shown[..., None])
+            last = self._view(frame, detail, frame.instance, self.shown.placed(frame.camera.time_us))
+            assert frame.rgb is not None
+            difference, trust = detail[..., :3], detail[..., 3]
+            reference = frame.rgb + difference / trust.clamp_min(1e-9)[..., None]
+            yield replace(frame, reference=reference.clamp(0, 1), trust=trust)
+
+    def _detail(self, frame: Frame, predicted: Sequence[Camera]) -> torch.Tensor:
+        """What the photos add to a frame, and how far that is to be trusted, `[H, W, 4]`: the former is weighted by the latter already."""
+        assert frame.rgb is not None and frame.depth is not None
+        total, weight = torch.zeros_like(frame.rgb), torch.zeros_like(frame.depth)
+        distance = frame.depth * camera_rays(frame.camera).to(frame.depth).norm(dim=-1)
+        for index, share in self.chosen(frame, predicted):
+            seen = self._seen(index, frame.camera.width, frame.rgb.device)
+            difference, shown = self._moved(frame, seen)
+            baseline = (self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm().float()
+            parallax = torch.where(_sky(frame), 0.0, baseline / distance)
+            sure = share * shown / (NOISE + parallax / PARALLAX)
+            total += sure[..., None] * difference
+            weight += sure
+        return torch.cat([total, weight[..., None]], -1) / (1 + weight)[..., None]
+
+    def chosen(self, frame: Frame, predicted: Sequence[Camera] = ()) -> list[tuple[int, float]]:
+        """The shots that show most of a frame from nearby, best first, and a share of 0 to 1 for each; continuous along a path; none
+        that was taken as one of `predicted`."""
+        if not self.shots:
+            return []
+        score = self._scores(frame, predicted)
+        best = score.argsort(descending=True)[: PHOTOS + 1]
+        floor = float(score[best[PHOTOS]]) if len(best) > PHOTOS else 0.0
+        room = max(float(score[best[0]]) - floor, 1e-12)
+        return [(int(i), s) for i in best[:PHOTOS] if (s := (float(score[i]) - floor) / room) > 0]
+
+    def _scores(self, frame: Frame, predicted: Sequence[Camera]) -> torch.Tensor:
+        """float64 `[S]`: the share of a frame that each shot shows, as sharply, by how far off it was taken."""
+        camera = frame.camera
+        assert frame.depth is not None
+        y, x = ((torch.arange(n) + 0.5) * side / n for n, side in zip(GRID, (camera.height, camera.width), strict=True))
+        at = y.long()[:, None], x.long()
+        depth = frame.depth.cpu()[at].clamp_max(FARTHEST)
+        points = (camera_rays(camera)[at] * depth[..., None]).reshape(-1, 3).double()
+        points = points @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
+        detail = camera.lens.focal()[0] / camera.width / depth.reshape(-1)
+        shows = torch.zeros(len(self.shots), dtype=torch.float64)
+        for (_, width, height), indices in self.alike.items():
+            lens = self.shots[indices[0]].camera.lens
+            back = torch.stack([inverse(self.shots[i].camera.world_from_cam) for i in indices])
+            local = points @ back[:, :3, :3].transpose(1, 2) + back[:, None, :3, 3]
+            pixels = lens.project(local)
+            side = torch.tensor([width, height])
+            # across the border by and by: rows of points that leave at once would make photos jump
+            inside = (torch.minimum(pixels, side - pixels) / (BORDER * side) + 0.5).clamp(0, 1).prod(-1) * lens.valid(local)
+            there = lens.focal()[0] / width / lens.depth(local).clamp_min(1e-6)
+            shows[indices] = (inside * (there / detail).clamp_max(1)).mean(-1)
+        off = (self.eyes - camera.world_from_cam[:3, 3]).norm(dim=-1) + SPEED * 1e-6 * (self.times - camera.time_us).abs()
+        for other in predicted:
+            shows[((self.eyes - other.world_from_cam[:3, 3]).norm(dim=-1) < 1e-6) & (self.times == other.time_us)] = 0
+        return shows / (NEAR + off)
+
+    def _seen(self, index: int, width: int, device: torch.device) -> _Seen:
+        """What a shot adds to the splats, at most as wide as the frames, so that nothing is skipped between its pixels."""
+        key = (index, width)
+        if key not in self.kept:
+            shot = self.shots[index]
+            shrink = min(1.0, width / shot.camera.width)
+            camera = shot.camera.resized(round(shot.camera.width * shrink), round(shot.camera.height * shrink))
+            frame = render_frame(self.recorded, camera, READS)
+            assert frame.rgb is not None and frame.instance is not None
+            photo = torch.from_numpy(np.array(shot.read(camera.width, camera.height))).to(device).float() / 255
+            placed = [replace(p, instance=int(self.ids[p.instance])) for p in self.recorded.placed(camera.time_us)]
+            instance = self.ids.to(device)[frame.instance.long()]
+            self.kept[key] = self._view(frame, photo - frame.rgb.clamp(0, 1), instance, placed)
+        self.kept.move_to_end(key)
+        while len(self.kept) > KEPT:
+            self.kept.popitem(last=False)
+        return self.kept[key]
+
+    def _view(self, frame: Frame, detail: torch.Tensor, instance: torch.Tensor | None, placed: list[Placed]) -> _Seen:
+        assert frame.depth is not None and instance is not None
+        depth = torch.where(_sky(frame), torch.inf, frame.depth)
+        return _Seen(frame.camera, detail.permute(2, 0, 1)[None], depth, torch.where(_mixed(frame), GONE, instance), placed)
+
+    def _moved(self, frame: Frame, seen: _Seen) -> tuple[torch.Tensor, torch.Tensor]:
+        """A view's detail as the frame sees it `[H, W, C]`, and where it shows the same surface `[H, W]`, 0 or 1."""
+        assert frame.depth is not None and frame.instance is not None
+        there = seen.camera
+        found = correspond(self.shown.placed(frame.camera.time_us), frame.camera, frame.depth, frame.instance, seen.placed, there)
+        side = torch.tensor([there.width, there.height], device=found.pixels.device)
+        grid = torch.nan_to_num(found.pixels / side * 2 - 1, nan=-9.0)[None].float()
+        moved = F.grid_sample(seen.detail, grid, mode="bicubic", padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
+        who = F.grid_sample(seen.instance[None, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)[0, 0]
+        return moved, (found.visible(seen.depth) & (who == frame.instance) & ~_mixed(frame)).float()
+
+
+def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:
+    """An actor's instance in the frames; GONE where these show none of its track, or put another thing in its place."""
+    return instance if shown is not None and torch.equal(asset.gaussians.means, shown.gaussians.means) else GONE
+
+
+def _sky(frame: Frame) -> torch.Tensor:
+    assert frame.depth is not None and frame.instance is not None
+    return frame.depth.isinf() | (frame.instance < 0)
+
+
+def _mixed(frame: Frame) -> torch.Tensor:
+    """Sky, bool `[H, W]`, before which wires and twigs stand or near which anything does."""
+    assert frame.alpha is not None and frame.instance is not None
+    covered = F.max_pool2d((frame.alpha > COVERED).float()[None, None], 2 * RIM + 1, 1, RIM)[0, 0] > 0
+    return covered & (frame.instance < 0)

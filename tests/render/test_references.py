@@ -1,0 +1,139 @@
+"""What photos add to rendered views."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import render_frame
+from render.album import keep_photos, references_of
+from render.compare import psnr
+from render.references import GONE, READS, References, Shot
+from render.video import to_bytes
+from scenes.edit import Edit
+from scenes.files import load, save
+from scenes.poses import translation
+from scenes.scene import Scene
+from scenes.usd_edit import add_change
+
+CAMERA = "front_camera"
+
+
+def blurred(scene: Scene) -> Scene:
+    """The scene with every splat half as large again: what the photos show, it does not."""
+
+    def swollen(g):
+        return replace(g, log_scales=g.log_scales + 0.4)
+
+    actors = tuple(replace(a, asset=replace(a.asset, gaussians=swollen(a.asset.gaussians))) for a in scene.actors)
+    return replace(scene, background=replace(scene.background, gaussians=swollen(scene.background.gaussians)), actors=actors)
+
+
+def shots(scene: Scene, which=range(8)) -> list[Shot]:
+    made = []
+    for i in which:
+        camera = scene.camera(CAMERA, int(scene.frame_times(CAMERA)[i]))
+        made.append(Shot(camera, lambda w, h, c=camera: to_bytes(render_frame(scene, c.resized(w, h)).rgb)))
+    return made
+
+
+def better(frame) -> torch.Tensor:
+    return torch.lerp(frame.rgb.clamp(0, 1), frame.reference, frame.trust[..., None])
+
+
+def views(scene, times, shift=0.0):
+    ego = scene.ego.shifted(lateral=shift)
+    return [render_frame(scene, scene.camera(CAMERA, int(t), ego), READS) for t in times]
+
+
+@pytest.fixture(scope="module")
+def unclear(street):
+    return blurred(street)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_photos_bring_views_nearer_to_the_truth(street, unclear, shift):
+    times = street.frame_times(CAMERA)[2:5]
+    found = list(References(shots(street), unclear).along(views(unclear, times, shift)))
+    truth = [f.rgb for f in views(street, times, shift)]
+    assert all(psnr(better(f), t) > psnr(f.rgb, t) + 1 for f, t in zip(found, truth, strict=True))
+
+
+def test_a_predicted_frames_photo_and_those_to_come_are_not_looked_at(street, unclear):
+    frames = views(unclear, street.frame_times(CAMERA)[3:6])
+    cameras = [f.camera for f in frames]
+    alone = References(shots(street, (0, 1, 2, 6, 7)), unclear)
+    (first,) = References(shots(street), unclear).along(frames[:1], cameras)
+    (wanted,) = alone.along(frames[:1])
+    assert torch.equal(first.reference, wanted.reference) and torch.equal(first.trust, wanted.trust)
+
+
+def test_without_photos_nothing_is_trusted(street):
+    (frame,) = References([], street).along(views(street, street.frame_times(CAMERA)[:1]))
+    assert not frame.trust.any() and torch.equal(frame.reference, frame.rgb.clamp(0, 1))
+
+
+def test_a_splat_scene_that_explains_its_photos_is_left_nearly_as_it_is(street):
+    (frame,) = References(shots(street), street).along(views(street, street.frame_times(CAMERA)[3:4], 0.5))
+    assert (better(frame) - frame.rgb.clamp(0, 1)).abs().max() < 2 / 255
+
+
+def test_shares_of_photos_change_little_along_a_path(street, unclear):
+    references = References(shots(street), unclear)
+    start, end = (int(street.frame_times(CAMERA)[i]) for i in (2, 3))
+    shares = []
+    for t in range(start, end, 1000):
+        depth = torch.full((54, 96), 12.0)
+        frame = replace(render_frame(unclear, street.camera(CAMERA, t)), depth=depth)
+        share = torch.zeros(8)
+        for index, value in references.chosen(frame):
+            share[index] = value
+        shares.append(share)
+    assert torch.stack(shares).diff(dim=0).abs().max() < 0.06
+
+
+def test_an_actor_that_was_removed_leaves_no_ghost(street, unclear):
+    empty = replace(unclear, actors=())
+    references = References(shots(street), unclear, empty)
+    assert references.ids.tolist() == [0, GONE, -1]
+    times = street.frame_times(CAMERA)[6:8]
+    found = list(references.along(views(empty, times)))
+    there = [f.instance == 1 for f in views(unclear, times)]
+    truth = [f.rgb for f in views(replace(street, actors=()), times)]
+    for f, car, t in zip(found, there, truth, strict=True):
+        assert car.sum() > 20 and psnr(better(f), t, car) > psnr(f.rgb, t, car) - 0.5
+
+
+def test_what_stands_in_an_actors_place_is_not_given_its_detail(street):
+    (actor,) = street.actors
+    other = replace(actor.asset, gaussians=actor.asset.gaussians.select(torch.arange(50)))
+    assert References([], street, replace(street, actors=(replace(actor, asset=other),))).ids.tolist() == [0, GONE, -1]
+
+
+def test_an_actors_detail_moves_with_it(street, unclear):
+    def aside(scene):
+        (actor,) = scene.actors
+        path = replace(actor.trajectory, world_from_body=translation(0.0, 1.0, 0.0) @ actor.trajectory.world_from_body)
+        return replace(scene, actors=(replace(actor, trajectory=path),))
+
+    (frame,) = References(shots(street), unclear, aside(unclear)).along(views(aside(unclear), street.frame_times(CAMERA)[7:8]))
+    (truth,) = views(aside(street), street.frame_times(CAMERA)[7:8])
+    car = frame.instance == 1
+    assert psnr(better(frame), truth.rgb, car) > psnr(frame.rgb, truth.rgb, car) + 0.5
+
+
+def test_a_scene_folder_keeps_its_photos_and_knows_what_was_edited(street, tmp_path):
+    folder = tmp_path / "s1"
+    save(street, folder)
+    assert references_of(folder, street) is None
+    pictures = [(CAMERA, s.camera.time_us, torch.rand(54, 96, 3)) for s in shots(street)]
+    keep_photos(folder, pictures)
+    add_change(folder, "gone", load(folder), Edit(remove=("veh_1",)), {})
+    edited = load(folder)
+    references = references_of(folder, edited)
+    assert not edited.actors and len(references.shots) == 8 and [a.track for a in references.recorded.actors] == ["veh_1"]
+    assert references.shots[0].read(48, 27).shape == (27, 48, 3)
+    next((folder / "photos" / CAMERA).iterdir()).write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="photo is done without"):
+        for shot in references.shots:
+            shot.read(96, 54)
