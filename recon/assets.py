@@ -161,7 +161,7 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate
         flaw = f"{sight.views} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
-    whole, mirrored = (completed(cut, sight.left, sight.right) if not flaw else (cut, False))
+    whole, mirrored = completed(cut, sight.left, sight.right) if not flaw else (cut, False)
     if not flaw and len(whole) < FEWEST_SPLATS:
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None

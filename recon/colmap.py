@@ -32,9 +32,7 @@ def find_model(folder: Path) -> Path | None:
     return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")), default=None)
 
 
-def read_colmap(
-    path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, pictures: Path | None = None
-) -> Log:
+def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, pictures: Path | None = None) -> Log:
     """The drive in a COLMAP workspace: a model and the pictures it registers.
 
     camera_height: metres of the cameras above the ground; metres_per_unit: of the model's unit; without either the log is not

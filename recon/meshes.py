@@ -234,14 +234,16 @@ def likeness(splats: Gaussians, traced: TracedMesh, cameras: list[Camera]) -> tu
 
 
 def asset_of_mesh(
-    mesh: Mesh, label: str, meta: dict, config: MeshFit = MeshFit(), report: Callable[[int, float], None] = lambda *_: None  # noqa: B008
+    mesh: Mesh,
+    label: str,
+    meta: dict,
+    config: MeshFit = MeshFit(),
+    report: Callable[[int, float], None] = lambda *_: None,  # noqa: B008
 ) -> Asset:
     """A splat asset that looks as the mesh does; `meta["psnr_unseen"]` says how well, in dB over the mesh's pixels, from 8 new views."""
     size = mesh.vertices.max(0).astype(np.float64) - mesh.vertices.min(0)
     traced = TracedMesh(mesh)
-    splats = fit_to_mesh(
-        splats_of_mesh(mesh, config.splats), traced, views_around(size, config.views, config.size), config, report
-    )
+    splats = fit_to_mesh(splats_of_mesh(mesh, config.splats), traced, views_around(size, config.views, config.size), config, report)
     whole, own = likeness(splats, traced, views_around(size, 8, config.size, offset=0.37))
     facts: dict = {"psnr_unseen": round(own, 2), "psnr_unseen_whole_picture": round(whole, 2), "views": config.views}
     facts["ground_linear"] = [ASPHALT * SKY] * 3

@@ -66,7 +66,9 @@ class Motion:
         first, last = torch.from_numpy(self._first[:-1]), torch.from_numpy(self._first[1:] - 1)
         self._knots, self._shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)]), share.float()[..., None]
         self._drifts = torch.stack([drift(knots, times) for knots in actors], 1) if actors else torch.zeros(len(times), 0, 6)
-        self._covers = torch.tensor([[k.trajectory.covers(t) for k in actors] for t in times]).reshape(len(times), len(actors))
+        self._covers = torch.tensor([[k.trajectory.covers(t) for k in actors] for t in times], dtype=torch.bool).view(
+            len(times), len(actors)
+        )
         self._radii = torch.tensor([float(np.linalg.norm(box)) for box in boxes], dtype=torch.float64)
 
     def speeds(self) -> torch.Tensor:

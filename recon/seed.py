@@ -148,7 +148,7 @@ def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray
     level = np.round(2 * np.log2(np.maximum(k * distance / 0.04, 1.0))).astype(np.int64)
     side = 0.04 * 2.0 ** (level / 2)
     cell = np.floor(xyz / side[:, None]).astype(np.int64) + (1 << 17)
-    key = ((level << 54) | (cell[:, 0] << 36) | (cell[:, 1] << 18) | cell[:, 2])
+    key = (level << 54) | (cell[:, 0] << 36) | (cell[:, 1] << 18) | cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1]), side
 
 

@@ -127,6 +127,7 @@ def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np
         when = frames.of(0)
         nearest = min(when, key=lambda v: _separation(log, track, v)).index if when else 0
         points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), nearest)])
+
     def pose(view: View) -> torch.Tensor | None:
         return trajectory.at(view.time_us) if trajectory.covers(view.time_us) else None
 
@@ -151,7 +152,7 @@ def box_skin(size: np.ndarray, step: float) -> np.ndarray:
     """Points on sides and top of a box `[length, width, height]` whose base centre is the origin."""
     axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in size]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    on = (np.abs(np.abs(grid) - size / 2) < 1e-9)
+    on = np.abs(np.abs(grid) - size / 2) < 1e-9
     return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from render.kernels.bin import WITH_SLOTS, deal, emit_pairs
@@ -31,11 +32,14 @@ class TileLists:
 
 def depth_order(keys: torch.Tensor) -> torch.Tensor:
     """Indices int32 of the records that are not culled, by rising depth, ties by index."""
-    visible = torch.nonzero(keys != int(CULLED)).flatten()
     if keys.device.type == "cpu":  # key and index in one number: its sort on a CPU's vectors beats a radix sort of pairs by two
-        both = (keys.index_select(0, visible).long() << 32) | visible
-        both.numpy().sort()
-        return both.to(torch.int32)
+        culled = keys.numpy()
+        (there,) = np.nonzero(culled != int(CULLED))
+        pairs = np.empty((len(there), 2), dtype="<i4")
+        pairs[:, 0], pairs[:, 1] = there, culled[there]
+        pairs.reshape(-1).view("<i8").sort()
+        return torch.from_numpy(pairs[:, 0].copy())
+    visible = torch.nonzero(keys != int(CULLED)).flatten()
     n = visible.shape[0]
     pair = keys.new_empty(2, 2 * n)
     pair[0, :n], pair[1, :n] = keys[visible], visible

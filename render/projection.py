@@ -14,10 +14,9 @@ import warp as wp
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.lenses.optics import PARAMS, Optics
 from render.kernels.lenses.optics import params as vec_params
-from render.kernels.motion import Motion
 from render.kernels.project import project, project_backward
 from render.kernels.project_lens import POSE, lens_kernels
-from render.kernels.types import RAY_BOUNDS, Pose, View
+from render.kernels.types import RAY_BOUNDS, View
 from scenes.camera import Camera
 from scenes.gaussians import Placed, SplatModel
 from scenes.lenses import Equirectangular, Lens, OpenCV, Pinhole
@@ -33,8 +32,11 @@ NEAR = 0.1
 LARGEST_TURN = math.radians(60)
 """How far a pose may turn while the image is read out: beyond, its cubic (`kernels/motion.py`) is off by more than 6e-4 of a radian."""
 
-_NODES = torch.linspace(0, 1, 4, dtype=torch.float64)
-_CUBIC = torch.linalg.inv(_NODES[:, None] ** torch.arange(4))
+POWERS = 4
+"""Of the readout's share, with which a pose that moves is written."""
+
+_NODES = torch.linspace(0, 1, POWERS, dtype=torch.float64)
+_CUBIC = torch.linalg.inv(_NODES[:, None] ** torch.arange(POWERS))
 """Coefficients of the cubic through values at the nodes."""
 
 
@@ -119,34 +121,36 @@ def projection(lens: type[Lens], rolling: bool) -> Projection:
     if lens is Pinhole and not rolling:
         return Projection(project, project_backward, 1, 4)
     kernels = lens_kernels(LENS_FUNCTIONS[lens.kind], rolling)
-    return Projection(kernels.forward, kernels.backward, 4 if rolling else 1, PARAMS, 2 if lens is Equirectangular else 1)
+    return Projection(kernels.forward, kernels.backward, POWERS if rolling else 1, PARAMS, 2 if lens is Equirectangular else 1)
 
 
-def uniforms(settings: Settings, lens: Lens, pose: torch.Tensor, instance: int, sh_count: int, copy: int) -> list:
-    """What the kernels of `projection` are told of one instance with `pose` `[C, 4, 4]`."""
-    view = _view(replace(settings, mask=None), lens, sh_count)  # a key that is kept must not keep a mask
+def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -> list:
+    """What the kernels of `projection` are told of the camera and, as rows, of all instances with `poses` `[P, C, 4, 4]`."""
+    view = _view(replace(settings, mask=None, instances=()), lens)  # a key that is kept must not keep a mask
+    instances = torch.tensor(settings.instances, dtype=torch.float64)[:, None]
     if isinstance(lens, Pinhole) and not settings.rolling:
-        return [view, _pose(pose[0], instance)]
+        rotation, translation = poses[:, 0, :3, :3], poses[:, 0, :3, 3]
+        eye = -(rotation.mT @ translation[..., None])[..., 0]
+        return [view, torch.cat([rotation.flatten(1), translation, eye, instances], 1)]
     optics = Optics()
     optics.p = vec_params(*lens.params().tolist(), *([0.0] * (PARAMS - len(lens.params()))))
     optics.cos_limit, optics.sin_limit = math.cos(lens.limit()), math.sin(lens.limit())
     optics.period = float(lens.period()) if isinstance(lens, Equirectangular) else 0.0
-    motion = Motion()
-    for k, p in enumerate(pose):
-        setattr(motion, f"r{k}", wp.mat33d(*p[:3, :3].flatten().tolist()))
-        setattr(motion, f"t{k}", wp.vec3d(*p[:3, 3].tolist()))
-    motion.axis = 0 if settings.shutter == "columns" else 1
-    motion.extent = float(settings.width if settings.shutter == "columns" else settings.height)
-    motion.instance, motion.copy = float(instance), copy
-    return [view, optics, motion]
+    powers = torch.cat([poses[..., :3, :3].flatten(2), poses[..., :3, 3]], 2)
+    powers = torch.nn.functional.pad(powers, (0, 0, 0, POWERS - powers.shape[1])).flatten(1)
+    by_rows = settings.shutter != "columns"
+    shutter = torch.tensor([by_rows, settings.height if by_rows else settings.width], dtype=torch.float64).expand(len(poses), 2)
+    rows = [torch.cat([powers, shutter, instances, torch.full_like(instances, copy)], 1) for copy in range(copies)]
+    return [view, optics, torch.cat(rows)]
 
 
 @lru_cache(maxsize=16)
-def _view(settings: Settings, lens: Lens, sh_count: int) -> View:
+def _view(settings: Settings, lens: Lens) -> View:
     """The same for all instances of a frame and all frames of a camera, so kept: nobody writes to it."""
     v = View()
     if isinstance(lens, Pinhole):
-        v.fx, v.fy, v.cx, v.cy = lens.params().tolist()
+        v.fx, v.fy, *_ = params = lens.params().tolist()
+        v.lens = wp.vec4d(*params)
     if isinstance(lens, Pinhole | OpenCV):
         left, right, top, bottom = view_box(lens, settings.width, settings.height)
         half_x, half_y = 0.15 * (right - left), 0.15 * (bottom - top)  # the 0.3 of 1.3 tan, on either side
@@ -157,15 +161,5 @@ def _view(settings: Settings, lens: Lens, sh_count: int) -> View:
     v.widen = RAY_BOUNDS if settings.model.response == "ray" else 1.0
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
     v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
-    v.unscented, v.antialias, v.sh_count = int(settings.model.projection == "ut"), int(settings.model.antialias), sh_count
+    v.unscented, v.antialias = int(settings.model.projection == "ut"), int(settings.model.antialias)
     return v
-
-
-def _pose(cam_from_local: torch.Tensor, instance: int) -> Pose:
-    p = Pose()
-    rows = cam_from_local[:3].tolist()
-    p.rotation = wp.mat33(*(x for row in rows for x in row[:3]))
-    p.translation = wp.vec3(*(row[3] for row in rows))
-    p.eye = wp.vec3(*(-(cam_from_local[:3, :3].T @ cam_from_local[:3, 3])).tolist())
-    p.instance = float(instance)
-    return p

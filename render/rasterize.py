@@ -11,7 +11,7 @@ import torch
 from render.bands import without_zero_bands
 from render.bridge import Rasterize
 from render.channels import SUMMED, Features, channel_fields, unit
-from render.cull import differentiated, in_sight
+from render.cull import differentiated, in_sight, those_in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
 from render.frames import canonical_frames
@@ -89,13 +89,13 @@ def rasterize(
 
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
-    seen = placed
+    seen = None
     if not differentiated(placed, camera):
-        seen = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
+        placed = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
         if not any(o in outputs for o in SUMMED):
-            seen = in_sight(seen, camera, model)
-    cam_from_local = poses(camera, seen)
-    summed = channel_fields(outputs, seen, cam_from_local[:, 0], features)
+            seen = in_sight(placed, camera, model)
+    cam_from_local = poses(camera, placed)
+    summed = channel_fields(outputs, placed, cam_from_local[:, 0], features)
     channels = torch.cat(list(summed.values()), 1) if summed else None
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
     settings = Settings(
@@ -104,7 +104,7 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         model=model,
         config=config,
         wanted=Wanted("depth" in outputs or flows, "median_depth" in outputs, "instance" in outputs or flows, bool(summed)),
-        instances=tuple(p.instance for p in seen),
+        instances=tuple(p.instance for p in placed),
         lens=type(camera.lens),
         shutter=camera.shutter,
         rolling=moves(camera, placed),
@@ -112,10 +112,14 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         mask=mask,
         gradients=torch.is_grad_enabled(),
     )
-    fields = [t for p in seen for t in p.gaussians.tensors().values()]
-    frames, rays = _along_rays(seen, camera, settings) if settings.by_rays else (None, None)
+    frames = rays = None
+    if settings.by_rays:
+        if seen is not None:  # what each splat has for this is dear, and not made for those that nobody sees
+            placed, seen = those_in_sight(placed, seen), None
+        frames, rays = _along_rays(placed, camera, settings)
+    fields = [t for p in placed for t in p.gaussians.tensors().values()]
     lens = camera.lens.params()
-    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, cam_from_local, lens, channels, frames, rays, *fields)
+    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
 
     frame: dict[str, torch.Tensor] = {"alpha": alpha, "instance": instance}
     frame["rgb"] = rgb.permute(1, 2, 0)
@@ -184,8 +188,6 @@ def _check(placed, camera, outputs, flow_to, model, config) -> None:
         if placed[0].gaussians.device.type != "cpu":
             raise ValueError(f"{which} is drawn on the CPU only; move the splats there, or use the default")
     check_projection(camera, placed, model)
-    if flow_to and moves(camera, placed):
-        raise ValueError('flow is not drawn while a shutter moves; use shutter="global" and no end poses')
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")

@@ -85,8 +85,8 @@ class Settings:
 
     @property
     def squarings(self) -> int:
-        """How often exp's polynomial is squared, so that its argument stays within 0.75."""
-        return max(3, math.ceil(math.log2(-math.log(self.cutoff) / 0.75)))
+        """How often exp's polynomial is squared, so that its argument stays within 1.5."""
+        return max(2, math.ceil(math.log2(-math.log(self.cutoff) / 1.5)))
 
     @property
     def least_opacity(self) -> float:

@@ -95,4 +95,3 @@ def in_model(world_from_cam: torch.Tensor) -> torch.Tensor:
     pose = TURN @ world_from_cam
     pose[:3, 3] = UNIT * (TURN[:3, :3] @ world_from_cam[:3, 3]) + TURN[:3, 3]
     return pose
-

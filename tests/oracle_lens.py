@@ -1,4 +1,5 @@
-"""Truth for any lens and for shutters that move: sigma points through the lens itself, Jacobians by autograd, readouts by fixed point.
+"""Truth for any lens and for shutters that move: sigma points through the lens itself, Jacobians by autograd, readouts by fixed point or
+by halving.
 
 Float64 torch, differentiable by autograd; where an equation is solved, one Newton step after the solution carries the gradients.
 """
@@ -35,10 +36,10 @@ def transformed(pose: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 
 def readout(lens: Lens, camera: Camera, pose: PoseAt, x: torch.Tensor, shift: torch.Tensor, moving: bool) -> torch.Tensor:
-    """The share `[...]` of the readout at which local points `[..., 3]`, moved by `shift` in the camera, are seen."""
-    s = torch.full(x.shape[:-1], 0.5, dtype=torch.float64)
+    """Share `[...]` of the readout at which local points `[..., 3]`, moved by `shift` in the camera, are seen: the first of several."""
+    s = torch.zeros(x.shape[:-1], dtype=torch.float64)
     if not moving:
-        return torch.zeros_like(s)
+        return s
     axis, extent = (0, camera.width) if camera.shutter == "columns" else (1, camera.height)
 
     def where(share):
@@ -47,6 +48,14 @@ def readout(lens: Lens, camera: Camera, pose: PoseAt, x: torch.Tensor, shift: to
     with torch.no_grad():
         for _ in range(100):
             s = where(s).nan_to_num(0.5).clamp(0, 1)
+        low, high = torch.zeros_like(s), torch.ones_like(s)
+        for _ in range(60):  # where the point comes so fast that this leads nowhere
+            middle = 0.5 * (low + high)
+            late = where(middle).nan_to_num(0.5).clamp(0, 1) > middle
+            low, high = torch.where(late, middle, low), torch.where(late, high, middle)
+        found = (where(s).nan_to_num(0.5).clamp(0, 1) - s).abs() < 1e-9
+        halved = torch.where(low == 0, 0.0, torch.where(high == 1, 1.0, 0.5 * (low + high)))
+        s = torch.where(found, s, halved)
     with torch.enable_grad():
         leaf = s.detach().requires_grad_()
         (rate,) = torch.autograd.grad(where(leaf).sum(), leaf)

@@ -7,7 +7,7 @@ Room for a splat's entries is set aside by the box around its ellipse.
 
 import warp as wp
 
-from render.kernels.types import INV_C, INV_K, OPTIONS, S_MAX, SLACK, TILE, Y_AT_EXT, Y_EXT, H, M, Window, X, Y
+from render.kernels.types import OPTIONS, S_MAX, SLACK, TILE, Y_AT_EXT, Y_EXT, H, K, M, Window, X, Y
 
 wp.set_module_options(OPTIONS)
 
@@ -43,7 +43,7 @@ def within(span: wp.vec2i, start: int, tiles: int):
 @wp.func
 def columns_of(records: wp.array2d[float], j: int, ty: int):
     """First and last tile of tile row ty that the ellipse reaches: its extreme x over the row's span of y."""
-    inv_k = records[j, INV_K]
+    inv_k = 1.0 / records[j, K]
     m = records[j, M]
     h = records[j, H]
     s_max = records[j, S_MAX]
@@ -124,8 +124,10 @@ def set_room_aside(records: wp.array2d[float], counts: wp.array[int], window: Wi
     j = first + wp.tid()
     room[j] = 0
     if counts[j] > 0:
-        inv_c = records[j, INV_C]
-        reach = wp.sqrt(records[j, S_MAX] * inv_c / records[j, H]) * records[j, INV_K] / inv_c
+        k = records[j, K]
+        m = records[j, M]
+        h = records[j, H]
+        reach = wp.sqrt(records[j, S_MAX] * (k * k * m * m + h) / h) / k
         rows = within(span_of(records[j, Y], ROOM * records[j, Y_EXT] + SLACK), window.top, window.tiles_y)
         columns = within(span_of(records[j, X], ROOM * reach + SLACK), window.left, window.tiles_x)
         room[j] = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)

@@ -30,6 +30,8 @@ from render.kernels.types import (
     RED,
     S_MAX,
     TILE,
+    X_REST,
+    Y_REST,
     H,
     K,
     M,
@@ -141,8 +143,8 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     record = terms[at + q]
                     bits = meets[BATCH * band + q]
                     rows = TILE * (at + BATCH + 2 * q)
-                    px = record[X] - x0
-                    py = record[Y] - y0
+                    px = (record[X] - x0) + record[X_REST]
+                    py = (record[Y] - y0) + record[Y_REST]
                     k = record[K]
                     m = record[M]
                     s_max = record[S_MAX]

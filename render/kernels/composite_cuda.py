@@ -28,6 +28,8 @@ from render.kernels.types import (
     RED,
     S_MAX,
     WHO,
+    X_REST,
+    Y_REST,
     H,
     K,
     M,
@@ -71,8 +73,8 @@ def composite_blocks(wanted: Wanted, tile_size: int):
             if t < termination:
                 break
             i = ids[n]
-            dy = y - records[i, Y]
-            u = (x - records[i, X] - records[i, M] * dy) * records[i, K]
+            dy = (y - records[i, Y]) - records[i, Y_REST]
+            u = ((x - records[i, X]) - records[i, X_REST] - records[i, M] * dy) * records[i, K]
             s = u * u + records[i, H] * dy * dy
             if s < records[i, S_MAX]:
                 a = wp.min(records[i, OPACITY] * wp.exp(-s), alpha_max)
@@ -144,8 +146,8 @@ def composite_blocks_gradient(wanted: Wanted, tile_size: int):
             m = records[i, M]
             h = records[i, H]
             opacity = records[i, OPACITY]
-            dy = y - records[i, Y]
-            offset = x - records[i, X] - m * dy
+            dy = (y - records[i, Y]) - records[i, Y_REST]
+            offset = (x - records[i, X]) - records[i, X_REST] - m * dy
             u = offset * k
             s = u * u + h * dy * dy
             w = float(0.0)

@@ -49,6 +49,8 @@ from render.kernels.types import (
     RED,
     TILE,
     WHO,
+    X_REST,
+    Y_REST,
     H,
     K,
     M,
@@ -328,9 +330,10 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         else:
                             k1 = wp.float64(record[K])
                             m1 = wp.float64(record[M])
-                            dy = wp.float64(y - record[Y])
+                            above = (y - record[Y]) - record[Y_REST]
+                            dy = wp.float64(above)
                             ds64 = lanes64(ds)
-                            x = lanes64(column - lanes(record[X] - x0 + record[M] * (y - record[Y])))
+                            x = lanes64(column - lanes((record[X] - x0) + record[X_REST] + record[M] * above))
                             slope = TWO * k1 * k1 * wp.dot(ds64, x)
                             per_y = dy * wp.dot(ds64, one64)
                             sums[band, j, G_X] = sums[band, j, G_X] - slope

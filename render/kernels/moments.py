@@ -16,6 +16,8 @@ import warp as wp
 
 from render.kernels.types import NEAREST, ROOT3, View
 
+SIXTH_OF_ROOT3 = wp.constant(3.0**0.5 / 6.0)
+
 vec_axis = wp.types.vector(length=8, dtype=wp.float32)
 
 
@@ -35,7 +37,8 @@ class Axis:
 class Footprint:
     """The 2D Gaussian before dilation; det0 is the determinant of its covariance."""
 
-    n: wp.vec2  # where on the image plane z = 1 the Jacobian is taken
+    along: wp.vec2  # where the centre's ray meets the plane z = 1
+    n: wp.vec2  # where the Jacobian is taken there
     u: Axis
     v: Axis
     w: Axis
@@ -62,10 +65,9 @@ def project_axis(offset: wp.vec3, n: wp.vec2, z: float, view: View):
     else:
         a.far_z = wp.max(z + ROOT3 * offset[2], NEAREST * z)
         a.near_z = wp.max(z - ROOT3 * offset[2], NEAREST * z)
-        r_far = ROOT3 / a.far_z
-        r_near = ROOT3 / a.near_z
-        a.w = (r_far * r_far + r_near * r_near) / 6.0
-        a.b = ROOT3 * (a.near_z - a.far_z) / (6.0 * a.near_z * a.far_z)
+        both = 1.0 / (a.near_z * a.far_z)  # one division for all: they are what takes the time here
+        a.w = 0.5 * (a.near_z * a.near_z + a.far_z * a.far_z) * both * both
+        a.b = SIXTH_OF_ROOT3 * (a.near_z - a.far_z) * both
     return a
 
 
@@ -74,7 +76,8 @@ def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
     """axes: the splat's principal directions in the camera, as columns; scale in metres."""
     f = Footprint()
     z = t[2]
-    f.n = wp.vec2(wp.clamp(t[0] / z, view.clamp_left, view.clamp_right), wp.clamp(t[1] / z, view.clamp_top, view.clamp_bottom))
+    f.along = wp.vec2(t[0] / z, t[1] / z)
+    f.n = wp.vec2(wp.clamp(f.along[0], view.clamp_left, view.clamp_right), wp.clamp(f.along[1], view.clamp_top, view.clamp_bottom))
     f.u = project_axis(scale[0] * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
     f.v = project_axis(scale[1] * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
     f.w = project_axis(scale[2] * wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)

@@ -6,6 +6,8 @@ it is off by at most a^4 / 1900, 5e-9 for 100 degrees a second over 33 ms. A glo
 
 import warp as wp
 
+from render.kernels.types import matrix_at, vector_at
+
 
 @wp.struct
 class Motion:
@@ -43,3 +45,22 @@ def rotation_rate(m: Motion, s: wp.float64):
 @wp.func
 def translation_rate(m: Motion, s: wp.float64):
     return m.t1 + s * (wp.float64(2.0) * m.t2 + s * wp.float64(3.0) * m.t3)
+
+
+@wp.func
+def motion_of(rows: wp.array2d[wp.float64], d: int):
+    """Row d: for each power its rotation (row major) and translation, then axis, extent, instance, copy."""
+    m = Motion()
+    m.r0 = matrix_at(rows, d, 0)
+    m.t0 = vector_at(rows, d, 9)
+    m.r1 = matrix_at(rows, d, 12)
+    m.t1 = vector_at(rows, d, 21)
+    m.r2 = matrix_at(rows, d, 24)
+    m.t2 = vector_at(rows, d, 33)
+    m.r3 = matrix_at(rows, d, 36)
+    m.t3 = vector_at(rows, d, 45)
+    m.axis = int(rows[d, 48])
+    m.extent = rows[d, 49]
+    m.instance = float(rows[d, 50])
+    m.copy = int(rows[d, 51])
+    return m

@@ -9,7 +9,7 @@ import warp as wp
 from render.kernels.fields import exp_scale, rotation, rotation_backward, sigmoid
 from render.kernels.moments import Footprint, axis_backward, cross2, cross_gradient, footprint, gradient_of_quadratic, quadratic
 from render.kernels.splat import Ellipse, colour_backward, cull, gather, no_gradient, write_splat
-from render.kernels.types import FARTHEST, OPTIONS, REACH, UNIFORM_GRADIENTS, Pose, View
+from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, OPTIONS, REACH, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
 
@@ -20,7 +20,8 @@ vec_uniform = wp.types.vector(length=UNIFORM_GRADIENTS, dtype=wp.float32)
 def beyond(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, side: wp.vec3):
     """Whether the splat's ellipsoid lies wholly on the positive side of the plane through the eye with normal `side`."""
     along = wp.cw_mul(wp.transpose(axes) * side, scale)
-    return wp.dot(side, t) > REACH * wp.length(along)
+    distance = wp.dot(side, t)
+    return distance > 0.0 and distance * distance > REACH * REACH * wp.dot(along, along)
 
 
 @wp.func
@@ -30,10 +31,10 @@ def in_view(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
 
 
 @wp.func
-def ellipse(t: wp.vec3, f: Footprint, view: View):
+def ellipse(t: wp.vec3d, f: Footprint, view: View):
     e = Ellipse()
-    e.x = view.fx * t[0] / t[2] + view.cx + f.mu[0]
-    e.y = view.fy * t[1] / t[2] + view.cy + f.mu[1]
+    e.x = view.lens[0] * (t[0] / t[2]) + view.lens[2] + wp.float64(f.mu[0])
+    e.y = view.lens[1] * (t[1] / t[2]) + view.lens[3] + wp.float64(f.mu[1])
     e.xx = f.xx
     e.xy = f.xy
     e.yy = f.yy
@@ -45,48 +46,57 @@ def ellipse(t: wp.vec3, f: Footprint, view: View):
 def project(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
-    view: View, pose: Pose, base: int,
+    view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
     records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """Records, depth keys and tiles at most of one instance, from record `base`."""
-    i = first + wp.tid()
-    j = base + i
-    cull(depth_keys, counts, j)
-    t = pose.rotation * means[i] + pose.translation
-    opacity = sigmoid(logit_opacities[i])
-    if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.least_opacity:
-        axes = pose.rotation * rotation(quats[i])
-        scale = exp_scale(log_scales[i])
-        if in_view(t, axes, scale, view):
-            e = ellipse(t, footprint(t, axes, scale, view), view)
-            write_splat(e, opacity, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
+    """Records, depth keys and tiles at most of a group's splats; `threads` threads share an item."""
+    part = first + wp.tid()
+    item = part // threads
+    pose = pose_of(poses, items[item, DRAW])
+    for k in range(part % threads, items[item, COUNT], threads):
+        i = items[item, FIRST] + k
+        j = items[item, BASE] + k
+        cull(depth_keys, counts, j)
+        exact = pose.exact * wp.vec3d(means[i]) + pose.translation
+        t = wp.vec3(exact)
+        opacity = sigmoid(logit_opacities[i])
+        if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.least_opacity:
+            axes = pose.rotation * rotation(quats[i])
+            scale = exp_scale(log_scales[i])
+            if in_view(t, axes, scale, view):
+                e = ellipse(exact, footprint(t, axes, scale, view), view)
+                write_splat(e, opacity, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
 
 
 @wp.kernel
 def project_backward(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
-    view: View, pose: Pose, base: int, n_splats: int, chunk: int,
+    view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
     counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
     g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
     g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3], g_uniform: wp.array2d[float],
     first: int,
 ):  # fmt: skip
-    """Sum each splat's slots in fixed order and carry them back; a thread takes `chunk` splats and sums their pose gradient."""
+    """Sum each splat's slots in fixed order and carry them back; a thread sums its splats' pose gradient."""
     part = first + wp.tid()
+    item = part // threads
+    pose = pose_of(poses, items[item, DRAW])
     uniform = vec_uniform()
-    for i in range(part * chunk, wp.min(part * chunk + chunk, n_splats)):
-        j = base + i
+    for k in range(part % threads, items[item, COUNT], threads):
+        i = items[item, FIRST] + k
+        j = items[item, BASE] + k
         if counts[j] == 0:
-            no_gradient(i, view.sh_count, g_means, g_quats, g_log_scales, g_logit_opacities, g_sh)
+            no_gradient(i, g_means, g_quats, g_log_scales, g_logit_opacities, g_sh)
         else:
-            t = pose.rotation * means[i] + pose.translation
+            exact = pose.exact * wp.vec3d(means[i]) + pose.translation
+            t = wp.vec3(exact)
             z = t[2]
             r_splat = rotation(quats[i])
             scale = exp_scale(log_scales[i])
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            g = gather(ellipse(t, f, view), sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
+            g = gather(ellipse(exact, f, view), sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
             g_logit_opacities[i] = g.logit
 
             uv = cross2(f.u.e, f.v.e)
@@ -118,8 +128,8 @@ def project_backward(
             a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), f.n, z, view)
 
             # the centre: pixel = f n + c + mu, with n not clamped; the Jacobian's n is clamped under EWA
-            nx = t[0] / z
-            ny = t[1] / z
+            nx = f.along[0]
+            ny = f.along[1]
             g_nx = view.fx * g_xy_px[0]
             g_ny = view.fy * g_xy_px[1]
             if nx == f.n[0]:
@@ -141,11 +151,11 @@ def project_backward(
             g_quats[i] = rotation_backward(quats[i], wp.transpose(pose.rotation) * g_axes)
 
             sight = means[i] - pose.eye
-            g_sight = colour_backward(sh, i, view.sh_count, sight, g.rgb, g_sh)
+            g_sight = colour_backward(sh, i, sight, g.rgb, g_sh)
             g_means[i] = wp.transpose(pose.rotation) * g_t + g_sight
 
             # eye = -R' t, so its gradient (-g_sight) reaches rotation and translation as well
-            g_rotation = wp.outer(g_t, means[i]) + g_axes * wp.transpose(r_splat) + wp.outer(pose.translation, g_sight)
+            g_rotation = wp.outer(g_t, means[i]) + g_axes * wp.transpose(r_splat) + wp.outer(wp.vec3(pose.translation), g_sight)
             g_translation = g_t + pose.rotation * g_sight
             for c in range(9):
                 uniform[c] = uniform[c] + g_rotation[c // 3, c % 3]

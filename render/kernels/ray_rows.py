@@ -16,7 +16,7 @@ import warp as wp
 
 from render.kernels.lanewise import below, cut
 from render.kernels.rows import exp_of, row_range
-from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, H, K, M, X, Y, Z, lanes
+from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
 
 lanes64 = wp.types.vector(length=TILE, dtype=wp.float64)
 
@@ -119,8 +119,8 @@ def ray_functions(ray: bool, eyes: bool, squarings: int):
     @wp.func
     def faded_conic(record: lanes, column: lanes, x0: float, y: float):
         k = record[K]
-        dy = y - record[Y]
-        u = column * k - lanes(k * (record[X] - x0 + record[M] * dy))
+        dy = (y - record[Y]) - record[Y_REST]
+        u = column * k - lanes(k * ((record[X] - x0) + record[X_REST] + record[M] * dy))
         s = wp.cw_mul(u, u) + lanes(record[H] * dy * dy)
         return cut(s, record[S_MAX], exp_minus(s))
 

@@ -5,28 +5,33 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import cut, greater, greatest, lesser
-from render.kernels.types import INV_C, OPTIONS, S_MAX, SLACK, TILE, Y_EXT, H, K, M, X, Y, lanes
+from render.kernels.types import OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, X, Y, lanes
 
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
 ROUNDING = wp.constant(1.00001)
-EXP = (-0.9999987248495342, 0.49995871443426915, -0.16628684606491032, 0.04027258706981761, -0.006117409069963007)
+EXP = (
+    -0.99999989594439, 0.4999973195795904, -0.1666446929074362, 0.041585101006979555, -0.008176347677892794, 0.0012246760256379365,
+    -0.00010672455304457475,
+)  # fmt: skip
 ROLLED = OPTIONS | {"max_unroll": 8}  # loops over a tile's 16 rows stay loops: unrolled they compile ten times as long and run no faster
 
 
 @cache
 def exp_of(squarings: int):
-    """The function exp(-s) of lanes: a polynomial of s / 2^squarings, squared that often; s / 2^squarings should lie in [0, 0.75], beyond
-    it gives anything but negative numbers. 3 squarings serve cutoffs down to 1/400, 5 to 1e-10.
+    """The function exp(-s) of lanes: a polynomial of s / 2^squarings, squared that often; s / 2^squarings should lie in [0, 1.5], beyond
+    it gives anything but negative numbers. 2 squarings serve cutoffs down to 1/400, 4 to 1e-10.
 
-    The polynomial is minimax for its 8th power, with 1 at 0: off by 5e-7 at most, and by 6e-6 of itself; 5 squarings, by 2e-6 and 3e-5
-    (`python -m tests.bench.accuracy`).
+    Every squaring doubles the rounding, so a longer polynomial and fewer of them are as fast and err half as much. It is minimax for its
+    4th power, with 1 at 0: off by 2e-7 at most, and by 3e-6 of itself; 4 squarings, by 8e-7 and 2e-5 (`python -m tests.bench.accuracy`).
     """
-    c1, c2, c3, c4, c5 = (c * 0.5 ** (squarings * (k + 1)) for k, c in enumerate(EXP))
+    c1, c2, c3, c4, c5, c6, c7 = (c * 0.5 ** (squarings * (k + 1)) for k, c in enumerate(EXP))
 
     @wp.func
     def exp_minus(s: lanes):
-        p = lanes(wp.static(c4)) + s * wp.static(c5)
+        p = lanes(wp.static(c6)) + s * wp.static(c7)
+        p = lanes(wp.static(c5)) + wp.cw_mul(s, p)
+        p = lanes(wp.static(c4)) + wp.cw_mul(s, p)
         p = lanes(wp.static(c3)) + wp.cw_mul(s, p)
         p = lanes(wp.static(c2)) + wp.cw_mul(s, p)
         p = lanes(wp.static(c1)) + wp.cw_mul(s, p)
@@ -46,9 +51,10 @@ def row_range(record: lanes, x0: float, y0: float):
     k = record[K]
     m = record[M]
     h = record[H]
-    inv_c = record[INV_C]
     k2 = k * k
-    cs = (k2 * m * m + h) * record[S_MAX]
+    c = k2 * m * m + h
+    inv_c = 1.0 / c
+    cs = c * record[S_MAX]
     k2h = k2 * h
     slope = k2 * m * inv_c
     x_at_ext = m * record[Y_EXT]
@@ -65,8 +71,8 @@ def row_range(record: lanes, x0: float, y0: float):
 def rows_met(record: lanes, x0: float, y0: float, rows: lanes, marks: lanes):
     """Of the tile whose first pixel centre is x0, y0, a lane a row: the exponent is (K column - ridge)^2 + across; and of marks those of
     the rows that the ellipse reaches."""
-    dy = rows - lanes(record[Y] - y0)
-    ridge = (lanes(record[X] - x0) + dy * record[M]) * record[K]
+    dy = rows - lanes((record[Y] - y0) + record[Y_REST])
+    ridge = (lanes((record[X] - x0) + record[X_REST]) + dy * record[M]) * record[K]
     across = wp.cw_mul(dy, dy) * record[H]
     beyond = greatest(ridge - lanes(record[K] * WIDTH), lanes(0.0) - ridge)
     # what rounding could do to a pixel's exponent must not drop its row

@@ -23,15 +23,15 @@ from render.kernels.types import (
     GRADIENTS,
     GREEN,
     INSTANCE,
-    INV_C,
-    INV_K,
     OPACITY,
     RED,
     S_MAX,
     SLACK,
     TINY,
+    X_REST,
     Y_AT_EXT,
     Y_EXT,
+    Y_REST,
     H,
     K,
     M,
@@ -48,8 +48,8 @@ vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
 class Ellipse:
     """A splat on the image before dilation: mean, covariance, and its determinant by a way that does not cancel."""
 
-    x: float
-    y: float
+    x: wp.float64
+    y: wp.float64
     xx: float
     xy: float
     yy: float
@@ -90,34 +90,34 @@ def write_splat(
         s_max = 0.0
     s_max *= view.widen
     # written so that a NaN anywhere culls the splat instead of spreading
-    if s_max > 0.0 and det > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
-        k2 = 0.5 * yy / det
-        k = wp.sqrt(k2)
-        m = e.xy / yy
+    if s_max > 0.0 and det > TINY and xx > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
         h = 0.5 / yy
-        c = k2 * m * m + h
-        records[j, X] = e.x
-        records[j, Y] = e.y
+        k = wp.sqrt(0.5 * yy / det)
+        x_ext = wp.sqrt(2.0 * s_max * xx)
+        y_ext = wp.sqrt(2.0 * s_max * yy)
+        x = float(e.x)
+        y = float(e.y)
+        records[j, X] = x
+        records[j, Y] = y
+        records[j, X_REST] = float(e.x - wp.float64(x))
+        records[j, Y_REST] = float(e.y - wp.float64(y))
         records[j, K] = k
-        records[j, M] = m
+        records[j, M] = e.xy / yy
         records[j, H] = h
         records[j, OPACITY] = opacity
         records[j, S_MAX] = s_max
         records[j, Z] = depth
         records[j, INSTANCE] = instance
-        records[j, Y_EXT] = wp.sqrt(s_max / h)
-        records[j, INV_K] = 1.0 / k
-        records[j, INV_C] = 1.0 / c
-        root = wp.sqrt(s_max / (c * h))
-        records[j, Y_AT_EXT] = k * m * root
-        all_rows = span_of(e.y, ROOM * records[j, Y_EXT] + SLACK)
-        all_columns = span_of(e.x, ROOM * c * root / k + SLACK)
+        records[j, Y_EXT] = y_ext
+        records[j, Y_AT_EXT] = e.xy / xx * x_ext
+        all_rows = span_of(y, ROOM * y_ext + SLACK)
+        all_columns = span_of(x, ROOM * x_ext + SLACK)
         rows = within(all_rows, view.tile_top, view.tiles_y)
         columns = within(all_columns, view.tile_left, view.tiles_x)
         total = wp.max(rows[1] - rows[0] + 1, 0) * wp.max(columns[1] - columns[0] + 1, 0)
         colour = wp.vec3(0.0)
         if total > 0:
-            colour = harmonics(sh, i, view.sh_count, wp.normalize(sight))
+            colour = harmonics(sh, i, sh.shape[1], sight * (1.0 / wp.max(wp.length(sight), TINY)))
         if total > 0 and wp.isfinite(colour):
             counts[j] = total
             note_reach(records, j, all_rows, all_columns, reach)
@@ -170,27 +170,27 @@ def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: in
 
 
 @wp.func
-def colour_backward(sh: wp.array2d[wp.vec3], i: int, count: int, sight: wp.vec3, g_rgb: wp.vec3, g_sh: wp.array2d[wp.vec3]):
+def colour_backward(sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, g_rgb: wp.vec3, g_sh: wp.array2d[wp.vec3]):
     """Write d loss / d sh of splat i; return d loss / d sight."""
     distance = wp.max(wp.length(sight), TINY)
     direction = sight / distance
-    colour = harmonics(sh, i, count, direction)
+    colour = harmonics(sh, i, sh.shape[1], direction)
     g = wp.vec3(g_rgb[0], g_rgb[1], g_rgb[2])
     for c in range(3):
         if colour[c] <= 0.0:
             g[c] = 0.0
-    g_direction = harmonics_backward(sh, i, count, direction, g, g_sh)
+    g_direction = harmonics_backward(sh, i, sh.shape[1], direction, g, g_sh)
     return (g_direction - direction * wp.dot(direction, g_direction)) / distance
 
 
 @wp.func
 def no_gradient(
-    i: int, sh_count: int, g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
+    i: int, g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
     g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3],
 ):  # fmt: skip
     g_means[i] = wp.vec3(0.0)
     g_quats[i] = wp.vec4(0.0)
     g_log_scales[i] = wp.vec3(0.0)
     g_logit_opacities[i] = 0.0
-    for b in range(sh_count):
+    for b in range(g_sh.shape[1]):
         g_sh[i, b] = wp.vec3(0.0)

@@ -16,9 +16,10 @@ lanes = wp.types.vector(length=TILE, dtype=wp.float32)
 RECORD = 16
 """Floats of a projected splat: one cache line. With dx, dy the pixel's offset from (X, Y), the exponent is
 s = (K (dx - M dy))^2 + H dy^2: the conic as a product of conditionals, which does not cancel for needles as
-a dx^2 + 2 b dx dy + c dy^2 does, and gives a row's exact extent by one square root."""
-X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, INV_K, Y_AT_EXT, INV_C = (wp.constant(i) for i in range(RECORD))
-# Y_EXT: the ellipse's reach in y; INV_K = 1 / K; Y_AT_EXT: dy of its rightmost point; INV_C = 1 / (K^2 M^2 + H)
+a dx^2 + 2 b dx dy + c dy^2 does, and gives a row's exact extent by one square root. A centre is kept in two parts, since a float has
+0.0001 pixels at 2,000: X is what a float holds of it, X_REST what that leaves over. X - x0 is exact."""
+X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, Y_AT_EXT, X_REST, Y_REST = (wp.constant(i) for i in range(RECORD))
+# Y_EXT: the ellipse's reach in y; Y_AT_EXT: dy of its rightmost point
 
 GRADIENTS = 10
 """Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
@@ -52,6 +53,12 @@ MEDIAN, WHO = 0, 1
 """Planes that pick one splat a pixel: the depth of the one behind which less than half the light passes, the id of the one that
 weighs most."""
 
+ITEM = 64
+"""Splats of an item of projection's work at most; their pose gradient is summed before it is written."""
+
+FIRST, COUNT, BASE, DRAW = (wp.constant(i) for i in range(4))
+"""Of an item: its first splat, how many, the first one's record, and the row of poses that it has."""
+
 UNIFORM_GRADIENTS = 16
 """Floats of the gradient shared by all splats of an instance: rotation (row major), translation, fx, fy, cx, cy."""
 
@@ -80,8 +87,7 @@ class View:
 
     fx: float
     fy: float
-    cx: float
-    cy: float
+    lens: wp.vec4d  # fx, fy, cx, cy
     left: float  # the sides of the view, as x/z and y/z, widened by the dilation's reach
     right: float
     top: float
@@ -102,14 +108,40 @@ class View:
     least_opacity: float  # splats up to it are not drawn
     unscented: int
     antialias: int
-    sh_count: int
 
 
 @wp.struct
 class Pose:
-    """cam_from_local of one instance, and the eye in its local frame."""
+    """cam_from_local of one instance, and the eye in its local frame. Splats' centres are carried over in float64."""
 
+    exact: wp.mat33d
+    translation: wp.vec3d
     rotation: wp.mat33
-    translation: wp.vec3
     eye: wp.vec3
     instance: float
+
+
+@wp.func
+def matrix_at(rows: wp.array2d[wp.float64], d: int, at: int):
+    return wp.mat33d(
+        rows[d, at], rows[d, at + 1], rows[d, at + 2],
+        rows[d, at + 3], rows[d, at + 4], rows[d, at + 5],
+        rows[d, at + 6], rows[d, at + 7], rows[d, at + 8],
+    )  # fmt: skip
+
+
+@wp.func
+def vector_at(rows: wp.array2d[wp.float64], d: int, at: int):
+    return wp.vec3d(rows[d, at], rows[d, at + 1], rows[d, at + 2])
+
+
+@wp.func
+def pose_of(rows: wp.array2d[wp.float64], d: int):
+    """Row d: rotation (row major), translation, eye, instance."""
+    p = Pose()
+    p.exact = matrix_at(rows, d, 0)
+    p.translation = vector_at(rows, d, 9)
+    p.rotation = wp.mat33(p.exact)
+    p.eye = wp.vec3(vector_at(rows, d, 12))
+    p.instance = float(rows[d, 15])
+    return p

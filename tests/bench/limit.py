@@ -8,7 +8,7 @@ import torch
 
 from render import RenderConfig
 from render.compositing import _composite
-from render.kernels.types import INV_C, S_MAX, SLACK, TILE, Y_EXT, H, K, M, Wanted, X, Y
+from render.kernels.types import S_MAX, SLACK, TILE, Y_EXT, H, K, M, Wanted, X, Y
 from render.launch import stage
 from render.settings import Settings
 from tests.bench.presets import Preset
@@ -52,8 +52,9 @@ def rows_of(r: torch.Tensor, tile: torch.Tensor, tiles_x: int) -> torch.Tensor:
     """Rows of its tile that each entry's ellipse reaches: `row_range` of the composite kernels, in float64."""
     px = r[:, int(X)] - (tile % tiles_x * TILE + 0.5)
     py = r[:, int(Y)] - (tile // tiles_x * TILE + 0.5)
-    k2, m, h, inv_c, slack = r[:, int(K)].square(), r[:, int(M)], r[:, int(H)], r[:, int(INV_C)], float(SLACK)
-    cs, slope, furthest = (k2 * m * m + h) * r[:, int(S_MAX)], k2 * m * inv_c, m * r[:, int(Y_EXT)]
+    k2, m, h, slack = r[:, int(K)].square(), r[:, int(M)], r[:, int(H)], float(SLACK)
+    inv_c = 1 / (k2 * m * m + h)
+    cs, slope, furthest = r[:, int(S_MAX)] / inv_c, k2 * m * inv_c, m * r[:, int(Y_EXT)]
     reach = []
     for sign in (1, -1):
         dx = (sign * furthest).clamp(-px - slack, TILE - 1 - px + slack)

@@ -19,6 +19,7 @@ def splats():
 
 BOXES = [np.array([2.0, 2.0, 2.0])] * 2
 
+
 def pulled(s, generator=torch.Generator().manual_seed(3)):  # noqa: B008
     return Growth(torch.rand(len(s), generator=generator), torch.ones(len(s)))
 

@@ -7,6 +7,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from render.budget import split
+from render.cull import in_sight, those_in_sight
 from render.frames import canonical_frames
 from render.kernels.types import Wanted
 from render.rays import exact_rays
@@ -14,8 +15,10 @@ from render.settings import Settings
 from scenes import Camera, Pinhole, Placed, SplatModel
 from scenes.poses import matrix_from_quat, translation
 from tests import oracle
-from tests.bench.presets import drive, random_splats, uniform
+from tests.bench.presets import Missing, drive, presets, random_splats, uniform
 from tests.render.test_cuda import keep_forward
+from tests.render.test_lenses import LENSES, around, camera_of
+from tests.render.test_shutter import FISHEYE, PINHOLE, driven, traffic
 
 BUDGETS = (1 / 64, 1 / 255, 1 / 1024, 1 / 4096)
 CAMERA = Camera(Pinhole(40.0, 41.0, 20.0, 15.0), 40, 30, torch.eye(4, dtype=torch.float64))
@@ -46,7 +49,9 @@ def brightest(placed: list[Placed], camera: Camera) -> float:
 
 
 def assert_kept(placed, camera, model, where: str) -> None:
-    rgb, _ = oracle.truth(placed, camera, model)
+    with torch.no_grad():
+        end, ends = camera.world_from_cam_end, [p.world_from_local_end for p in placed]
+        rgb, *_ = oracle.render(oracle.as_oracle(placed), camera, model, order="pixel", world_from_cam_end=end, ends=ends)
     unit = brightest(placed, camera)
     for e in BUDGETS:
         drawn = rasterize(placed, camera, ("rgb",), model=model, config=RenderConfig(max_error=e)).rgb
@@ -78,6 +83,35 @@ def test_the_drive_keeps_every_budget():
     preset = drive(32, 18)
     thinned = [replace(p, gaussians=p.gaussians.select(torch.arange(0, len(p.gaussians), 6))) for p in preset.placed]
     assert_kept(thinned, preset.camera, preset.model, "drive")
+
+
+@pytest.mark.parametrize("name", ["drive-480x270", "drive-960x540", "drive-1920x1080", "lund", "biker", "street-1M", "street-3M"])
+def test_every_preset_keeps_every_budget(name):
+    """Three small cameras that look at what the preset's shows at full size: near its bottom, at the horizon, and to one side."""
+    try:
+        preset = presets()[name]()
+    except Missing as missing:
+        pytest.skip(str(missing))
+    whole = preset.camera
+    for x, y in [(0.5, 0.8), (0.45, 0.5), (0.8, 0.45)]:
+        left, top = int(x * whole.width), int(y * whole.height)
+        lens = replace(whole.lens, cx=float(whole.lens.cx) - left, cy=float(whole.lens.cy) - top)
+        camera = replace(whole, lens=lens, width=20, height=12)
+        seen = in_sight(preset.placed, camera, preset.model)
+        nearby = [p for p in those_in_sight(preset.placed, seen) if len(p.gaussians)]
+        assert_kept(nearby, camera, preset.model, f"{name} at {left}, {top}")
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_every_lens_keeps_every_budget(name):
+    for seed in (1, 2):
+        assert_kept(around(seed), camera_of(LENSES[name]), SplatModel(antialias=seed == 2), f"{name} {seed}")
+
+
+@pytest.mark.parametrize(("lens", "shutter"), [(PINHOLE, "rows"), (FISHEYE, "columns")], ids=["pinhole-rows", "fisheye-columns"])
+def test_moving_shutters_keep_every_budget(lens, shutter):
+    for seed in (0, 1):
+        assert_kept(traffic(seed), driven(lens, shutter), SplatModel(), f"traffic {seed}")
 
 
 def test_where_no_splats_can_change_places_the_tiles_draw():

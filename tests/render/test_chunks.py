@@ -7,7 +7,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from render.chunks import window, windows
-from render.kernels.types import INV_C, INV_K, RECORD, S_MAX, Y_EXT, H, X, Y
+from render.kernels.types import RECORD, S_MAX, Y_EXT, H, K, X, Y
 from scenes import Camera, Pinhole
 from tests.render.test_rasterize import two_instances
 
@@ -35,7 +35,7 @@ def test_windows_change_no_pixel_and_no_gradient(most):
 def walls(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Records of splats that cover a 16384x16384 image, and their room in it: a million tiles each."""
     records = torch.zeros(count, RECORD)
-    for field, value in {X: 8192.0, Y: 8192.0, H: 1e-12, INV_K: 1e6, INV_C: 1e12, S_MAX: 1.0, Y_EXT: 1e6}.items():
+    for field, value in {X: 8192.0, Y: 8192.0, H: 1e-12, K: 1e-6, S_MAX: 1.0, Y_EXT: 1e6}.items():
         records[:, int(field)] = value
     return records, torch.full((count,), 1024 * 1024, dtype=torch.int32)
 

@@ -9,6 +9,7 @@ import warp as wp
 
 from render import rasterize
 from render.bridge import Rasterize
+from render.bridge import _told as told
 from render.chunks import window
 from render.frame_types import RenderConfig
 from render.kernels import bin as bin_kernels
@@ -63,8 +64,9 @@ class Captured:
 def keep_forward(settings: Settings, gaussians, pose: torch.Tensor, lens: Pinhole, features=None, frames=None, rays=None):
     """`Rasterize.forward` outside autograd: what it keeps for backward, and its outputs."""
     kept = Captured()
-    kept.needs_input_grad = (True,) * 11
-    return kept, Rasterize.forward(kept, settings, pose[None, None], lens.params(), features, frames, rays, *gaussians.tensors().values())
+    kept.needs_input_grad = (True,) * 12
+    fields = gaussians.tensors().values()
+    return kept, Rasterize.forward(kept, settings, None, pose[None, None], lens.params(), features, frames, rays, *fields)
 
 
 def whole(settings: Settings):
@@ -85,7 +87,7 @@ def test_block_kernels_agree_with_lane_kernels():
     gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:5]]
     expected = Rasterize.backward(kept, *gradients, None, None)
 
-    records, features, (group,), (uniform,) = kept.scene.records, kept.scene.features, kept.groups, kept.told
+    records, features, (group,) = kept.scene.records, kept.scene.features, kept.work.groups
     visible = torch.where(kept.scene.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     pixels = WIDTH * HEIGHT
     # every pixel lists every splat: more than the exact lists
@@ -119,16 +121,16 @@ def test_block_kernels_agree_with_lane_kernels():
     grads = torch.cat([-(g_alpha * planes[0])[None], g_rgb, g_z[None], g_w[None], g_channels])
     args = [*lists, view(slot_of, int), *scene, settings.alpha_max, view(planes, float), view(grads, float), view(last, int)]
     run_blocks(composite_blocks_gradient(EVERYTHING, 1), pixels, 1, [*args, view(slots, float), view(channel_slots, float)], cpu)
-    out = [torch.empty_like(t) for t in group]
+    out = [torch.empty_like(t) for t in group.fields]
     shared = torch.empty(2, 16)
     types = [wp.vec3, wp.vec4, wp.vec3, float, wp.vec3]
-    fields = [view(t, d) for t, d in zip(group, types, strict=True)]
+    fields = [view(t, d) for t, d in zip(group.fields, types, strict=True)]
     results = [view(t, d) for t, d in zip(out, types, strict=True)]
     tail = [view(everywhere, int), view(first_slot, int), view(slots, float), *results, view(shared, float)]
-    run(project_kernels.project_backward, 2, [*fields, *uniform, len(records), 64, *tail], cpu)
+    run(project_kernels.project_backward, 2, [*fields, *told(kept.told, kept.rows, group.items), *tail], cpu)
     g_features = torch.zeros_like(features)
     g_features[order.long()] = channel_slots.reshape(n, pixels, CHANNELS).sum(1)
-    for mine, reference in zip([g_features, *out], [expected[3], *expected[6:]], strict=True):
+    for mine, reference in zip([g_features, *out], [expected[4], *expected[7:]], strict=True):
         assert (mine - reference).abs().max() < 1e-3 * reference.abs().max()
 
 

@@ -1,7 +1,6 @@
 """Every lens and moving shutters, drawn and differentiated, against the float64 oracle."""
 
 import math
-from dataclasses import fields as fields_of
 from dataclasses import replace
 
 import pytest
@@ -124,8 +123,7 @@ def gradients(placed: list[Placed], camera: Camera, model: SplatModel):
     yield "camera pose", my_camera.world_from_cam.grad[:3], start.grad[:3]
     if end is not None:
         yield "camera's end pose", my_camera.world_from_cam_end.grad[:3], end.grad[:3]
-    for name, mine_of, reference in zip((f.name for f in fields_of(camera.lens)), my_lens.grad, lens.grad, strict=True):
-        yield f"lens {name}", mine_of, reference
+    yield "lens", my_lens.grad, lens.grad
 
 
 @pytest.mark.parametrize(("make", "model"), SCENES, ids=["ut", "ewa", "stretched"])

@@ -34,9 +34,9 @@ def test_a_chart_is_drawn_with_one_point_or_none(tmp_path):
 
 
 def test_rows_of_a_circle_are_counted():
-    from render.kernels.types import INV_C, RECORD, S_MAX, Y_EXT, H, K, X, Y
+    from render.kernels.types import RECORD, S_MAX, Y_EXT, H, K, X, Y
 
     record = torch.zeros(1, RECORD, dtype=torch.float64)
-    for field, value in {X: 8.0, Y: 8.0, K: 1.0, H: 1.0, S_MAX: 9.0, Y_EXT: 3.0, INV_C: 1.0}.items():  # of radius 3 pixels
+    for field, value in {X: 8.0, Y: 8.0, K: 1.0, H: 1.0, S_MAX: 9.0, Y_EXT: 3.0}.items():  # of radius 3 pixels
         record[0, int(field)] = value
     assert rows_of(record, torch.tensor([0]), 1).tolist() == [6.0]

@@ -64,6 +64,19 @@ def crash(seed: int) -> list[Placed]:
     return [replace(p, gaussians=replace(p.gaussians, log_scales=shapes[torch.arange(len(p.gaussians)) % 2])) for p in traffic(seed)]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_points_that_outrun_the_shutter_are_drawn_as_the_oracle_draws_them(seed):
+    """Needles whose ends come by so fast beside the camera that Newton's step leads away from the moment at which they are seen."""
+    placed, camera = crash(seed), driven(LENSES["opencv"], "rows")
+    with torch.no_grad():
+        rgb, *_, unsure = oracle.render(
+            oracle.as_oracle(placed), camera, SplatModel(), cutoff=1e-8, alpha_max=0.999,
+            world_from_cam_end=camera.world_from_cam_end, ends=[p.world_from_local_end for p in placed],
+        )  # fmt: skip
+    frame = rasterize(placed, camera, ("rgb",), config=RenderConfig(alpha_cutoff=1e-8, termination=0))
+    assert largest(frame.rgb, rgb, ~unsure) < 1e-5
+
+
 @pytest.mark.parametrize(
     ("lens", "shutter", "make"),
     [
@@ -134,6 +147,48 @@ def test_each_row_is_what_a_still_camera_at_its_own_pose_sees():
         still = rasterize(placed, Camera(PINHOLE, WIDTH, HEIGHT, pose), config=RenderConfig(termination=0))
         # a splat's neighbouring rows are seen a moment later: a 40th of the motion, under a tenth of a pixel
         assert (frame.rgb[row] - still.rgb[row]).abs().mean() < 0.15 * still.rgb[row].abs().mean()
+
+
+@pytest.mark.parametrize("there", ["rows", "columns", "global"])
+@pytest.mark.parametrize("here", ["rows", "columns", "global"])
+@pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=lambda lens: lens.kind)
+def test_flow_leads_to_where_a_splat_stands_in_the_other_frame(lens, here, there):
+    """Small opaque splats, standing and driving; where each lies on either image is the centre of its own feature's weight."""
+    side = torch.linspace(-1.2, 1.2, 4)
+    means = torch.stack([*torch.meshgrid(side, 0.7 * side, indexing="ij"), torch.zeros(4, 4)], -1).reshape(-1, 3)
+    means[:, 2] = torch.linspace(4.0, 6.0, 16)
+    dots = random_splats(16, 1, sh_count=1)
+    dots = replace(dots, means=means, log_scales=torch.full((16, 3), -3.2), logit_opacities=torch.full((16,), 7.0))
+    driving = torch.arange(16) % 3 == 1
+    first = START @ translation(0, 0, 0.5)
+    pose, step = first, translation(0.25, -0.05, 0.1) @ turned(1.0)
+
+    def frame_at(shutter: str, time: int) -> tuple[list[Placed], Camera]:
+        camera = driven(lens, shutter)
+        if shutter == "global":
+            camera = replace(camera, world_from_cam_end=None)
+        begins = torch.linalg.matrix_power(step, time)
+        camera = replace(camera, world_from_cam=camera.world_from_cam @ translation(0.05 * time, 0.02, 0.1 * time))
+        end = None if shutter == "global" else begins @ step @ pose
+        return [Placed(dots.select(~driving), pose), Placed(dots.select(driving), begins @ pose, end, instance=2)], camera
+
+    def centres(placed: list[Placed], camera: Camera) -> torch.Tensor:
+        names = torch.eye(16)
+        features = [names[~driving], names[driving]]
+        weights = rasterize(placed, camera, ("features",), features=features).features.double()
+        return (weights[..., None] * camera.pixel_centres()[:, :, None]).sum((0, 1)) / weights.sum((0, 1))[:, None]
+
+    (placed, camera), (later, other) = frame_at(here, 0), frame_at(there, 1)
+    before, after = centres(placed, camera), centres(later, other)
+    frame = rasterize(placed, camera, ("flow_next", "visible_next", "instance"), flow_to={"next": (later, other)})
+    x, y = before.floor().long().unbind(1)
+    size = torch.tensor([camera.width, camera.height])
+    whole = torch.stack([before, after]).sub(size / 2).abs().lt(size / 2 - 4).all(-1).all(0)  # not cut off by the image's edge
+    shown = (frame.instance[y, x] >= 0) & whole
+    assert shown.sum() >= 9 and frame.visible_next[y, x][shown].float().mean() > 0.8
+    assert (frame.flow_next[y, x] - (after - before))[shown].abs().max() < 0.2  # the pixel's centre is not the splat's
+    moved = after - before
+    assert (moved[driving].mean(0) - moved[~driving].mean(0)).norm() > 0.5, "the motion must show"
 
 
 def test_moving_splats_and_camera_by_the_same_motion_shows_nothing_of_it():

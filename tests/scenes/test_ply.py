@@ -146,7 +146,6 @@ def test_a_wrong_number_of_sh_properties_is_refused(tmp_path):
         load_ply(tmp_path / "a.ply")
 
 
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("field", ["means", "quats", "log_scales", "logit_opacities", "sh"])
 def test_a_value_that_is_not_finite_is_refused_by_splat_and_field(tmp_path, field, value):
