@@ -19,9 +19,6 @@ from recon.kernels.descent import BETA1, BETA2, Rates, catch_up, descend
 from recon.model import FIELDS, Splats
 from render.launch import run, stage, view
 
-FADE = 0.003
-"""Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes."""
-
 _TYPES = (wp.vec3, wp.vec4, wp.vec3, float, wp.vec3)
 
 
@@ -54,12 +51,13 @@ class Descent:
             run(descend, len(which), [view(which, wp.int64), rates, *arrays], which.device)
 
 
-def rates_at(now: int, steps: Mapping[str, float]) -> Rates:
-    """What step `now`, from 1, does: `steps` a field, and "harmonics" for those of the colours beyond the first."""
+def rates_at(now: int, steps: Mapping[str, float], fade: float = 0.0) -> Rates:
+    """What step `now`, from 1, does: `steps` a field, and "harmonics" for those of the colours beyond the first; `fade`: the logit that a
+    splat loses each time it is seen."""
     rates = Rates()
     for name, length in steps.items():
         setattr(rates, name, length)
-    rates.fade, rates.now, rates.unbias1, rates.unbias2 = FADE, float(now), 1 / (1 - BETA1**now), 1 / (1 - BETA2**now)
+    rates.fade, rates.now, rates.unbias1, rates.unbias2 = fade, float(now), 1 / (1 - BETA1**now), 1 / (1 - BETA2**now)
     rates.log_largest, rates.log_thinnest, rates.log_longest = (math.log(x) for x in (LARGEST, THINNEST, LONGEST))
     return rates
 

@@ -63,11 +63,15 @@ SKY_WEIGHT = 0.03
 SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
 
-ASIDE, ASIDE_EVERY = 3.0, 4
-"""Metres to either side of the path from which the road must be closed too, and every how many steps that is looked at."""
+ASIDE, ASIDE_EVERY, ASIDE_WEIGHT = 3.0, 2, 0.3
+"""Metres to either side of the path from which the road must be closed too, every how many steps that is looked at, and its weight."""
 
 HORIZON = -0.01
 """Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
+
+FADE = 0.003
+"""Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
+could not hold up anything against it at the end."""
 
 RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "colours": 5e-3, "harmonics": 5e-4}
 """Adam's step a field; of means in parts of each splat's reach: 0.1 pixel."""
@@ -138,7 +142,7 @@ class Fit:
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if aside is not None:
-            haze = haze + SOLID_WEIGHT * self._gaps(shown, view, aside)
+            haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
         (loss + haze + self.motion.unrest() + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self._follow()
@@ -209,7 +213,7 @@ class Fit:
     def _rates(self) -> Rates:
         settle = 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
         steps = {name: rate * (0.01**self.progress if name == "means" else settle) for name, rate in RATES.items()}
-        return rates_at(self.step_count + 1, steps)
+        return rates_at(self.step_count + 1, steps, FADE * settle)
 
     def _follow(self) -> None:
         """The steps of what all pictures share."""

@@ -4,10 +4,11 @@ import torch
 from randomized import gaussians
 
 from recon.densify import LARGEST, LONGEST, THINNEST, Growth
-from recon.descent import FADE, Descent, rates_at
+from recon.descent import Descent, rates_at
 from recon.model import Splats
 
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 1e-4, "logits": 4e-2, "colours": 5e-3, "harmonics": 5e-4}
+FADE = 0.003
 
 
 def splats(count=40):
@@ -17,7 +18,7 @@ def splats(count=40):
 
 
 def follow(descent, all_splats, growth, which, gradients, now):
-    rates = rates_at(now, RATES)
+    rates = rates_at(now, RATES, FADE)
     descent.catch_up(all_splats, which, 4, rates)
     shown = all_splats.select(which, 4)
     for name, g in gradients.items():
