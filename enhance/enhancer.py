@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
+from enhance.corrections import Corrections, correct
 from enhance.net import MULTIPLE, Net
-from enhance.objects import Corrections, correct
 from enhance.past import Past
 from enhance.precision import channels_last, has_bfloat16
 from enhance.step import Steps, checked

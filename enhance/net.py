@@ -8,7 +8,7 @@ features of the input frame, and of the last enhanced one moved to it, at every 
     output = base + gate * (residual + blend * (last - base)),   base = input + altered * colour
 
 where colour undoes altered colours, averaged over the last frames: by fields (`ColourNet`) where no mask is told; told objects come
-here corrected already (`ObjectColour`). The residual is free; blending with the last picture keeps a clip calm; altered and gate are
+here corrected already (`ObjectNet`). The residual is free; blending with the last picture keeps a clip calm; altered and gate are
 exactly 0 where the frame is to be left alone. Colour, residual and blend are zero in an untrained network, which therefore changes
 nothing.
 """
@@ -24,7 +24,7 @@ from torch.nn import functional as F
 from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
 from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
-from enhance.objects import ObjectColour
+from enhance.objects import ObjectNet
 from enhance.past import Past
 from enhance.precision import lower
 from enhance.tiles import Tiles, coarser, sampled, within
@@ -170,7 +170,7 @@ class Net(nn.Module):
         self.config = config
         self.encoder = Encoder()
         self.colour = ColourNet()
-        self.objects = ObjectColour(config.looks)
+        self.objects = ObjectNet(config.looks)
         self.stem = Stem(config)
         self.embed = nn.Conv2d(LATENT, config.width, PATCH, stride=PATCH)
         self.age = nn.Parameter(torch.zeros(config.history, config.width))
@@ -186,7 +186,7 @@ class Net(nn.Module):
         """One frame.
 
         rgb   `[B, 3, H, W]`, sides multiples of 16
-        mask  `[B, 1, H, W]`, above 0 where inserted or moving objects are, their colours corrected (`enhance.objects.correct`); NaN
+        mask  `[B, 1, H, W]`, above 0 where inserted or moving objects are, their colours corrected (`enhance.corrections`); NaN
               throughout a frame, or None, where unknown
         past  of the frames before, already moved to this one; None at the start
         """

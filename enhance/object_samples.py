@@ -11,25 +11,29 @@ from torch.nn import functional as F
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
 from enhance.objects import Box, Evidence, boxes, evidence, spots, whole_of
-from enhance.shards import Shard
+from enhance.shards import RENDERED, Shard
 
 PIXELS = 384
-"""Pixels of an object by which a correction is judged."""
-STORED = 0.3  # how often the stored damage of relit, re-inserted and placed objects is drawn
+"""Pixels of an object by which a correction is judged, and as many of the ground."""
+STORED = {"relight": 0.15, "reinsert": 0.1, "shadow": 0.3}
+"""How often objects are drawn whose damage is stored: relit and re-inserted ones, and placed ones, which only miss their shadow."""
+RENDERED_ONES = 0.25  # how often a picture is a rendering and no photo, as where the enhancer is used
 ANY_REGION = 0.15  # how often the object is any region of a picture
 COARSE = 4  # how much smaller than the picture that region is drawn
+SHADED = 0.35  # how often a placed object has its shadow
 VARIANTS = 3  # how often an object is used, each time in other colours
 RIGHT = 0.35  # how often an object is right as it is
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
+    """Evidence of B objects, and pixels `[B, 2 * PIXELS, 3]` as given and as they should be, at `places` `[B, 2 * PIXELS, 2]` down and
+    across the box: those of the object, then of the ground."""
 
     evidence: Evidence
     given: torch.Tensor
     target: torch.Tensor
-    height: torch.Tensor
+    places: torch.Tensor
 
 
 class ObjectSampler:
@@ -37,8 +41,9 @@ class ObjectSampler:
 
     def __init__(self, shards: dict[str, list[Shard]], photos: list[np.ndarray]):
         self.shards, self.photos = shards, photos
-        self.places = {kind: [s for s in shards.get(kind, ()) if s.meta.get("instances")] for kind in ("relight", "reinsert", "shadow")}
+        self.places = {kind: [s for s in shards.get(kind, ()) if s.meta.get("instances")] for kind in STORED}
         self.plain = [s for kind in ("clean", "isp") for s in shards.get(kind, ())]
+        self.rendered = [s for kind in RENDERED for s in shards.get(kind, ())]
 
     def draw(self, rng: np.random.Generator, count: int) -> Objects:
         drawn: list[tuple] = []
@@ -49,13 +54,12 @@ class ObjectSampler:
 
     def _object(self, rng: np.random.Generator) -> list[tuple]:
         """An object, VARIANTS times; nothing where the picture drawn has none."""
-        kinds = [k for k, found in self.places.items() if found]
-        if kinds and rng.random() < STORED:
-            kind = kinds[rng.integers(len(kinds))]
+        kind = rng.choice([*STORED, ""], p=[*STORED.values(), 1 - sum(STORED.values())])
+        if self.places.get(kind):
             shard = self.places[kind][rng.integers(len(self.places[kind]))]
             t = int(rng.integers(shard.frames))
-            given, instance = shard.frame("input", t)
-            wanted = given if kind == "shadow" else shard.frame("target", t)[0]
+            wanted, instance = shard.frame("target", t)
+            given = wanted if kind == "shadow" and rng.random() < SHADED else shard.frame("input", t)[0]
             some = shard.meta["instances"] if rng.random() < 0.7 else None
             fresh = kind == "shadow"
         else:
@@ -73,8 +77,10 @@ class ObjectSampler:
         """A right picture and its objects, or a region of it as if it were one."""
         region = rng.random() < ANY_REGION
         if self.plain and (not self.photos or not region or rng.random() < 0.5):
-            shard = self.plain[rng.integers(len(self.plain))]
-            rgb, instance = shard.frame("target", int(rng.integers(shard.frames)))
+            render = bool(self.rendered) and rng.random() < RENDERED_ONES
+            stored = self.rendered if render else self.plain
+            shard = stored[rng.integers(len(stored))]
+            rgb, instance = shard.frame("input" if render else "target", int(rng.integers(shard.frames)))
         else:
             rgb = torch.from_numpy(self.photos[rng.integers(len(self.photos))])
             instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
@@ -97,13 +103,16 @@ class ObjectSampler:
         mask = ids == pick
         share = float(mask.sum()) / instance.numel()
         at = spots(mask, box, share)
-        judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
+        ground = (ids == 0) | (ids == 255)
+        if not ground.any():
+            return []
+        judged = torch.cat([p.nonzero()[torch.from_numpy(rng.integers(int(p.sum()), size=PIXELS))] for p in (mask, ground)])
         y, x = torch.cat([at.yx, judged]).unbind(1)
         strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]
         thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1).float() / 255
         soft = F.avg_pool2d(mask[None].float(), 3, 1, 1)[0] if rng.random() < 0.7 else mask.float()
         others = ((ids > 0) & (ids < 255) & ~mask)[y, x][None, None].float()
-        height = (judged[:, 0] + box.outer_rows.start + 0.5 - box.rows.start) / (box.rows.stop - box.rows.start) * 2 - 1
+        places = box.placed(judged[:, 0] + box.outer_rows.start, judged[:, 1] + box.outer_columns.start)
         drawn = []
         for _ in range(VARIANTS):
             (seen, target), whole = strips, thin
@@ -117,17 +126,16 @@ class ObjectSampler:
                     seen = alter(seen, others, isp if rng.random() < 0.5 else random_isp(rng))
             seen, target = seen[:, 0].T, target[:, 0].T
             seen = ((seen * 255).round() + torch.from_numpy(rng.random(seen.shape, dtype=np.float32)) - 0.5) / 255
-            read = _flipped(rng, evidence(seen[:-PIXELS], at, whole_of(whole)))
-            drawn.append((read, seen[-PIXELS:], target[-PIXELS:], height))
+            read = evidence(seen[: -2 * PIXELS], at, whole_of(whole))
+            one = (read, seen[-2 * PIXELS :], target[-2 * PIXELS :], places)
+            drawn.append(_flipped(*one) if rng.random() < 0.5 else one)
         return drawn
 
 
-def _flipped(rng: np.random.Generator, e: Evidence) -> Evidence:
-    """Now and then mirrored left to right."""
-    if rng.random() < 0.5:
-        return e
+def _flipped(e: Evidence, given: torch.Tensor, target: torch.Tensor, places: torch.Tensor) -> tuple:
+    """An object mirrored left to right."""
     place, inside, around, whole = (v.clone() for v in (e.place, e.inside, e.around, e.whole))
     place[..., [1, 3]] *= -1
     for v in (inside, around, whole):
         v[..., 4] *= -1
-    return Evidence(e.seam, place, e.known, inside, around, whole)
+    return Evidence(e.seam, place, e.known, inside, around, whole), given, target, places * torch.tensor([1.0, -1.0])

@@ -1,15 +1,15 @@
-"""Colours of an object that was put in: what its seam, its own pixels and its surroundings say, and a small network that listens.
+"""Colours and shadow of an object that was put in: what its seam, its own pixels and its surroundings say, and a network that listens.
 
 Where the mask is told, altered colours are a problem of few numbers: one tone curve and saturation for the whole object. What tells
 them is fine detail of which a thinned picture shows nothing: along the seam, surfaces go on beyond the mask and only their colours
 jump. So the network reads a few hundred pixels of full sharpness: profiles across the seam, pixels inside, around and anywhere.
-Trained to be near in the picture, it corrects less the less sure it is.
+They tell, too, whether there is a shadow; where it is missing, its grid (`enhance.shade`) is a few numbers more. Trained to be near
+in the picture, the network corrects less the less sure it is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import torch
@@ -18,6 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.colour import LUMA
+from enhance.shade import KNOTS
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
 """How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
@@ -26,9 +27,8 @@ REACH = 4
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 FEWEST = 64
 """Pixels that an object must have: what is smaller stays as it is."""
-COEFFICIENTS = 15
-STEADY = 8
-"""Frames over which an object's correction is averaged, at most."""
+COLOURS = 15
+COEFFICIENTS = COLOURS + KNOTS
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,18 @@ class Box:
         wide = max(8, (rows.stop - rows.start) // 2), max(8, (columns.stop - columns.start) // 2)
         grown = [slice(max(0, s.start - by), min(n, s.stop + by)) for s, by, n in zip((rows, columns), wide, (height, width), strict=True)]
         return cls(rows, columns, *grown)
+
+    def places(self, where: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        """Of the N pixels that are True in bool `[h, w]` of the outer part: places `[N, 2]` down and across the box, -1..1 within it; and
+        their rows and columns in the frame."""
+        y, x = where.nonzero().unbind(1)
+        y, x = y + self.outer_rows.start, x + self.outer_columns.start
+        return self.placed(y, x), (y, x)
+
+    def placed(self, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        """Places `[N, 2]` in the box of rows and columns of the frame."""
+        sides = ((y, self.rows), (x, self.columns))
+        return torch.stack([(at + 0.5 - s.start) / (s.stop - s.start) * 2 - 1 for at, s in sides], -1)
 
 
 def boxes(instance: torch.Tensor) -> dict[int, Box]:
@@ -116,12 +128,10 @@ def spots(mask: torch.Tensor, box: Box, share: float) -> Spots:
     y = (edges[:, :1] + steps * edges[:, 2:3]).clamp(0, mask.shape[0] - 1)
     x = (edges[:, 1:2] + steps * edges[:, 3:]).clamp(0, mask.shape[1] - 1)
     pixels = [_spread(mask.nonzero(), INSIDE), _spread((mask if mask.all() else ~mask).nonzero(), AROUND)]
-    top, left = box.rows.start - box.outer_rows.start, box.columns.start - box.outer_columns.start
-    corner = torch.tensor([top, left], device=mask.device)
-    extent = torch.tensor([box.rows.stop - box.rows.start, box.columns.stop - box.columns.start], device=mask.device)
+    yx = torch.cat([edges[:, :2], *pixels])
     return Spots(
         torch.cat([torch.stack([y, x], -1).flatten(0, 1), *pixels]),
-        (torch.cat([edges[:, :2], *pixels]) + 0.5 - corner) / extent * 2 - 1,
+        box.placed(yx[:, 0] + box.outer_rows.start, yx[:, 1] + box.outer_columns.start),
         edges[:, 2:].float(),
         mask[y, x],
         known,
@@ -181,8 +191,9 @@ class _Round(nn.Module):
         return x + self.think(self.thought(x))
 
 
-class ObjectColour(nn.Module):
-    """Evidence to coefficients `[B, 15]` of a colour change for the whole object; zero at first."""
+class ObjectNet(nn.Module):
+    """Evidence to coefficients `[B, COEFFICIENTS]`, zero at first: of a colour change for the whole object (`changed`), and the optical
+    depths of the shadow that it lacks (`enhance.shade.optical_depth`)."""
 
     def __init__(self, width: int = 96, heads: int = 4, questions: int = 12, rounds: int = 3):
         super().__init__()
@@ -208,43 +219,8 @@ class ObjectColour(nn.Module):
 
 
 def changed(rgb: torch.Tensor, height: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """What `coefficients` `[B, 15]` add to `rgb` `[B, N, 3]` at heights `[B, N]`, -1 at the object's top and 1 at its base: per channel
-    a + b x + c x^2 + d (luma - x) + e height x."""
-    a, b, c, d, e = (coefficients[:, None, i : i + 3] for i in range(0, COEFFICIENTS, 3))
+    """What the first 15 of `coefficients` `[B, ...]` add to `rgb` `[B, N, 3]` at heights `[B, N]`, -1 at the object's top and 1 at its
+    base: per channel a + b x + c x^2 + d (luma - x) + e height x."""
+    a, b, c, d, e = (coefficients[:, None, i : i + 3] for i in range(0, COLOURS, 3))
     luma = (rgb @ rgb.new_tensor(LUMA))[..., None]
     return a + rgb * (b + c * rgb + e * height[..., None]) + d * (luma - rgb)
-
-
-Corrections = Mapping[int, tuple[torch.Tensor, int]]
-"""By object the mean of its coefficients over the last frames, and of how many."""
-
-
-def corrected(net: ObjectColour, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
-    """Frames `[B, 3, H, W]` without a past, with objects by their ids `[B, 1, H, W]`, NaN where not told, as `correct` makes them."""
-    return torch.stack([correct(net, x, torch.nan_to_num(i[0]), {})[0] for x, i in zip(rgb, ids, strict=True)])
-
-
-@torch.no_grad()
-def correct(net: ObjectColour, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
-    """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there, and their corrections."""
-    found = boxes(instance)
-    if not found:
-        return rgb, {}
-    whole, read, masks = whole_of(rgb), [], {}
-    for i, box in found.items():
-        outer = box.outer_rows, box.outer_columns
-        masks[i] = instance[outer] == i
-        at = spots(masks[i], box, float(masks[i].sum()) / instance.numel())
-        y, x = at.yx.unbind(1)
-        read.append(evidence(rgb[(slice(None), *outer)][:, y, x].T, at, whole))
-    out, after = rgb.clone(), {}
-    for (i, box), now in zip(found.items(), net(Evidence.stacked(read)), strict=True):
-        mean, count = before.get(i, (now, 0))
-        mean = mean + (now - mean) / (count + 1)
-        after[i] = mean, min(count + 1, STEADY - 1)
-        y, x = masks[i].nonzero().unbind(1)
-        y, x = y + box.outer_rows.start, x + box.outer_columns.start
-        height = (y + 0.5 - box.rows.start) / (box.rows.stop - box.rows.start) * 2 - 1
-        given = rgb[:, y, x].T
-        out[:, y, x] = (given + changed(given[None], height[None], mean[None])[0]).T.clamp(0, 1)
-    return out, after

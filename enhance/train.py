@@ -20,19 +20,25 @@ from torch.nn import functional as F
 from enhance.autoencoder import Autoencoder
 from enhance.calibrate import calibrate_colour, calibrate_gate
 from enhance.colour import altered_logits, colour_change
+from enhance.corrections import corrected
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
-from enhance.objects import changed, corrected
+from enhance.object_samples import Objects
+from enhance.objects import COLOURS, changed
 from enhance.past import Past
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
+from enhance.shade import optical_depth, shaded
 from enhance.shards import PairSet
 from enhance.weights_file import BUILTIN, load_net, save_net
 from scenes.atomic import atomic_file
 from scenes.names import unknown
 
-NEAR_ENOUGH = 3e-4
-"""Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
+NEAR_ENOUGH = (3e-4, 1e-3)
+"""Squared error of an object's colours, and of the ground around it, below which getting nearer counts for little: 35 and 30 dB. A missing
+shadow costs less than that around it: with a lower one, the fear to shade what is right drowns all else, and no shadow is ever learnt."""
+GROUND = 4.0
+"""Weight of the ground beside the object."""
 STAGES = ("autoencoder", "colour", "objects", "enhancer")
 RATES = {"autoencoder": 2.5, "objects": 2.0}  # of the highest rate
 FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
@@ -286,8 +292,18 @@ def _objects_step(run: _Run, sampler: Sampler, step: int) -> float:
     drawn = sampler.objects(4 * step + 3, run.config.looked_at)
     with autocast(drawn.given.device):
         coefficients = run.net.objects(drawn.evidence)
-    error = (drawn.given + changed(drawn.given, drawn.height, coefficients) - drawn.target).square().mean((1, 2))
-    return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
+    return _update(run, "objects", [objects_loss(drawn, coefficients)])
+
+
+def objects_loss(drawn: Objects, coefficients: torch.Tensor) -> torch.Tensor:
+    """Mean logarithm of the squared error of objects' own pixels and of the ground's after a correction, each above what is near enough."""
+    own, ground = drawn.given.chunk(2, 1)
+    places, around = drawn.places.chunk(2, 1)
+    right = own + changed(own, places[..., 0], coefficients)
+    dark = shaded(ground, optical_depth(around, coefficients[:, COLOURS:]))
+    errors = [(x - wanted).square().mean((1, 2)) for x, wanted in zip((right, dark), drawn.target.chunk(2, 1), strict=True)]
+    of_object, of_ground = (torch.log(error + enough).mean() for error, enough in zip(errors, NEAR_ENOUGH, strict=True))
+    return of_object + GROUND * of_ground
 
 
 CROPS = (1.0, 1.0, 1.5, 2.0)

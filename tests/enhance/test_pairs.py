@@ -13,6 +13,7 @@ from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
 from enhance.pairs import kinds_for, make_pairs, prepare_sources
+from enhance.photo_pairs import make_photo_pairs
 from enhance.refits import REFITS, Refit, shots_of
 from enhance.shards import KINDS, PairSet
 from recon.log import Log, LogCamera
@@ -198,3 +199,17 @@ def test_damaged_pair_folders_say_what_to_do(tmp_path):
     (tmp_path / "isp" / "a.json").write_text(json.dumps({"frames": 1, "height": 2, "width": 2, "kind": "isp", "split": "train"}))
     with pytest.raises(FileNotFoundError, match="a.safetensors"):
         PairSet(tmp_path)
+
+
+def test_photos_become_pairs_that_are_held_out_and_told_their_region(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for i in range(3):
+        write_image(tmp_path / "photos" / f"{i}.png", torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(i)))
+    pairs = PairSet(make_photo_pairs([tmp_path / "photos"], tmp_path / "made", seed=2, width=64))
+    assert len(pairs.of("isp", "held out")) == len(pairs.of("clean", "held out")) == 3 and not pairs.of(split="train")
+    for altered, right in zip(pairs.of("isp"), pairs.of("clean"), strict=True):
+        a, b = altered.window(), right.window()
+        assert torch.equal(b.input, b.target) and torch.equal(a.target, b.target) and b.region.max() == 0
+        changed = (a.input != a.target).any(1, keepdim=True)
+        assert changed.any() and not changed[a.region == 0].any()
+        assert torch.equal(a.instance, b.instance) and ((a.instance == 1) == (a.region > 0.5)).float().mean() > 0.99

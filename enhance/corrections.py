@@ -1,0 +1,70 @@
+"""What is done to told objects, frame by frame: their colours and missing shadows, as `ObjectNet` finds them, held steady over a clip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from enhance.objects import COLOURS, Box, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
+from enhance.shade import NONE, optical_depth, shaded
+
+STEADY = 8
+"""Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
+
+Corrections = Mapping[int, tuple[torch.Tensor, int]]
+"""By object the mean of its coefficients over the last frames, and in how many it was seen."""
+
+
+def corrected(net: ObjectNet, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    """Frames `[B, 3, H, W]` without a past, with objects by their ids `[B, 1, H, W]`, NaN where not told, as `correct` makes them."""
+    return torch.stack([correct(net, x, torch.nan_to_num(i[0]), {})[0] for x, i in zip(rgb, ids, strict=True)])
+
+
+@torch.no_grad()
+def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
+    """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there and the shadows that they
+    lacked, and their corrections, to be passed with the next frame. Pixels that are neither an object's nor shaded stay as they are."""
+    found = boxes(instance)
+    masks = {i: instance[box.outer_rows, box.outer_columns] == i for i, box in found.items()}
+    after = _looked_at(net, rgb, found, masks, before)
+    out, ground = rgb.clone() if found else rgb, instance <= 0
+    for i, box in found.items():
+        coefficients = after[i][0][None]
+        _shade(out, box, ground[box.outer_rows, box.outer_columns], coefficients[:, COLOURS:])
+        places, (y, x) = box.places(masks[i])
+        given = rgb[:, y, x].T
+        out[:, y, x] = (given + changed(given[None], places[None, :, 0], coefficients)[0]).T.clamp(0, 1)
+    return out, after
+
+
+def _looked_at(
+    net: ObjectNet, rgb: torch.Tensor, found: dict[int, Box], masks: dict[int, torch.Tensor], before: Corrections
+) -> dict[int, tuple[torch.Tensor, int]]:
+    """Objects' corrections after this frame: those that are due are looked at anew."""
+    counts = {i: before[i][1] if i in before else 0 for i in found}
+    due = [i for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0]  # not all in the same frame
+    new: dict[int, torch.Tensor] = {}
+    if due:
+        whole, read = whole_of(rgb), []
+        for i in due:
+            at = spots(masks[i], found[i], float(masks[i].sum()) / rgb[0].numel())
+            y, x = at.yx.unbind(1)
+            read.append(evidence(rgb[:, found[i].outer_rows, found[i].outer_columns][:, y, x].T, at, whole))
+        new = dict(zip(due, net(Evidence.stacked(read)), strict=True))
+    after = {}
+    for i, count in counts.items():
+        mean = before[i][0] if i in before else new[i]
+        if i in new:
+            mean = mean + (new[i] - mean) / min(count + 1, STEADY)
+        after[i] = mean, count + 1
+    return after
+
+
+def _shade(out: torch.Tensor, box: Box, ground: torch.Tensor, depths: torch.Tensor) -> None:
+    """Darken, in the picture `out` `[3, H, W]`, the `ground` `[h, w]` of a box's outer part."""
+    places, (y, x) = box.places(ground)
+    depth = optical_depth(places[None], depths)[0]
+    dark = depth > NONE
+    y, x = y[dark], x[dark]
+    out[:, y, x] = shaded(out[:, y, x].T, depth[dark] - NONE).T

@@ -1,0 +1,39 @@
+"""The shadow that an object lacks: how much darker the ground around it should be, on a small grid that goes with its box.
+
+Where an object meets the ground, and how far its shadow reaches, is much the same for every car once places are measured in boxes, so
+a few numbers tell it: optical depths at knots that are dense along the object's base, between which hats interpolate.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from scenes.sky import linear_from_srgb, srgb_from_linear
+
+DOWN = (-0.4, 0.2, 0.6, 0.9, 1.1, 1.4, 2.0)
+"""Heights in the box of the knots, -1 its top and 1 its base; at the first and the last there is no shadow."""
+ACROSS = (-2.2, -1.6, -1.1, -0.6, -0.2, 0.2, 0.6, 1.1, 1.6, 2.2)
+"""The same across the box, -1 its left and 1 its right side."""
+KNOTS = (len(DOWN) - 2) * (len(ACROSS) - 2)
+NONE = 0.02
+"""Optical depth up to which the ground stays as it is."""
+
+
+def optical_depth(places: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
+    """At places `[B, N, 2]` (down and across the box) between the knots' `depths` `[B, KNOTS]`: `[B, N]`; of a trained network's it may
+    be a little below 0."""
+    down, across = (_hats(places[..., i], knots) for i, knots in enumerate((DOWN, ACROSS)))
+    grid = depths.unflatten(-1, (down.shape[-1], across.shape[-1]))
+    return torch.einsum("bnd,bdk,bnk->bn", down, grid, across)
+
+
+def shaded(rgb: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    """sRGB `[..., 3]` behind an optical depth `[...]`: light times exp(-depth)."""
+    return srgb_from_linear(linear_from_srgb(rgb.clamp(0, 1)) * torch.exp(-depth)[..., None])
+
+
+def _hats(x: torch.Tensor, knots: tuple[float, ...]) -> torch.Tensor:
+    """How much each inner knot counts at `x` `[...]`: 1 there, falling to 0 at its neighbours, `[..., len(knots) - 2]`."""
+    before, at, after = (torch.tensor(knots[i : len(knots) - 2 + i], device=x.device) for i in range(3))
+    x = x[..., None]
+    return torch.minimum((x - before) / (at - before), (after - x) / (after - at)).clamp_min(0)
