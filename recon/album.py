@@ -52,10 +52,10 @@ def at_once(scene: Scene, camera: Camera, rig: RigCamera, photo: torch.Tensor) -
     rays = camera_rays(camera)
     points = rays * torch.where(sky, FAR, frame.depth)[..., None]
     moved = points.clone()
-    for p in scene.placed(camera.time_us):
-        mine = (frame.instance == p.instance) | sky if p.instance == 0 else frame.instance == p.instance
-        if not mine.any():
-            continue
+    instance = torch.where(sky, 0, frame.instance)
+    seen = set(instance.unique().tolist())
+    for p in (p for p in scene.placed(camera.time_us) if p.instance in seen):
+        mine = instance == p.instance
         still = p.world_from_local
         path = scene.actors[p.instance - 1].trajectory if p.instance else None
         poses = [still if path is None else path.near(t) for t in (first, last)]

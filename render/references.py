@@ -84,6 +84,13 @@ class _Seen:
     instance: torch.Tensor
     placed: list[Placed]
 
+    @classmethod
+    def of(cls, frame: Frame, detail: torch.Tensor, instance: torch.Tensor, placed: list[Placed]) -> _Seen:
+        """Of a frame with its detail `[H, W, C]`."""
+        assert frame.depth is not None and frame.instance is not None
+        depth = torch.where(frame.instance < 0, torch.inf, frame.depth)
+        return cls(frame.camera, detail.permute(2, 0, 1)[None], depth, instance, placed)
+
 
 class References:
     """The shots of a scene, for the frames of clips of it."""
@@ -110,26 +117,27 @@ class References:
         """
         last: _Seen | None = None
         for i, frame in enumerate(frames):
-            detail = self._detail(frame, predicted[i:])
+            assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
+            placed, clear = self.shown.placed(frame.camera.time_us), ~_mixed(frame)
+            detail = self._detail(frame, placed, clear, predicted[i:])
             if last is not None:
-                carried, shown = self._moved(frame, last)
+                carried, shown = _moved(frame, placed, clear, last)
                 detail = torch.lerp(detail, carried, CARRIED * shown[..., None])
-            last = self._view(frame, detail, frame.instance, self.shown.placed(frame.camera.time_us))
-            assert frame.rgb is not None
+            last = _Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
             difference, trust = detail[..., :3], detail[..., 3]
             reference = frame.rgb + difference / trust.clamp_min(1e-9)[..., None]
             yield replace(frame, reference=reference.clamp(0, 1), trust=trust)
 
-    def _detail(self, frame: Frame, predicted: Sequence[Camera]) -> torch.Tensor:
+    def _detail(self, frame: Frame, placed: list[Placed], clear: torch.Tensor, predicted: Sequence[Camera]) -> torch.Tensor:
         """What the photos add to a frame, and how far that is to be trusted, `[H, W, 4]`: the former is weighted by the latter already."""
-        assert frame.rgb is not None and frame.depth is not None
+        assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
         total, weight = torch.zeros_like(frame.rgb), torch.zeros_like(frame.depth)
         distance = frame.depth * camera_rays(frame.camera).to(frame.depth).norm(dim=-1)
         for index, share in self.chosen(frame, predicted):
             seen = self._seen(index, frame.camera.width, frame.rgb.device)
-            difference, shown = self._moved(frame, seen)
+            difference, shown = _moved(frame, placed, clear, seen)
             baseline = (self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm().float()
-            parallax = torch.where(_sky(frame), 0.0, baseline / distance)
+            parallax = torch.where(frame.instance < 0, 0.0, baseline / distance)
             sure = share * shown / (NOISE + parallax / PARALLAX)
             total += sure[..., None] * difference
             weight += sure
@@ -183,38 +191,28 @@ class References:
             assert frame.rgb is not None and frame.instance is not None
             photo = torch.from_numpy(np.array(shot.read(camera.width, camera.height))).to(device).float() / 255
             placed = [replace(p, instance=int(self.ids[p.instance])) for p in self.recorded.placed(camera.time_us)]
-            instance = self.ids.to(device)[frame.instance.long()]
-            self.kept[key] = self._view(frame, photo - frame.rgb.clamp(0, 1), instance, placed)
+            instance = torch.where(_mixed(frame), GONE, self.ids.to(device)[frame.instance.long()])
+            self.kept[key] = _Seen.of(frame, photo - frame.rgb.clamp(0, 1), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:
             self.kept.popitem(last=False)
         return self.kept[key]
 
-    def _view(self, frame: Frame, detail: torch.Tensor, instance: torch.Tensor | None, placed: list[Placed]) -> _Seen:
-        assert frame.depth is not None and instance is not None
-        depth = torch.where(_sky(frame), torch.inf, frame.depth)
-        return _Seen(frame.camera, detail.permute(2, 0, 1)[None], depth, torch.where(_mixed(frame), GONE, instance), placed)
 
-    def _moved(self, frame: Frame, seen: _Seen) -> tuple[torch.Tensor, torch.Tensor]:
-        """A view's detail as the frame sees it `[H, W, C]`, and where it shows the same surface `[H, W]`, 0 or 1."""
-        assert frame.depth is not None and frame.instance is not None
-        there = seen.camera
-        found = correspond(self.shown.placed(frame.camera.time_us), frame.camera, frame.depth, frame.instance, seen.placed, there)
-        side = torch.tensor([there.width, there.height], device=found.pixels.device)
-        grid = torch.nan_to_num(found.pixels / side * 2 - 1, nan=-9.0)[None].float()
-        moved = F.grid_sample(seen.detail, grid, mode="bicubic", padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
-        who = F.grid_sample(seen.instance[None, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)[0, 0]
-        return moved, (found.visible(seen.depth) & (who == frame.instance) & ~_mixed(frame)).float()
+def _moved(frame: Frame, placed: list[Placed], clear: torch.Tensor, seen: _Seen) -> tuple[torch.Tensor, torch.Tensor]:
+    """A view's detail as a frame sees it `[H, W, C]`, and where, if that is `clear`, it shows the same surface `[H, W]`, 0 or 1."""
+    assert frame.depth is not None and frame.instance is not None
+    found = correspond(placed, frame.camera, frame.depth, frame.instance, seen.placed, seen.camera)
+    side = torch.tensor([seen.camera.width, seen.camera.height], device=found.pixels.device)
+    grid = torch.nan_to_num(found.pixels / side * 2 - 1, nan=-9.0)[None].float()
+    moved = F.grid_sample(seen.detail, grid, mode="bicubic", padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
+    who = F.grid_sample(seen.instance[None, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)[0, 0]
+    return moved, (found.visible(seen.depth) & (who == frame.instance) & clear).float()
 
 
 def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:
     """An actor's instance in the frames; GONE where these show none of its track, or put another thing in its place."""
     return instance if shown is not None and torch.equal(asset.gaussians.means, shown.gaussians.means) else GONE
-
-
-def _sky(frame: Frame) -> torch.Tensor:
-    assert frame.depth is not None and frame.instance is not None
-    return frame.depth.isinf() | (frame.instance < 0)
 
 
 def _mixed(frame: Frame) -> torch.Tensor:

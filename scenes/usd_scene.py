@@ -7,6 +7,7 @@ actors/*.usdc     one asset each, referenced by /World/Actors/<track>, whose tra
 edits/*.usda      sublayers that add, change and remove actors without touching the rest (scenes/usd_edit.py)
 ground.usdc       the height field as a mesh, referenced by /World/Ground; a guide: not rendered
 sky_linear.hdr    the texture of /World/Lights/Sky
+photos/           what the scene was made from, where it was kept (render/album.py)
 metadata.json     what USD cannot carry exactly: lenses, image sizes, exposures, capture times, the splat model, metadata
 
 /World/Ego carries the body's trajectory and its cameras, fixed to it. Every fact stands in one place only.
