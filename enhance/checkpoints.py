@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 import zipfile
 from collections.abc import Mapping
@@ -41,7 +42,7 @@ def open_public(path: str | Path, device: str | torch.device = "cpu", **how) -> 
     about = {"model": model.name, "file": str(path), "weights used": weights, "unverified": "never run with the released weights here"}
     if isinstance(model, WhiteBox):
         return WhiteBoxEnhancer(model, about, device, **how)
-    return PublicEnhancer(model, about, device, **how)
+    return PublicEnhancer(model, about | {"left out": list(model.left_out)}, device, **how)
 
 
 def _folder(path: Path) -> Model:
@@ -94,14 +95,16 @@ def _file(path: Path) -> Model | WhiteBox:
     if isinstance(transformer, Mapping) and isinstance(vae, Mapping):
         if "rank_vae" in state:
             raise ValueError(f"{path} holds what Difix was trained by on top of SD-Turbo; give the folder nvidia/difix, which is whole")
-        strange = sorted(set(map(str, state)) - {"state_dict_unet", "state_dict_vae", *TRAINING})
+        beside = {str(name): value for name, value in state.items() if name not in ("state_dict_unet", "state_dict_vae")}
+        strange = sorted(n for n, v in beside.items() if n not in TRAINING and isinstance(v, Mapping | torch.Tensor))
         if strange:
             raise ValueError(f"{path} has the unknown part {strange[0]}; give {KNOWN}")
+        left_out = (*sorted(beside), *sorted({str(name).split(".")[0] + ".*" for name in transformer if "_ema." in str(name)}))
         if "conv1.weight" in vae or "encoder.conv1.weight" in vae:
-            return read_cosmos(path, transformer, vae, "NVIDIA Harmonizer", 4)
+            return _without(read_cosmos(path, transformer, vae, "NVIDIA Harmonizer", 4), left_out)
         if part(vae, "encoder.") and part(vae, "decoder."):
             tokenizer = _tokenizer(path)
-            return read_fixer(path, transformer, vae, tokenizer, read_state(tokenizer))
+            return _without(read_fixer(path, transformer, vae, tokenizer, read_state(tokenizer)), left_out)
     if "regressor.f.weight" in state:
         return WhiteBox.read(path, state)
     if any(str(name).removeprefix("net.").startswith("blocks.") for name in state):
@@ -110,6 +113,11 @@ def _file(path: Path) -> Model | WhiteBox:
         raise ValueError(f"{path} is the Wan autoencoder alone; give the folder with model.pt in it, or a Harmonizer's .pkl")
     first = ", ".join(map(str, list(state)[:3]))
     raise ValueError(f"{path} is no enhancer that is known, it holds {first or 'nothing'}; give {KNOWN}")
+
+
+def _without(model: Model, names: tuple[str, ...]) -> Model:
+    model.left_out = names
+    return model
 
 
 def _tokenizer(path: Path) -> Path:
@@ -150,12 +158,14 @@ def read_state(path: Path) -> dict:
         except SafetensorError as error:
             raise ValueError(f"{path} is not a whole safetensors file ({error}); fetch it again") from error
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+        with torch.serialization.safe_globals([io.BytesIO]):  # Transformer Engine's state beside the weights; bytes, never run
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except pickle.UnpicklingError as error:
-        why = next((line.strip() for line in str(error).splitlines() if "GLOBAL" in line or "global" in line), "it is cut off or damaged")
+        told = [line.strip() for line in str(error).splitlines() if "global" in line.lower()]
+        why = told[0] if told else "it is no checkpoint, or damaged"
         raise ValueError(f"{path} does not open as tensors alone: {why}; fetch it again, or re-save its state dicts alone") from error
     except (RuntimeError, EOFError, KeyError, ValueError, zipfile.BadZipFile, UnicodeDecodeError) as error:
-        why = (str(error).strip().splitlines() or ["it ends too early"])[0]
+        why = (str(error).strip().splitlines() or ["it ends too early"])[0].split(". ")[0]
         raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, not tensors by name; give {KNOWN}")

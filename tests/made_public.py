@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -68,9 +69,10 @@ def harmonizer(path: Path, net, vae, **more) -> Path:
 
 
 def base(folder: Path, net, vae) -> Path:
-    """The folder of nvidia/Cosmos-Predict2-0.6B-Text2Image."""
+    """The folder of nvidia/Cosmos-Predict2-0.6B-Text2Image, with what Transformer Engine leaves in a state dict."""
     (folder / "tokenizer").mkdir(parents=True)
-    torch.save(prefixed("net.", transformer_state(net)), folder / "model.pt")
+    engine = {"blocks.0.self_attn.attn_op._extra_state": io.BytesIO(b"some"), "t_embedding_norm._extra_state": torch.zeros(0).byte()}
+    torch.save(prefixed("net.", transformer_state(net) | engine), folder / "model.pt")
     torch.save(autoencoder_state(vae), folder / "tokenizer" / "tokenizer.pth")
     return folder
 

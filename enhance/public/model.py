@@ -12,6 +12,7 @@ class Model(nn.Module):
     multiple  of which both sides must be
     window    rows and columns that it takes, and no others; any if None
     history   how many of its last results it takes beside the frame: all of those, or none
+    left_out  what else stands in its file, and is of no use here
     takes_reference  whether a clean picture of the same place may come second
     """
 
@@ -20,6 +21,7 @@ class Model(nn.Module):
     window: tuple[int, int] | None = None
     history = 0
     takes_reference = False
+    left_out: tuple[str, ...] = ()
 
     def forward(self, clip: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError

@@ -107,6 +107,11 @@ def test_harmonizer_runs_as_its_release_does_alone_and_with_four_results(nets, h
     assert not torch.allclose(alone, better, atol=1e-3)
 
 
+def test_what_is_of_no_use_is_left_out_and_said(harmonizer):
+    about = Enhancer.load(harmonizer).about
+    assert about["left out"] == ["net_disc", "optimizer", "optimizer_disc", "net_ema.*"]
+
+
 def test_history_can_be_left_out(harmonizer):
     enhancer, memory = Enhancer.load(harmonizer, bfloat16=False, history=0), None
     for _ in range(6):
@@ -175,6 +180,7 @@ def test_what_is_missing_unknown_or_misshapen_is_named(parts, tmp_path):
     unet["controlnet.weight"] = kept
     broken(parts, tmp_path, "unknown controlnet.weight")
     del unet["controlnet.weight"]
+    broken(parts | {"state_dict_controlnet": {"weight": kept}}, tmp_path, "unknown part state_dict_controlnet")
     vae["decoder.middle.3.gamma"] = kept
     broken(parts, tmp_path, "unknown decoder.middle.3.gamma of the Wan 2.1 autoencoder")
     del vae["decoder.middle.3.gamma"]
