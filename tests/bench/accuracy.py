@@ -20,7 +20,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from render.kernels.rows import EXP
-from render.kernels.types import Wanted, X, Y
+from render.kernels.types import X_REST, Y_REST, Wanted, X, Y
 from render.settings import Settings
 from scenes import Camera, Pinhole, Placed, SplatModel
 from scenes.poses import translation
@@ -149,7 +149,8 @@ def ut_in_pixels(count: int = 20_000) -> dict[str, float]:
     axes = oracle.matrix_from_quat(field["quats"]) * field["log_scales"].exp()[:, None, :]
     mean, _ = oracle.project_ut(points, axes, camera.lens.params(), camera.width, camera.height)
     drawn = kept.scene.counts > 0
-    off = (kept.scene.records[drawn][:, [int(X), int(Y)]].double() - mean[drawn]).norm(dim=1).sort().values
+    centres = sum(kept.scene.records[drawn][:, [int(i) for i in part]].double() for part in ((X, Y), (X_REST, Y_REST)))
+    off = (centres - mean[drawn]).norm(dim=1).sort().values
     return {"median": float(off[len(off) // 2]), "p99": float(off[int(0.99 * len(off))]), "max": float(off[-1])}
 
 

@@ -62,6 +62,25 @@ def test_forward_agrees_with_the_oracle(make, model):
     assert largest(terminated.rgb, rgb, sure) < 1e-4 * max(1.0, float(rgb.detach().max()))
 
 
+@pytest.mark.parametrize("width, height", [(3840, 2160), (960, 540)])
+def test_a_corner_far_from_the_origin_is_as_exact_as_the_middle(width, height):
+    """Splats smaller than a pixel in the corner of a large image, and the oracle's picture of that corner alone: 3,800 pixels from the
+    origin a float has 2e-4 pixels, which would show as 1e-4 of a colour."""
+    corner = width - 80, height - 60
+    dice = torch.Generator().manual_seed(1)
+    g = random_splats(200, 1)
+    z = 3 + 4 * torch.rand(200, generator=dice)
+    pixels = torch.rand(200, 2, generator=dice) * torch.tensor([70.0, 50.0]) + torch.tensor(corner) - torch.tensor([width, height]) / 2
+    means = torch.cat([pixels / 2000 * z[:, None], z[:, None]], 1)
+    g = replace(g, means=means, log_scales=-6.5 + 0.5 * torch.randn(200, 3, generator=dice))
+    still = torch.eye(4, dtype=torch.float64)
+    whole = Camera(Pinhole(2000.0, 2000.0, width / 2, height / 2), width, height, still)
+    alone = Camera(Pinhole(2000.0, 2000.0, width / 2 - corner[0], height / 2 - corner[1]), 70, 50, still)
+    rgb, *_, unsure = oracle.render(oracle.as_oracle([Placed(g, still)]), alone, SplatModel(), cutoff=1 / 255, alpha_max=0.999)
+    frame = rasterize(g, whole, ("rgb",), config=RenderConfig(termination=0), crop=(*corner, 70, 50))
+    assert largest(frame.rgb, rgb, ~unsure) < 2e-6 * max(1.0, float(rgb.detach().max()))
+
+
 def assert_gradient(name: str, mine: torch.Tensor, reference: torch.Tensor) -> None:
     error = (mine.double() - reference).abs()
     allowed = 1e-3 * reference.abs() + 1e-6 * reference.abs().max()
