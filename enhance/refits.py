@@ -47,9 +47,7 @@ class Refit:
     cameras: tuple[str, ...]
 
 
-def refits(
-    kind: str, scene: Scene, log: Log, folder: str | Path, config: FitConfig = SHORT, size: tuple[int, int] = SIZE
-) -> list[Refit]:
+def refits(kind: str, scene: Scene, log: Log, folder: str | Path, config: FitConfig = SHORT, size: tuple[int, int] = SIZE) -> list[Refit]:
     """The reconstructions of one of REFITS of a `scene` that was made from `log`; kept in `folder`, and read there where they are already.
 
     A fit takes some minutes. Raises ValueError where the rig has too few cameras or frames.

@@ -46,18 +46,22 @@ def _of_items(clusters: torch.Tensor, splats: int) -> torch.Tensor:
 
 def those_in_sight(placed: Sequence[Placed], seen: Sequence[torch.Tensor | None]) -> list[Placed]:
     """Copies of `placed` without what is not seen."""
-    return [p if s is None else replace(p, gaussians=_select(p.gaussians, s)) for p, s in zip(placed, seen, strict=True)]
+    return [replace(p, gaussians=p.gaussians.select(splats_in_sight([p], [s]))) for p, s in zip(placed, seen, strict=True)]
 
 
-def _select(g: Gaussians, items: torch.Tensor) -> Gaussians:
-    return g.select(items.repeat_interleave(ITEM)[: len(g)].nonzero()[:, 0].to(g.device))
+def splats_in_sight(placed: Sequence[Placed], seen: Sequence[torch.Tensor | None]) -> torch.Tensor:
+    """int64 `[M]`, of all splats of `placed`, one after the other, those that are projected."""
+    sizes = [len(p.gaussians) for p in placed]
+    shown = [torch.ones(n, dtype=torch.bool) if s is None else s.repeat_interleave(ITEM)[:n] for s, n in zip(seen, sizes, strict=True)]
+    return torch.cat(shown).nonzero()[:, 0].to(placed[0].gaussians.device)
 
 
-def differentiated(placed: Sequence[Placed], camera: Camera) -> bool:
+def differentiated(placed: Sequence[Placed], camera: Camera, features: torch.Tensor | Sequence[torch.Tensor] | None = None) -> bool:
     """Whether autograd will ask for a gradient of anything here."""
     if not torch.is_grad_enabled():
         return False
     tensors = [t for p in placed for t in (p.world_from_local, p.world_from_local_end, *p.gaussians.tensors().values())]
+    tensors += [] if features is None else [features] if isinstance(features, torch.Tensor) else features
     tensors += [camera.world_from_cam, camera.world_from_cam_end, camera.lens.params()]
     return any(t is not None and t.requires_grad for t in tensors)
 

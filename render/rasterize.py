@@ -10,8 +10,8 @@ import torch
 
 from render.bands import without_zero_bands
 from render.bridge import Rasterize
-from render.channels import SUMMED, Features, channel_fields, unit
-from render.cull import differentiated, in_sight, those_in_sight
+from render.channels import Features, channel_fields, unit
+from render.cull import differentiated, in_sight, splats_in_sight, those_in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
 from render.frames import canonical_frames
@@ -90,13 +90,14 @@ def rasterize(
 
 def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
     seen = None
-    if not differentiated(placed, camera):
+    if not differentiated(placed, camera, features):
         placed = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
-        if not any(o in outputs for o in SUMMED):
-            seen = in_sight(placed, camera, model)
+        seen = in_sight(placed, camera, model)
     cam_from_local = poses(camera, placed)
     summed = channel_fields(outputs, placed, cam_from_local[:, 0], features)
     channels = torch.cat(list(summed.values()), 1) if summed else None
+    if channels is not None and seen is not None:
+        channels = channels[splats_in_sight(placed, seen)]
     flows = any(o.startswith(("flow_", "visible_")) for o in outputs)
     settings = Settings(
         width=camera.width,

@@ -62,6 +62,17 @@ class Trajectory:
         t0, t1 = self.times_us[later - 1 : later + 1].tolist()
         return self.world_from_body[later - 1], self.world_from_body[later], (time_us - t0) / (t1 - t0)
 
+    def at_each(self, times_us: torch.Tensor) -> torch.Tensor:
+        """`world_from_body` `[n, 4, 4]` at times int64 `[n]`, as `at` gives them one by one. ValueError where one is not covered."""
+        if len(times_us) and not (self.covers(int(times_us.min())) and self.covers(int(times_us.max()))):
+            return torch.stack([self.at(int(t)) for t in times_us])  # which names the one
+        if len(self) == 1:
+            return self.world_from_body.expand(len(times_us), 4, 4)
+        later = torch.searchsorted(self.times_us, times_us).clamp(1, len(self) - 1)
+        before, after = self.times_us[later - 1], self.times_us[later]
+        share = (times_us - before).double() / (after - before)
+        return interpolate(self.world_from_body[later - 1], self.world_from_body[later], share)
+
     def near(self, time_us: int) -> torch.Tensor:
         """`world_from_body` `[4, 4]` at a time, or at the nearest that is covered: where a readout ends after the path does."""
         first, last = self.span_us()

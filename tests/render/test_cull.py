@@ -39,9 +39,11 @@ def test_a_picture_of_what_is_in_sight_is_the_picture_of_all(seed, monkeypatch):
     placed = [Placed(scattered(seed), translation(0, 0, 2)), Placed(scattered(seed + 9, 3), translation(0, 1, 3), instance=4)]
     seen = in_sight(placed, turned, SplatModel())
     assert 0 < int(torch.cat(seen).sum()) < 0.7 * sum(len(p.gaussians) for p in placed) / ITEM
-    culled = rasterize(placed, turned, ("rgb", "depth", "instance"))
+    outputs = ("rgb", "depth", "instance", "normal", "features")
+    features = torch.randn(sum(len(p.gaussians) for p in placed), 2, generator=torch.Generator().manual_seed(seed))
+    culled = rasterize(placed, turned, outputs, features=features)
     monkeypatch.setattr(sys.modules["render.rasterize"], "in_sight", lambda placed, *_: None)
-    whole = rasterize(placed, turned, ("rgb", "depth", "instance"))
+    whole = rasterize(placed, turned, outputs, features=features)
     for name, picture in culled.outputs().items():
         assert torch.equal(picture, getattr(whole, name)), name
 
@@ -61,6 +63,10 @@ def test_bounds_are_kept_until_the_splats_change():
 
 
 def test_what_needs_gradients_is_not_culled():
+    features = torch.ones(20, 1).requires_grad_()
+    behind = Placed(random_splats(20, 2), translation(0, 0, -9))
+    rasterize(behind, CAMERA, ("features",), features=features).features.sum().backward()
+    assert features.grad.shape == (20, 1) and features.grad.abs().max() == 0
     g = random_splats(20, 2).map(lambda t: t.requires_grad_())
     behind = [Placed(g, translation(0, 0, -9))]
     rasterize(behind, CAMERA).rgb.sum().backward()

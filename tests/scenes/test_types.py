@@ -201,3 +201,12 @@ def test_poses_of_many_trajectories_are_those_of_each():
         for mine, alone in zip(all_at(paths, time), [p.at(time) for p in paths], strict=True):
             torch.testing.assert_close(mine, alone, atol=1e-12, rtol=0)
     assert all_at([], 0) == []
+
+
+def test_a_trajectory_at_many_times_is_the_trajectory_at_each():
+    path = Trajectory(torch.tensor([0, 100, 250]), torch.stack([pose_from([1, 0.1 * k, 0, 0.2 * k], [k, 2 * k, 0]) for k in range(3)]))
+    times = torch.tensor([-40, 0, 55, 100, 249, 260])
+    assert torch.allclose(path.at_each(times), torch.stack([path.at(int(t)) for t in times]), rtol=0, atol=1e-15)
+    assert path.at_each(times[:0]).shape == (0, 4, 4)
+    with pytest.raises(ValueError, match="time 900 us is outside"):
+        path.at_each(torch.tensor([0, 900]))
