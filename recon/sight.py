@@ -20,11 +20,10 @@ Eye = tuple[Camera, torch.Tensor, torch.Tensor]
 
 def in_sight(splats: Splats, eyes: Sequence[Eye], actors: Sequence[int]) -> torch.Tensor:
     """Indices int64 `[M]`, rising, of the background's splats that one of `eyes` may see, and of all splats of the groups `actors`."""
-    seen = torch.zeros(len(splats), dtype=torch.uint8)
-    still = splats.sizes[0]
+    still, device = splats.sizes[0], splats.reach.device
+    seen = torch.zeros(len(splats), dtype=torch.uint8, device=device)
     if all(isinstance(camera.lens, Pinhole | OpenCV) for camera, *_ in eyes):
-        sides = torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes])
-        device = splats.reach.device
+        sides = torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes]).to(device)
         with stage(device):
             fields = [view(splats.fields[name], wp.vec3) for name in ("means", "log_scales")]
             run(mark, still, [*fields, view(sides, wp.vec4), view(seen, wp.uint8)], device)

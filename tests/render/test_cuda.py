@@ -7,6 +7,9 @@ import pytest
 import torch
 import warp as wp
 
+from recon.kernels import descent as descent_kernels
+from recon.kernels import develop as develop_kernels
+from recon.kernels import sight as sight_kernels
 from render import rasterize
 from render.bridge import Rasterize
 from render.bridge import _told as told
@@ -35,6 +38,9 @@ KERNELS = {
     "moving fisheye backward": lambda: lens_kernels(LENS_FUNCTIONS["fisheye"], True).backward,
     "trace": lambda: trace_kernels.trace_surface,
     "bin": lambda: bin_kernels.emit_pairs,
+    "descent": lambda: descent_kernels.descend,
+    "develop": lambda: develop_kernels.develop_backward,
+    "sight": lambda: sight_kernels.mark,
     "composite": lambda: composite_blocks(EVERYTHING, TILE),
     "composite backward": lambda: composite_blocks_gradient(EVERYTHING, TILE),
 }
