@@ -37,6 +37,7 @@ def references_of(folder: Path, scene: Scene) -> References | None:
         Shot(scene.camera(name, int(file.stem)), partial(_read, file))
         for name in scene.rig
         for file in sorted((folder / FOLDER / name).glob("*.jpg"))
+        if file.stem.isdecimal()
     ]
     if not shots:
         return None

@@ -124,7 +124,7 @@ class References:
                 carried, shown = _moved(frame, placed, clear, last)
                 detail = torch.lerp(detail, carried, CARRIED * shown[..., None])
             last = _Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
-            difference, trust = detail[..., :3], detail[..., 3]
+            difference, trust = detail[..., :3], detail[..., 3].clamp(0, 1)  # where it was carried, a cubic may overshoot
             reference = frame.rgb + difference / trust.clamp_min(1e-9)[..., None]
             yield replace(frame, reference=reference.clamp(0, 1), trust=trust)
 

@@ -1,18 +1,26 @@
 """Whole videos."""
 
+import numpy as np
 import pytest
 import torch
 from small_net import SMALL
 
-from enhance.clip import enhance_video
+from enhance.clip import enhance_video, enhancement
 from enhance.enhancer import Enhancer
 from enhance.net import Net
+from enhance.weights_file import save_net
+from render.clip import render_clip
+from render.references import References, Shot
 from render.video import VideoWriter, read_video
 
 
 @pytest.fixture(scope="module")
 def enhancer():
     return Enhancer(Net(SMALL))
+
+
+def times(scene):
+    return scene.frame_times("front_camera")
 
 
 def write(path, count=4, width=50, height=34):
@@ -47,3 +55,14 @@ def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
     write(tmp_path / "in.mp4")
     with pytest.raises(ValueError, match="itself"):
         enhance_video(tmp_path / "in.mp4", tmp_path / "in.mp4", enhancer)
+
+
+def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
+    save_net(Net(SMALL), tmp_path / "untrained.safetensors", {})
+    bright = [Shot(street.camera("front_camera", int(t)), lambda w, h: np.full((h, w, 3), 255, np.uint8)) for t in times(street)]
+    finish, reads = enhancement(str(tmp_path / "untrained.safetensors"), references=References(bright, street))
+    frames = list(render_clip(street, "front_camera", 0.5, times(street)[:3], outputs=reads))
+    for before, after in zip(frames, finish(iter(frames)), strict=True):
+        assert after.rgb.mean() > before.rgb.mean() + 0.2
+    without, fewer = enhancement(str(tmp_path / "untrained.safetensors"))
+    assert set(fewer) < set(reads) and torch.equal(next(without(iter(frames))).rgb, frames[0].rgb.clamp(0, 1))
