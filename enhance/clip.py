@@ -13,9 +13,6 @@ from render.references import READS as NEEDED
 from render.references import References
 from scenes.opening import warn
 
-READS = ("flow_prev", "instance")  # outputs of a rendered frame that the enhancer uses beside rgb, and beside what references read
-
-
 HUGE = 50_000_000
 """Weights from which a model is no matter of milliseconds on a CPU."""
 
@@ -31,7 +28,7 @@ def load_saying(weights: str, device: str = "cpu") -> Steps:
 
 
 def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
-    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in READS."""
+    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`."""
     memory = None
     for frame in frames:
         better, memory = enhancer.step(frame, memory)
@@ -44,9 +41,10 @@ def enhancement(
     """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads. references: of the scene, if it
     has photos."""
     enhancer = load_saying(weights, device)
-    if references is None:
-        return lambda frames: enhance_frames(frames, enhancer), READS
-    return lambda frames: enhance_frames(references.along(frames), enhancer), (*READS, *NEEDED)
+    outputs = tuple(name for name in enhancer.reads if name != "reference")
+    if references is None or "reference" not in enhancer.reads:
+        return lambda frames: enhance_frames(frames, enhancer), outputs
+    return lambda frames: enhance_frames(references.along(frames), enhancer), (*outputs, *NEEDED)
 
 
 def enhance_video(

@@ -42,6 +42,8 @@ class Memory:
 class Enhancer:
     """A trained network behind the call that every enhancer has: `better, memory = enhancer.step(frame, memory)`."""
 
+    reads: tuple[str, ...] = ("flow_prev", "instance", "reference")
+
     def __init__(
         self,
         net: Net,

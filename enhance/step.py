@@ -15,9 +15,11 @@ class Steps(Protocol):
     """An enhancer: frames of one clip in order, `better, memory = enhancer.step(frame, memory)`, memory None at its start.
 
     about  what is known of the weights, json-like
+    reads  what it uses of a rendered frame beside rgb; photos of the drive, too, where "reference" is among it
     """
 
     about: dict
+    reads: tuple[str, ...]
     device: torch.device
 
     def step(self, frame: Frame | torch.Tensor, memory: Any = None) -> tuple[torch.Tensor, Any]: ...

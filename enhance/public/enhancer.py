@@ -32,6 +32,8 @@ class Recent:
 class PublicEnhancer:
     """`better, memory = enhancer.step(frame, memory)`, as `Enhancer`; the model redraws every pixel, needed or not."""
 
+    reads: tuple[str, ...] = ()
+
     def __init__(
         self,
         model: Model,

@@ -130,6 +130,8 @@ class Arguments:
 class WhiteBoxEnhancer:
     """`better, memory = enhancer.step(frame, memory)`, as `Enhancer`: a Frame's instances are harmonized, all else stays as it is."""
 
+    reads: tuple[str, ...] = ("instance",)
+
     def __init__(self, model: WhiteBox, about: dict | None = None, device: str | torch.device = "cpu"):
         self.device = torch.device(device)
         self.model, self.about = model.to(self.device), about or {}

@@ -17,7 +17,6 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from enhance.clip import READS
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
 from enhance.enhancer import Enhancer, Memory
 from enhance.precision import has_bfloat16
@@ -31,6 +30,7 @@ from tests.bench.plot import Chart, save
 
 FRAMES = 6
 SHARES = (0.5, 0.75)
+READS = tuple(name for name in Enhancer.reads if name != "reference")
 
 
 def clip(width: int, height: int) -> list[Frame]:

@@ -371,6 +371,13 @@ def test_a_huge_model_says_so_before_it_begins(harmonizer, monkeypatch, capsys):
     assert "NVIDIA Harmonizer" in said and "million weights" in said and "--weights builtin" in said
 
 
+def test_nothing_is_rendered_for_a_model_that_looks_at_pictures_only(harmonizer):
+    from enhance.clip import enhancement
+
+    finish, outputs = enhancement(str(harmonizer), references=object())  # photos that it would not look at are not looked up
+    assert outputs == () and Enhancer.load("builtin").reads == ("flow_prev", "instance", "reference")
+
+
 def test_a_clip_is_enhanced_by_any_of_them(harmonizer, tmp_path):
     from enhance import enhance_video
     from render.video import VideoWriter, read_video

@@ -145,7 +145,7 @@ def test_a_broken_checkpoint_is_refused_by_name(pairs, trained, tmp_path, spoil)
 
 def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
     class Told:
-        about, device = {}, torch.device("cpu")
+        about, device, reads = {}, torch.device("cpu"), ("instance",)
 
         def step(self, frame, memory=None):
             assert frame.instance is not None and (memory is None) == (frame.flow_prev is None)
