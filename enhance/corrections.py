@@ -6,14 +6,15 @@ from collections.abc import Mapping
 
 import torch
 
-from enhance.objects import COLOURS, Box, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
-from enhance.shade import NONE, optical_depth, shaded
+from enhance.objects import COEFFICIENTS, Box, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
+from enhance.shade import NONE, optical_depth, read_ground, shaded
 
 STEADY = 8
 """Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
 
 Corrections = Mapping[int, tuple[torch.Tensor, int]]
-"""By object the mean of its coefficients over the last frames, and in how many it was seen."""
+"""By object the mean over the last frames of its coefficients and the optical depths of its missing shadow, and in how many frames it
+was seen."""
 
 
 def corrected(net: ObjectNet, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
@@ -27,31 +28,40 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     lacked, and their corrections, to be passed with the next frame. Pixels that are neither an object's nor shaded stay as they are."""
     found = boxes(instance)
     masks = {i: instance[box.outer_rows, box.outer_columns] == i for i, box in found.items()}
-    after = _looked_at(net, rgb, found, masks, before)
-    out, ground = rgb.clone() if found else rgb, instance <= 0
+    grounds = {i: (instance <= 0)[box.outer_rows, box.outer_columns] for i, box in found.items()}
+    after = _looked_at(net, rgb, found, masks, grounds, before)
+    out = rgb.clone() if found else rgb
     for i, box in found.items():
         coefficients = after[i][0][None]
-        _shade(out, box, ground[box.outer_rows, box.outer_columns], coefficients[:, COLOURS:])
+        _shade(out, box, grounds[i], coefficients[:, COEFFICIENTS:])
         places, (y, x) = box.places(masks[i])
         given = rgb[:, y, x].T
-        out[:, y, x] = (given + changed(given[None], places[None, :, 0], coefficients)[0]).T.clamp(0, 1)
+        out[:, y, x] = (given + changed(given[None], places[None, :, 0], coefficients[:, :COEFFICIENTS])[0]).T.clamp(0, 1)
     return out, after
 
 
 def _looked_at(
-    net: ObjectNet, rgb: torch.Tensor, found: dict[int, Box], masks: dict[int, torch.Tensor], before: Corrections
+    net: ObjectNet,
+    rgb: torch.Tensor,
+    found: dict[int, Box],
+    masks: dict[int, torch.Tensor],
+    grounds: dict[int, torch.Tensor],
+    before: Corrections,
 ) -> dict[int, tuple[torch.Tensor, int]]:
     """Objects' corrections after this frame: those that are due are looked at anew."""
     counts = {i: before[i][1] if i in before else 0 for i in found}
     due = [i for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0]  # not all in the same frame
     new: dict[int, torch.Tensor] = {}
     if due:
-        whole, read = whole_of(rgb), []
+        whole, read, around = whole_of(rgb), [], []
         for i in due:
             at = spots(masks[i], found[i], float(masks[i].sum()) / rgb[0].numel())
             y, x = at.yx.unbind(1)
             read.append(evidence(rgb[:, found[i].outer_rows, found[i].outer_columns][:, y, x].T, at, whole))
-        new = dict(zip(due, net(Evidence.stacked(read)), strict=True))
+            places, (y, x) = found[i].places(grounds[i])
+            around.append(read_ground(rgb[:, y, x].T, places))
+        both = torch.cat([net(Evidence.stacked(read)), net.shade(torch.stack(around))], 1)
+        new = dict(zip(due, both, strict=True))
     after = {}
     for i, count in counts.items():
         mean = before[i][0] if i in before else new[i]

@@ -14,26 +14,24 @@ from enhance.objects import Box, Evidence, boxes, evidence, spots, whole_of
 from enhance.shards import RENDERED, Shard
 
 PIXELS = 384
-"""Pixels of an object by which a correction is judged, and as many of the ground."""
-STORED = {"relight": 0.15, "reinsert": 0.1, "shadow": 0.3}
-"""How often objects are drawn whose damage is stored: relit and re-inserted ones, and placed ones, which only miss their shadow."""
+"""Pixels of an object by which a correction is judged."""
+STORED = {"relight": 0.2, "reinsert": 0.1, "shadow": 0.12}
+"""How often objects are drawn whose damage is stored: relit and re-inserted ones; and placed ones, right as they are."""
 RENDERED_ONES = 0.25  # how often a picture is a rendering and no photo, as where the enhancer is used
 ANY_REGION = 0.15  # how often the object is any region of a picture
 COARSE = 4  # how much smaller than the picture that region is drawn
-SHADED = 0.35  # how often a placed object has its shadow
 VARIANTS = 3  # how often an object is used, each time in other colours
 RIGHT = 0.35  # how often an object is right as it is
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Evidence of B objects, and pixels `[B, 2 * PIXELS, 3]` as given and as they should be, at `places` `[B, 2 * PIXELS, 2]` down and
-    across the box: those of the object, then of the ground."""
+    """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
 
     evidence: Evidence
     given: torch.Tensor
     target: torch.Tensor
-    places: torch.Tensor
+    height: torch.Tensor
 
 
 class ObjectSampler:
@@ -59,7 +57,7 @@ class ObjectSampler:
             shard = self.places[kind][rng.integers(len(self.places[kind]))]
             t = int(rng.integers(shard.frames))
             wanted, instance = shard.frame("target", t)
-            given = wanted if kind == "shadow" and rng.random() < SHADED else shard.frame("input", t)[0]
+            given = wanted if kind == "shadow" else shard.frame("input", t)[0]
             some = shard.meta["instances"] if rng.random() < 0.7 else None
             fresh = kind == "shadow"
         else:
@@ -103,16 +101,13 @@ class ObjectSampler:
         mask = ids == pick
         share = float(mask.sum()) / instance.numel()
         at = spots(mask, box, share)
-        ground = (ids == 0) | (ids == 255)
-        if not ground.any():
-            return []
-        judged = torch.cat([p.nonzero()[torch.from_numpy(rng.integers(int(p.sum()), size=PIXELS))] for p in (mask, ground)])
+        judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
         y, x = torch.cat([at.yx, judged]).unbind(1)
         strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]
         thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1).float() / 255
         soft = F.avg_pool2d(mask[None].float(), 3, 1, 1)[0] if rng.random() < 0.7 else mask.float()
         others = ((ids > 0) & (ids < 255) & ~mask)[y, x][None, None].float()
-        places = box.placed(judged[:, 0] + box.outer_rows.start, judged[:, 1] + box.outer_columns.start)
+        height = box.placed(judged[:, 0] + box.outer_rows.start, judged[:, 1] + box.outer_columns.start)[:, 0]
         drawn = []
         for _ in range(VARIANTS):
             (seen, target), whole = strips, thin
@@ -126,16 +121,15 @@ class ObjectSampler:
                     seen = alter(seen, others, isp if rng.random() < 0.5 else random_isp(rng))
             seen, target = seen[:, 0].T, target[:, 0].T
             seen = ((seen * 255).round() + torch.from_numpy(rng.random(seen.shape, dtype=np.float32)) - 0.5) / 255
-            read = evidence(seen[: -2 * PIXELS], at, whole_of(whole))
-            one = (read, seen[-2 * PIXELS :], target[-2 * PIXELS :], places)
-            drawn.append(_flipped(*one) if rng.random() < 0.5 else one)
+            read = evidence(seen[:-PIXELS], at, whole_of(whole))
+            drawn.append((_mirrored(read) if rng.random() < 0.5 else read, seen[-PIXELS:], target[-PIXELS:], height))
         return drawn
 
 
-def _flipped(e: Evidence, given: torch.Tensor, target: torch.Tensor, places: torch.Tensor) -> tuple:
-    """An object mirrored left to right."""
+def _mirrored(e: Evidence) -> Evidence:
+    """Left and right changed."""
     place, inside, around, whole = (v.clone() for v in (e.place, e.inside, e.around, e.whole))
     place[..., [1, 3]] *= -1
     for v in (inside, around, whole):
         v[..., 4] *= -1
-    return Evidence(e.seam, place, e.known, inside, around, whole), given, target, places * torch.tensor([1.0, -1.0])
+    return Evidence(e.seam, place, e.known, inside, around, whole)

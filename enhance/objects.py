@@ -1,10 +1,9 @@
-"""Colours and shadow of an object that was put in: what its seam, its own pixels and its surroundings say, and a network that listens.
+"""Colours of an object that was put in: what its seam, its own pixels and its surroundings say, and a small network that listens.
 
 Where the mask is told, altered colours are a problem of few numbers: one tone curve and saturation for the whole object. What tells
 them is fine detail of which a thinned picture shows nothing: along the seam, surfaces go on beyond the mask and only their colours
 jump. So the network reads a few hundred pixels of full sharpness: profiles across the seam, pixels inside, around and anywhere.
-They tell, too, whether there is a shadow; where it is missing, its grid (`enhance.shade`) is a few numbers more. Trained to be near
-in the picture, the network corrects less the less sure it is.
+Trained to be near in the picture, it corrects less the less sure it is. A missing shadow is found apart (`enhance.shade`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.colour import LUMA
-from enhance.shade import KNOTS
+from enhance.shade import ShadeNet
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
 """How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
@@ -27,8 +26,7 @@ REACH = 4
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 FEWEST = 64
 """Pixels that an object must have: what is smaller stays as it is."""
-COLOURS = 15
-COEFFICIENTS = COLOURS + KNOTS
+COEFFICIENTS = 15
 
 
 @dataclass(frozen=True)
@@ -192,8 +190,7 @@ class _Round(nn.Module):
 
 
 class ObjectNet(nn.Module):
-    """Evidence to coefficients `[B, COEFFICIENTS]`, zero at first: of a colour change for the whole object (`changed`), and the optical
-    depths of the shadow that it lacks (`enhance.shade.optical_depth`)."""
+    """Evidence to coefficients `[B, 15]` of a colour change for the whole object (`changed`), zero at first; `shade` goes with it."""
 
     def __init__(self, width: int = 96, heads: int = 4, questions: int = 12, rounds: int = 3):
         super().__init__()
@@ -207,6 +204,7 @@ class ObjectNet(nn.Module):
         self.last = nn.Linear(width, COEFFICIENTS)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
+        self.shade = ShadeNet()
 
     def forward(self, e: Evidence) -> torch.Tensor:
         seam = self.seam(torch.cat([e.seam.flatten(2), e.place], 2))
@@ -219,8 +217,8 @@ class ObjectNet(nn.Module):
 
 
 def changed(rgb: torch.Tensor, height: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
-    """What the first 15 of `coefficients` `[B, ...]` add to `rgb` `[B, N, 3]` at heights `[B, N]`, -1 at the object's top and 1 at its
+    """What `coefficients` `[B, 15]` add to `rgb` `[B, N, 3]` at heights `[B, N]`, -1 at the object's top and 1 at its
     base: per channel a + b x + c x^2 + d (luma - x) + e height x."""
-    a, b, c, d, e = (coefficients[:, None, i : i + 3] for i in range(0, COLOURS, 3))
+    a, b, c, d, e = (coefficients[:, None, i : i + 3] for i in range(0, COEFFICIENTS, 3))
     luma = (rgb @ rgb.new_tensor(LUMA))[..., None]
     return a + rgb * (b + c * rgb + e * height[..., None]) + d * (luma - rgb)

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
 from enhance.object_samples import Objects, ObjectSampler
+from enhance.shade_samples import Grounds, ShadeSampler
 from enhance.shards import RENDERED, PairSet, Shard, Window
 
 KIND_WEIGHTS = {
@@ -97,6 +98,7 @@ class Sampler:
         self.shards = {kind: pairs.of(kind, "train") if pairs else [] for kind in KIND_WEIGHTS}
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
+        self._shade = ShadeSampler(self.shards["shadow"], seed)
         self._objects = ObjectSampler(self.shards, photos.frames if photos else [])
         if pairs and not any(self.shards.values()) and photos is None:
             raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')
@@ -127,6 +129,10 @@ class Sampler:
     def objects(self, step: int, count: int) -> Objects:
         """Objects in wrong colours or in their own."""
         return self._objects.draw(self.rng(step), count)
+
+    def grounds(self, step: int, count: int) -> Grounds | None:
+        """Ground by objects with and without their shadow."""
+        return self._shade.draw(self.rng(step), count)
 
     def _thinned(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
         if self.shards["relight"] and rng.random() < 0.2:

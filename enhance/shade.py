@@ -1,12 +1,14 @@
 """The shadow that an object lacks: how much darker the ground around it should be, on a small grid that goes with its box.
 
 Where an object meets the ground, and how far its shadow reaches, is much the same for every car once places are measured in boxes, so
-a few numbers tell it: optical depths at knots that are dense along the object's base, between which hats interpolate.
+a few numbers tell it: optical depths at knots that are dense along the object's base, between which hats interpolate. Whether it is
+missing, the brightness of the ground at the same knots tells.
 """
 
 from __future__ import annotations
 
 import torch
+from torch import nn
 
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
@@ -17,6 +19,44 @@ ACROSS = (-2.2, -1.6, -1.1, -0.6, -0.2, 0.2, 0.6, 1.1, 1.6, 2.2)
 KNOTS = (len(DOWN) - 2) * (len(ACROSS) - 2)
 NONE = 0.02
 """Optical depth up to which the ground stays as it is."""
+
+
+READ = 3 * KNOTS
+SEEN = 4096
+"""Most pixels of the ground that are read."""
+DARKEST = 3e-3
+
+
+class ShadeNet(nn.Module):
+    """What `read_ground` reads of objects `[B, READ]` to optical depths `[B, KNOTS]` of the shadows that they lack; zero at first."""
+
+    def __init__(self, width: int = 64):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(READ, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, KNOTS))
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, read: torch.Tensor) -> torch.Tensor:
+        return self.layers(read).float()
+
+
+def read_ground(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Of sRGB `[N, 3]` of ground at `places` `[N, 2]` by an object: by knot the mean logarithm of its light against the median, its
+    spread, and how much of the ground is there, `[READ]`."""
+    near = (places[:, 0] > DOWN[0]).nonzero()[:, 0]
+    near = near[torch.arange(min(SEEN, len(near)), device=rgb.device) * len(near) // max(1, min(SEEN, len(near)))]
+    if len(near) == 0:
+        return rgb.new_zeros(READ)
+    light = torch.log(linear_from_srgb(rgb[near]).mean(-1) + DARKEST)
+    light = light - light.median()
+    down, across = (_hats(places[near, i], knots) for i, knots in enumerate((DOWN, ACROSS)))
+    counts = torch.einsum("nd,nk->dk", down, across)
+    mean, square = (torch.einsum("n,nd,nk->dk", v, down, across) / counts.clamp_min(1e-6) for v in (light, light.square()))
+    known = counts > 2
+    spread = (square - mean.square()).clamp_min(0).sqrt()
+    return torch.cat([(mean * known).flatten(), (spread * known).flatten(), (counts / len(near) * 20).clamp_max(2).flatten()])
 
 
 def optical_depth(places: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:

@@ -23,8 +23,7 @@ from enhance.colour import altered_logits, colour_change
 from enhance.corrections import corrected
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
-from enhance.object_samples import Objects
-from enhance.objects import COLOURS, changed
+from enhance.objects import changed
 from enhance.past import Past
 from enhance.precision import autocast, channels_last
 from enhance.samples import Photos, Sample, Sampler
@@ -34,13 +33,12 @@ from enhance.weights_file import BUILTIN, load_net, save_net
 from scenes.atomic import atomic_file
 from scenes.names import unknown
 
-NEAR_ENOUGH = (3e-4, 1e-3)
-"""Squared error of an object's colours, and of the ground around it, below which getting nearer counts for little: 35 and 30 dB. A missing
-shadow costs less than that around it: with a lower one, the fear to shade what is right drowns all else, and no shadow is ever learnt."""
-GROUND = 4.0
-"""Weight of the ground beside the object."""
-STAGES = ("autoencoder", "colour", "objects", "enhancer")
-RATES = {"autoencoder": 2.5, "objects": 2.0}  # of the highest rate
+NEAR_ENOUGH = 3e-4
+"""Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
+SHADE_NEAR_ENOUGH = 1e-3
+"""The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
+STAGES = ("autoencoder", "colour", "objects", "shade", "enhancer")
+RATES = {"autoencoder": 2.5, "objects": 2.0, "shade": 7.5}  # of the highest rate
 FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
 
 
@@ -54,6 +52,8 @@ class TrainConfig:
     """Share of the budget for the colour network."""
     objects: float = 0.25
     """Share of the budget for objects' colours."""
+    shade: float = 0.01
+    """Share of the budget for objects' missing shadows."""
     crop: int = 160
     """Side of the smallest training crops in pixels, a multiple of 16."""
     images: int = 8
@@ -63,7 +63,7 @@ class TrainConfig:
     thinned: int = 24
     """Thinned pictures in a batch of the colour network."""
     looked_at: int = 32
-    """Objects in a batch of objects' colours."""
+    """Objects in a batch of objects' colours, and of missing shadows."""
     frames: int = 4
     """Frames of a training clip."""
     temporal_every: int = 4
@@ -103,7 +103,10 @@ class _Run:
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
             "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
-            "objects": torch.optim.AdamW(self.net.objects.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
+            "objects": torch.optim.AdamW(
+                [p for n, p in self.net.objects.named_parameters() if not n.startswith("shade.")], betas=(0.9, 0.98), weight_decay=1e-2
+            ),
+            "shade": torch.optim.AdamW(self.net.objects.shade.parameters(), betas=(0.9, 0.98), weight_decay=3e-2),
             "enhancer": torch.optim.AdamW(
                 [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
             ),
@@ -136,7 +139,7 @@ class _Run:
     def share(self, stage: str) -> float:
         """A stage's share of the budget, of which those that are left out take nothing."""
         c = self.config
-        all_of = {"autoencoder": c.autoencoder, "colour": c.colour, "objects": c.objects}
+        all_of = {"autoencoder": c.autoencoder, "colour": c.colour, "objects": c.objects, "shade": c.shade}
         all_of["enhancer"] = 1 - sum(all_of.values())
         return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 
@@ -212,6 +215,7 @@ def train(
         if "colour" in run.stages:
             calibrate_colour(run.net, clean)
         _stage(run, "objects", lambda step: _objects_step(run, sampler, step), checkpoint, save_every, report)
+        _stage(run, "shade", lambda step: _shade_step(run, sampler, step), checkpoint, save_every, report)
         now = run.net.state_dict()
         frozen = {k: v for k, v in now.items() if k.startswith((*FROZEN, "shut_colour"))}
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
@@ -292,18 +296,17 @@ def _objects_step(run: _Run, sampler: Sampler, step: int) -> float:
     drawn = sampler.objects(4 * step + 3, run.config.looked_at)
     with autocast(drawn.given.device):
         coefficients = run.net.objects(drawn.evidence)
-    return _update(run, "objects", [objects_loss(drawn, coefficients)])
+    error = (drawn.given + changed(drawn.given, drawn.height, coefficients) - drawn.target).square().mean((1, 2))
+    return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
 
 
-def objects_loss(drawn: Objects, coefficients: torch.Tensor) -> torch.Tensor:
-    """Mean logarithm of the squared error of objects' own pixels and of the ground's after a correction, each above what is near enough."""
-    own, ground = drawn.given.chunk(2, 1)
-    places, around = drawn.places.chunk(2, 1)
-    right = own + changed(own, places[..., 0], coefficients)
-    dark = shaded(ground, optical_depth(around, coefficients[:, COLOURS:]))
-    errors = [(x - wanted).square().mean((1, 2)) for x, wanted in zip((right, dark), drawn.target.chunk(2, 1), strict=True)]
-    of_object, of_ground = (torch.log(error + enough).mean() for error, enough in zip(errors, NEAR_ENOUGH, strict=True))
-    return of_object + GROUND * of_ground
+def _shade_step(run: _Run, sampler: Sampler, step: int) -> float:
+    drawn = sampler.grounds(step, 2 * run.config.looked_at)
+    if drawn is None:
+        return 0.0
+    dark = shaded(drawn.given, optical_depth(drawn.places, run.net.objects.shade(drawn.read)))
+    error = (dark - drawn.target).square().mean((1, 2))
+    return _update(run, "shade", [torch.log(error + SHADE_NEAR_ENOUGH).mean()])
 
 
 CROPS = (1.0, 1.0, 1.5, 2.0)

@@ -5,7 +5,8 @@ import torch
 
 from enhance.corrections import STEADY, correct, corrected
 from enhance.object_samples import PIXELS, ObjectSampler
-from enhance.objects import COLOURS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
+from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
+from enhance.shade import KNOTS
 
 
 def scene(top=10, left=20, height=16, width=24, seed=0):
@@ -27,7 +28,7 @@ def read(rgb, instance):
 def stirred():
     torch.manual_seed(0)
     net = ObjectNet(width=16, heads=2, questions=2, rounds=1).eval()
-    torch.nn.init.normal_(net.last.weight[:COLOURS], std=0.05)
+    torch.nn.init.normal_(net.last.weight, std=0.05)
     return net
 
 
@@ -91,7 +92,7 @@ def test_an_object_s_corrections_are_averaged_over_frames():
 
 def test_an_object_long_known_is_looked_at_rarely():
     net, (rgb, instance) = stirred(), scene()
-    known = {5: (torch.zeros(net.last.out_features), STEADY)}
+    known = {5: (torch.zeros(COEFFICIENTS + KNOTS), STEADY)}
     looks = []
     for _ in range(2 * STEADY):
         _, after = correct(net, rgb, instance, known)
@@ -102,14 +103,14 @@ def test_an_object_long_known_is_looked_at_rarely():
 
 def test_coefficients_offset_scale_and_grey():
     rgb, height = torch.rand(1, 50, 3), torch.linspace(-1, 1, 50)[None]
-    c = torch.zeros(1, COLOURS)
+    c = torch.zeros(1, COEFFICIENTS)
     c[:, 0], c[:, 4] = 0.1, -0.5
     assert torch.allclose(changed(rgb, height, c), torch.stack([torch.full((1, 50), 0.1), -0.5 * rgb[..., 1], 0 * rgb[..., 2]], -1))
-    c = torch.zeros(1, COLOURS)
+    c = torch.zeros(1, COEFFICIENTS)
     c[:, 9:12] = 1
     grey = rgb + changed(rgb, height, c)
     assert torch.allclose(grey, grey[..., :1].expand_as(grey), atol=1e-6)
-    c = torch.zeros(1, COLOURS)
+    c = torch.zeros(1, COEFFICIENTS)
     c[:, 12:] = 0.5
     assert torch.allclose(changed(rgb, height, c), 0.5 * height[..., None] * rgb)
 
@@ -119,7 +120,7 @@ def test_a_missing_shadow_darkens_the_ground_by_the_object_and_nothing_else():
     instance[20:60, 50:70] = 7
     net = ObjectNet(width=16, heads=2, questions=2, rounds=1).eval()
     with torch.no_grad():
-        net.last.bias[COLOURS:] = 0.5
+        net.shade.layers[-1].bias[:] = 0.5
     better, _ = correct(net, rgb, torch.where(instance == 7, -1, instance), {})
     darker = (better < rgb).all(0)
     assert darker[26, 20:44].all() and not darker[instance == 5].any() and torch.equal(better[:, :, 75:], rgb[:, :, 75:])
@@ -132,8 +133,8 @@ def test_draws_repeat_and_are_right_or_wrong():
     sampler = ObjectSampler({}, photos)
     drawn, again = (sampler.draw(np.random.default_rng(3), 24) for _ in range(2))
     assert torch.equal(drawn.given, again.given) and torch.equal(drawn.evidence.seam, again.evidence.seam)
-    assert drawn.given.shape == (24, 2 * PIXELS, 3) and drawn.evidence.seam.shape == (24, SEAM, 2 * REACH, 4)
-    apart = (drawn.given - drawn.target)[:, :PIXELS].abs().amax((1, 2))
+    assert drawn.given.shape == (24, PIXELS, 3) and drawn.evidence.seam.shape == (24, SEAM, 2 * REACH, 4)
+    apart = (drawn.given - drawn.target).abs().amax((1, 2))
     assert 0 < (apart < 2 / 255).float().mean() < 1
 
 
