@@ -10,7 +10,7 @@ import torch
 from small_net import SMALL
 
 from enhance.enhancer import Enhancer
-from enhance.evaluate import evaluate, table
+from enhance.evaluate import METHODS, PHOTOS, evaluate, table
 from enhance.net import Net
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import TrainConfig, train
@@ -84,12 +84,12 @@ def test_training_undoes_a_constant_error(pairs, tmp_path):
     config = replace(QUICK, autoencoder=0.05, colour=0.04, objects=0.01, rate=3e-3)
     weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
     rows = evaluate(pairs, Enhancer.load(weights))
-    assert [r.method for r in rows] == ["identity", "ours", "ours + instances"] * 3
+    assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, *METHODS]
     by = {(r.kind, r.method): r for r in rows}
     assert by["underfit", "ours"].mean("region") > by["underfit", "identity"].mean("region") + 0.3
     assert by["clean", "identity"].mean("frame") == float("inf") and by["isp", "identity"].mean("warp error") > 0
     text = table(rows)
-    assert text.count("\n") == 10 and "| clean | identity | - | - | equal |" in text
+    assert text.count("\n") == 12 and "| clean | identity | - | - | equal |" in text
 
 
 def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_path):
@@ -152,5 +152,5 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
             return frame.rgb * 0.5, True
 
     rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
-    assert [r.method for r in rows] == ["identity", "ours", "ours + instances", "half"] * 3
+    assert [r.method for r in rows] == [*METHODS, *PHOTOS, "half", *METHODS, "half", *METHODS, "half"]
     assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)
