@@ -56,6 +56,8 @@ def _folder(path: Path) -> Model:
         return read_difix(path, read_state)
     if (path / "transformer" / "config.json").is_file():
         return _diffusers_cosmos(path)
+    if (path / "enhancer.safetensors").is_file():
+        raise ValueError(f"{path} is the folder of a training; give {path / 'enhancer.safetensors'}")
     raise ValueError(f"{path} holds no model that is known; give {KNOWN}")
 
 

@@ -23,9 +23,6 @@ from enhance.public.layout import State, finite, shape_of, strict
 NAME = "Cosmos-Predict2"
 LATENT = 16
 PATCH = 2
-LONGEST = 120
-"""Patches a side that positions are known for."""
-
 BESIDE = r"accum_\w+|pos_embedder\.(seq|dim_spatial_range|dim_temporal_range)|(.*\.)?_extra_state"
 """What the releases write beside the weights: counters of the training, tables that follow from the sizes, Transformer Engine's state."""
 
@@ -159,7 +156,7 @@ class Denoiser(nn.Module):
         return net.eval().requires_grad_(False)
 
     def forward(self, z: torch.Tensor) -> torch.Tensor:
-        """Latents `[B, 16, T, h, w]`, even sides up to 240, to (1 - t) z - t net((1 - t) z, t) with t = sigma / (1 + sigma)."""
+        """Latents `[B, 16, T, h, w]`, sides even, to (1 - t) z - t net((1 - t) z, t) with t = sigma / (1 + sigma)."""
         b, c, t, height, width = z.shape
         patches = z.view(b, c, t, height // PATCH, PATCH, width // PATCH, PATCH).permute(0, 2, 3, 5, 1, 4, 6).flatten(4)
         size = patches.shape[1:4]

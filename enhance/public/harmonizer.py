@@ -35,7 +35,7 @@ class Cosmos(Model):
     def __init__(self, name: str, net: Denoiser, vae: Autoencoder, history: int):
         super().__init__()
         self.name, self.history = name, history
-        self.net, self.vae = net, vae if history else vae.single()
+        self.net, self.vae = net, vae
 
     def forward(self, clip: torch.Tensor) -> torch.Tensor:
         """`[1, V, 3, H, W]` in 0..1, newest first, V 1 or 5, sides multiples of 16, to the first frame `[1, 3, H, W]`."""
@@ -99,7 +99,7 @@ def live(state: Mapping[str, object]) -> dict[str, object]:
 
 def read_cosmos(path: Path, transformer: Mapping[str, object], vae: Mapping[str, object], name: str, history: int) -> Cosmos:
     """Of released tensors. ValueError as `strict`."""
-    return Cosmos(name, Denoiser.read(path, live(transformer)), Autoencoder.read(path, vae), history)
+    return Cosmos(name, Denoiser.read(path, live(transformer)), Autoencoder.read(path, vae, single=history == 0), history)
 
 
 def read_fixer(path: Path, transformer: Mapping[str, object], vae: Mapping[str, object], tokenizer: Path, kept: Mapping) -> Fixer:

@@ -35,31 +35,52 @@ SKIPPED = {0: 0, 1: 1, 2: 2, 5: 3, 6: 4, 8: 6, 10: 7, 12: 9, 14: 10}
 
 
 class Causal(nn.Conv3d):
-    """A convolution that sees no later frame. Over a first frame the taps that would see earlier ones meet zeros: there it is the last
-    tap's convolution in the plane, exactly."""
+    """A convolution that sees no later frame, as the release holds it; `Taps` is what runs."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, over_time: bool = False):
         plane = 1 if over_time else kernel
         super().__init__(inputs, outputs, (kernel, plane, plane))
 
+
+class Taps(nn.Module):
+    """A causal convolution as one in the plane for each frame that it looks back.
+
+    Those that would look before the first frame meet zeros and are left out, exactly: of a first frame only the last is left, and only
+    that is kept where nothing but first frames comes.
+    """
+
+    def __init__(self, conv: Causal, looks_back: bool):
+        super().__init__()
+        taps = conv.weight.unbind(2)
+        self.taps = nn.ParameterList([nn.Parameter(w.clone(), requires_grad=False) for w in (taps if looks_back else taps[-1:])])
+        self.bias = conv.bias
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`[B, C, T, H, W]` to as many frames of the same size."""
-        taps, side = self.weight.shape[2], self.weight.shape[3] // 2
-        if taps > 1 and x.shape[2] > 1:
-            return F.conv3d(F.pad(x, (side, side, side, side, taps - 1, 0)), self.weight, self.bias)
-        flat = F.conv2d(x.transpose(1, 2).flatten(0, 1), self.weight[:, :, -1], self.bias, padding=side)
-        return flat.unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
+        """`[T, C, H, W]`, the frames of one clip in order, to as many."""
+        *earlier, now = self.taps
+        side = now.shape[-1] // 2
+        y = F.conv2d(x, now, self.bias, padding=side)
+        for back, tap in enumerate(reversed(earlier), 1):
+            if back < len(x):
+                y[back:] += F.conv2d(x[:-back], tap, padding=side)
+        return y
+
+    def thinned(self, x: torch.Tensor) -> torch.Tensor:
+        """`[T, C, H, W]` to (T - 1) / 2 frames, each of three neighbours."""
+        first, second, third = (F.conv2d(x[k : len(x) - 2 + k : 2], tap) for k, tap in enumerate(self.taps))
+        assert self.bias is not None
+        return first + second + third + self.bias.view(-1, 1, 1)
 
 
 class Norm(nn.Module):
-    """Channels scaled to their root mean square; `planes`: over `[B, C, H, W]`, over `[B, C, T, H, W]` otherwise."""
+    """Channels scaled to their root mean square; `sides` of its weight: those of a picture, or of a clip."""
 
-    def __init__(self, width: int, planes: bool = False):
+    def __init__(self, width: int, sides: int = 3):
         super().__init__()
-        self.gamma = nn.Parameter(torch.ones(width, *((1, 1) if planes else (1, 1, 1))))
+        self.gamma = nn.Parameter(torch.ones(width, *(sides * [1])))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return F.normalize(x, dim=1) * (x.shape[1] ** 0.5 * self.gamma)
+        return F.normalize(x, dim=1) * (x.shape[1] ** 0.5 * self.gamma.view(-1, 1, 1))
 
 
 class Residual(nn.Module):
@@ -78,16 +99,14 @@ class Attention(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.norm = Norm(width, planes=True)
+        self.norm = Norm(width, 2)
         self.to_qkv = nn.Conv2d(width, 3 * width, 1)
         self.proj = nn.Conv2d(width, width, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        b, c, t, h, w = x.shape
-        frames = x.transpose(1, 2).flatten(0, 1)
-        q, k, v = self.to_qkv(self.norm(frames)).flatten(2).transpose(1, 2)[:, None].chunk(3, dim=-1)
+        q, k, v = self.to_qkv(self.norm(x)).flatten(2).transpose(1, 2)[:, None].chunk(3, dim=-1)
         seen = F.scaled_dot_product_attention(q.contiguous(), k.contiguous(), v.contiguous())[:, 0]
-        return x + self.proj(seen.transpose(1, 2).unflatten(2, (h, w))).unflatten(0, (b, t)).transpose(1, 2)
+        return x + self.proj(seen.transpose(1, 2).unflatten(2, x.shape[2:]))
 
 
 class Shrink(nn.Module):
@@ -100,11 +119,8 @@ class Shrink(nn.Module):
             self.time_conv = Causal(width, width, 3, over_time=True)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        x = _by_frame(self.resample, x)
-        if x.shape[2] == 1 or not hasattr(self, "time_conv"):
-            return x
-        later = F.conv3d(x, self.time_conv.weight, self.time_conv.bias, stride=(2, 1, 1))
-        return torch.cat([x[:, :, :1], later], 2)
+        x, over_time = self.resample(x), getattr(self, "time_conv", None)
+        return torch.cat([x[:1], over_time.thinned(x)]) if len(x) > 1 and isinstance(over_time, Taps) else x
 
 
 class Grow(nn.Module):
@@ -117,11 +133,7 @@ class Grow(nn.Module):
             self.time_conv = Causal(width, 2 * width, 3, over_time=True)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return _by_frame(self.resample, x)
-
-
-def _by_frame(module: nn.Module, x: torch.Tensor) -> torch.Tensor:
-    return module(x.transpose(1, 2).flatten(0, 1)).unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
+        return self.resample(x)
 
 
 class Encoder(nn.Module):
@@ -139,7 +151,7 @@ class Encoder(nn.Module):
         self.head = nn.Sequential(Norm(outputs), nn.SiLU(), Causal(outputs, 2 * LATENT, 3))
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Moments `[B, 32, t, H/8, W/8]`, and the layers' features."""
+        """Frames `[T, 3, H, W]` to moments `[t, 32, H/8, W/8]`, and the layers' features."""
         x, features = self.conv1(x), []
         for layer in self.downsamples:
             x = layer(x)
@@ -166,12 +178,12 @@ class Decoder(nn.Module):
             setattr(self, f"skip_conv_{i}", nn.Conv3d(width * m, width * m, 1, bias=False))
 
     def forward(self, z: torch.Tensor, features: list[torch.Tensor]) -> torch.Tensor:
-        """Latents `[B, 16, 1, h, w]` to `[B, 3, 1, 8 h, 8 w]`; `features` of the encoder's first frame."""
+        """Latents `[1, 16, h, w]` to `[1, 3, 8 h, 8 w]`; the encoder's `features`, whose first frame is carried over."""
         x, order = self.middle(self.conv1(z)), list(SKIPPED)
         for i, layer in enumerate(self.upsamples):
             if self.skips and i in SKIPPED:
                 carry = getattr(self, f"skip_conv_{order.index(i)}")
-                x = x + carry(features[::-1][SKIPPED[i]][:, :, :1])
+                x = x + F.conv2d(features[::-1][SKIPPED[i]][:1], carry.weight[:, :, 0])
             x = layer(x)
         return self.head(x)
 
@@ -188,8 +200,8 @@ class Autoencoder(nn.Module):
         self.conv1, self.conv2 = Causal(2 * LATENT, 2 * LATENT, 1), Causal(LATENT, LATENT, 1)
 
     @classmethod
-    def read(cls, path: Path, state: Mapping[str, object]) -> Autoencoder:
-        """From the released tensors, in float32. ValueError as `strict`."""
+    def read(cls, path: Path, state: Mapping[str, object], single: bool = False) -> Autoencoder:
+        """From the released tensors, in float32; `single`: for clips of one frame only. ValueError as `strict`."""
         width = shape_of(path, NAME, state, "encoder.conv1.weight", 5)[0]
         with torch.device("meta"):
             vae = cls(width, any(name.startswith("decoder.skip_conv_") for name in state))
@@ -197,33 +209,30 @@ class Autoencoder(nn.Module):
         for layer in vae.decoder.upsamples:
             if hasattr(layer, "time_conv"):
                 del layer.time_conv
-        _flatten(vae.decoder)
+        _settle(vae.encoder, looks_back=not single)
+        _settle(vae, looks_back=False)
         for name, values in (("mean", MEAN), ("std", STD)):
-            vae.register_buffer(name, torch.tensor(values).view(1, LATENT, 1, 1, 1))
+            vae.register_buffer(name, torch.tensor(values).view(1, LATENT, 1, 1))
         finite(path, vae)
         return vae.eval().requires_grad_(False)
 
-    def single(self) -> Autoencoder:
-        """For clips of one frame only: nothing of the encoder looks back either."""
-        for layer in self.encoder.downsamples:
-            if hasattr(layer, "time_conv"):
-                del layer.time_conv
-        _flatten(self.encoder)
-        return self
-
     def encode(self, clip: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """`[B, 3, 1 + 4n, H, W]` in -1..1, sides multiples of 8, to latents `[B, 16, 1 + n, H/8, W/8]` of about mean 0 and deviation 1;
+        """`[1, 3, 1 + 4n, H, W]` in -1..1, sides multiples of 8, to latents `[1, 16, 1 + n, H/8, W/8]` of about mean 0 and deviation 1;
         and the features that `decode` takes."""
-        moments, features = self.encoder(clip)
-        return (self.conv1(moments)[:, :LATENT] - self.mean) / self.std, features
+        frames = clip[0].transpose(0, 1).contiguous(memory_format=torch.channels_last)
+        moments, features = self.encoder(frames)
+        return ((self.conv1(moments)[:, :LATENT] - self.mean) / self.std).transpose(0, 1)[None], features
 
     def decode(self, latents: torch.Tensor, features: list[torch.Tensor]) -> torch.Tensor:
-        """The first frame `[B, 3, H, W]`, about -1..1, of latents `[B, 16, t, H/8, W/8]`: later latents cannot change it."""
-        return self.decoder(self.conv2(latents[:, :, :1] * self.std + self.mean), features)[:, :, 0]
+        """The first frame `[1, 3, H, W]`, about -1..1, of latents `[1, 16, t, H/8, W/8]`: later latents cannot change it."""
+        first = latents[:, :, 0].contiguous(memory_format=torch.channels_last)
+        return self.decoder(self.conv2(first * self.std + self.mean), features)
 
 
-def _flatten(module: nn.Module) -> None:
-    """Keep of each causal convolution what meets a first frame."""
-    for layer in module.modules():
+def _settle(module: nn.Module, looks_back: bool) -> None:
+    """Put what runs in place of what the release holds."""
+    for name, layer in module.named_children():
         if isinstance(layer, Causal):
-            layer.weight = nn.Parameter(layer.weight[:, :, -1:].clone(), requires_grad=False)
+            setattr(module, name, Taps(layer, looks_back))
+        else:
+            _settle(layer, looks_back)

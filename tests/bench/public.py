@@ -39,7 +39,7 @@ def works(width: int, height: int, narrow: int) -> dict[str, tuple[Callable[[], 
     vae = AutoencoderKLWan(base_dim=96 // narrow, latents_mean=list(MEAN), latents_std=list(STD)).eval()
     ours = Denoiser.read(HERE, released(net.state_dict(), TRANSFORMER))
     halves = Autoencoder.read(HERE, released(vae.state_dict(), AUTOENCODER))
-    single = Autoencoder.read(HERE, released(vae.state_dict(), AUTOENCODER)).single()
+    single = Autoencoder.read(HERE, released(vae.state_dict(), AUTOENCODER), single=True)
     clip = torch.rand(1, 3, 5, height, width) * 2 - 1
     z = torch.randn(1, 16, 2, height // 8, width // 8)
     time, text = torch.tensor([0.2]), torch.zeros(1, 512, 1024)

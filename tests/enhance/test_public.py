@@ -89,7 +89,7 @@ def test_the_autoencoder_is_the_whole_one_and_decodes_the_first_frame_alone(nets
 def test_an_autoencoder_of_single_frames_loses_nothing(nets, tmp_path):
     state = made.autoencoder_state(nets[1])
     clip = torch.rand(1, 3, 1, 16, 16) * 2 - 1
-    whole, single = Autoencoder.read(tmp_path, state), Autoencoder.read(tmp_path, state).single()
+    whole, single = Autoencoder.read(tmp_path, state), Autoencoder.read(tmp_path, state, single=True)
     assert torch.equal(whole.encode(clip)[0], single.encode(clip)[0])
     assert 2.5 * sum(p.numel() for p in single.encoder.parameters()) < sum(p.numel() for p in whole.encoder.parameters())
 
@@ -208,6 +208,9 @@ def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer,
     with pytest.raises(ValueError, match="holds a list"):
         open_public(cut)
     with pytest.raises(ValueError, match="holds no model"):
+        Enhancer.load(tmp_path)
+    (tmp_path / "enhancer.safetensors").touch()
+    with pytest.raises(ValueError, match=r"folder of a training; give .*enhancer\.safetensors"):
         Enhancer.load(tmp_path)
     with pytest.raises(FileNotFoundError):
         Enhancer.load(tmp_path / "none.pkl")
