@@ -94,6 +94,29 @@ def test_an_autoencoder_of_single_frames_loses_nothing(nets, tmp_path):
     assert 2.5 * sum(p.numel() for p in single.encoder.parameters()) < sum(p.numel() for p in whole.encoder.parameters())
 
 
+def test_skips_carry_the_encoders_features_to_where_the_release_adds_them(nets, tmp_path):
+    vae, draw = nets[1], torch.Generator().manual_seed(0)
+    widths = [32, 32, 32, 32, 32, 16, 16, 8, 8]
+    carry = [0.3 * torch.randn(w, w, 1, 1, 1, generator=draw) for w in widths]
+    state = made.autoencoder_state(vae) | {f"decoder.skip_conv_{i}.weight": w for i, w in enumerate(carry)}
+    clip, seen, hooks = torch.rand(1, 3, 1, 16, 32, generator=draw) * 2 - 1, [], []
+    for block in vae.encoder.down_blocks:
+        hooks.append(block.register_forward_hook(lambda _module, _x, out: seen.append(out)))
+    # decoder layer 4 b + r is residual block r of stage b; the numbers are `enc_dec_mapping` of NVIDIA/harmonizer
+    for i, (layer, back) in enumerate({0: 0, 1: 1, 2: 2, 5: 3, 6: 4, 8: 6, 10: 7, 12: 9, 14: 10}.items()):
+        block = vae.decoder.up_blocks[layer // 4].resnets[layer % 4]
+        add = lambda _module, x, i=i, back=back: (x[0] + torch.nn.functional.conv3d(seen[::-1][back], carry[i]), *x[1:])  # noqa: E731
+        hooks.append(block.register_forward_pre_hook(add))
+    with torch.no_grad():
+        latents = vae.encode(clip).latent_dist.mode()
+        whole = vae._decode(latents).sample[:, :, 0]
+        for hook in hooks:
+            hook.remove()
+        ours = Autoencoder.read(tmp_path, state, single=True)
+        assert torch.allclose(ours.decode(*ours.encode(clip)).clamp(-1, 1), whole, atol=ROUNDING)
+        assert not torch.allclose(vae._decode(latents).sample[:, :, 0], whole, atol=1e-2)
+
+
 def test_harmonizer_runs_as_its_release_does_alone_and_with_four_results(nets, harmonizer):
     enhancer, memory, results = Enhancer.load(harmonizer, bfloat16=False), None, []
     for i in range(6):
