@@ -12,6 +12,11 @@ from enhance.shade import NONE, optical_depth, read_ground, shaded
 STEADY = 8
 """Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
 
+SLIGHT = 4 / 255
+"""Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong."""
+DEEP = 0.3
+"""Optical depth that a missing shadow has somewhere; an object that lacks less has its shadow."""
+
 Corrections = Mapping[int, tuple[torch.Tensor, int]]
 """By object the mean over the last frames of its coefficients and the optical depths of its missing shadow, and in how many frames it
 was seen."""
@@ -36,7 +41,9 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
         _shade(out, box, grounds[i], coefficients[:, COEFFICIENTS:])
         places, (y, x) = box.places(masks[i])
         given = rgb[:, y, x].T
-        out[:, y, x] = (given + changed(given[None], places[None, :, 0], coefficients[:, :COEFFICIENTS])[0]).T.clamp(0, 1)
+        change = changed(given[None], places[None, :, 0], coefficients[:, :COEFFICIENTS])[0]
+        if change.square().mean() > SLIGHT**2:
+            out[:, y, x] = (given + change).T.clamp(0, 1)
     return out, after
 
 
@@ -73,6 +80,8 @@ def _looked_at(
 
 def _shade(out: torch.Tensor, box: Box, ground: torch.Tensor, depths: torch.Tensor) -> None:
     """Darken, in the picture `out` `[3, H, W]`, the `ground` `[h, w]` of a box's outer part."""
+    if depths.max() < DEEP:
+        return
     places, (y, x) = box.places(ground)
     depth = optical_depth(places[None], depths)[0]
     dark = depth > NONE
