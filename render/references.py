@@ -51,6 +51,9 @@ COVERED, RIM = 0.3, 2
 GRID = 12, 20
 """Points of a view, down and across, by which photos are chosen."""
 
+APART = 0.06
+"""Spread of what photos add to the sky at which little of it is believed: what differs is no sky but wires that no splats stand for."""
+
 BORDER = 0.1
 """Part of a photo's side over which a point counts as leaving it: a step of GRID."""
 
@@ -131,7 +134,7 @@ class References:
     def _detail(self, frame: Frame, placed: list[Placed], clear: torch.Tensor, predicted: Sequence[Camera]) -> torch.Tensor:
         """What the photos add to a frame, and how far that is to be trusted, `[H, W, 4]`: the former is weighted by the latter already."""
         assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
-        total, weight = torch.zeros_like(frame.rgb), torch.zeros_like(frame.depth)
+        total, weight, squares = torch.zeros_like(frame.rgb), torch.zeros_like(frame.depth), torch.zeros_like(frame.depth)
         distance = frame.depth * camera_rays(frame.camera).to(frame.depth).norm(dim=-1)
         for index, share in self.chosen(frame, predicted):
             seen = self._seen(index, frame.camera.width, frame.rgb.device)
@@ -140,8 +143,13 @@ class References:
             parallax = torch.where(frame.instance < 0, 0.0, baseline / distance)
             sure = share * shown / (NOISE + parallax / PARALLAX)
             total += sure[..., None] * difference
+            squares += sure * difference.square().mean(-1)
             weight += sure
-        return torch.cat([total, weight[..., None]], -1) / (1 + weight)[..., None]
+        some = weight.clamp_min(1e-9)
+        spread = squares / some - (total / some[..., None]).square().mean(-1)
+        spread = F.max_pool2d(spread[None, None], 3, 1, 1)[0, 0]
+        agree = torch.where(frame.instance < 0, torch.exp(-spread / APART**2), 1.0)
+        return torch.cat([total, weight[..., None]], -1) * (agree / (1 + weight))[..., None]
 
     def chosen(self, frame: Frame, predicted: Sequence[Camera] = ()) -> list[tuple[int, float]]:
         """The shots that show most of a frame from nearby, best first, and a share of 0 to 1 for each; continuous along a path; none
