@@ -28,6 +28,7 @@ def stirred(module: torch.nn.Module, seed: int, share: float = 1.0) -> torch.nn.
 def cosmos(seed: int = 0, masks: int = 1):
     """diffusers' transformer: 2 blocks, 2 heads of 24. The mask channels are ordinary channels of it, as torchvision would be needed."""
     module = pytest.importorskip("diffusers.models.transformers.transformer_cosmos", reason="diffusers is not installed")
+    torch.manual_seed(seed)
     stretch = 4.0 if masks == 1 else 3.0
     net = module.CosmosTransformer3DModel(
         in_channels=16 + masks, out_channels=16, num_attention_heads=2, attention_head_dim=24, num_layers=2, mlp_ratio=2.0,
@@ -39,6 +40,7 @@ def cosmos(seed: int = 0, masks: int = 1):
 def wan(seed: int = 0):
     """diffusers' autoencoder, 12 times narrower."""
     module = pytest.importorskip("diffusers.models.autoencoders.autoencoder_kl_wan", reason="diffusers is not installed")
+    torch.manual_seed(seed)
     return stirred(module.AutoencoderKLWan(base_dim=8, z_dim=16, latents_mean=list(MEAN), latents_std=list(STD)), seed, 0.5)
 
 
