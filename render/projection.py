@@ -16,7 +16,7 @@ from render.kernels.lenses.optics import PARAMS, Optics
 from render.kernels.lenses.optics import params as vec_params
 from render.kernels.project import project, project_backward
 from render.kernels.project_lens import POSE, lens_kernels
-from render.kernels.types import RAY_BOUNDS, View
+from render.kernels.types import View
 from scenes.camera import Camera
 from scenes.gaussians import Placed, SplatModel
 from scenes.lenses import Equirectangular, Lens, OpenCV, Pinhole
@@ -158,7 +158,7 @@ def _view(settings: Settings, lens: Lens) -> View:
         margin = 4 * math.sqrt(settings.model.dilation) + 1
         v.left, v.right, v.top, v.bottom = view_box(lens, settings.width, settings.height, margin)
     v.tile_left, v.tile_top, v.tiles_x, v.tiles_y = settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y
-    v.widen = RAY_BOUNDS if settings.model.response == "ray" else 1.0
+    v.along_rays = int(settings.model.response == "ray")
     v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
     v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
     v.unscented, v.antialias = int(settings.model.projection == "ut"), int(settings.model.antialias)

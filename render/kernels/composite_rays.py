@@ -292,7 +292,7 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         e = lanes(0.0)
                         if wp.static(ray):
                             ux, uy, uz, qx, qy, qz = canonical(frames, i, rays, row, tx)
-                            e = faded_along(record, ux, uy, uz, qx, qy, qz)
+                            e = faded_along(record, column, x0, ux, uy, uz, qx, qy, qz)
                         else:
                             e = faded_conic(record, column, x0, y)
                         de = wp.cw_mul(wp.cw_mul(da, e), below(alpha_max, e * opacity))

@@ -8,7 +8,8 @@ import warp as wp
 
 from render.kernels.fields import exp_scale, rotation, rotation_backward, sigmoid
 from render.kernels.moments import Footprint, axis_backward, cross2, cross_gradient, footprint, gradient_of_quadratic, quadratic
-from render.kernels.splat import Ellipse, colour_backward, cull, gather, no_gradient, write_splat
+from render.kernels.ray_bound import pinhole_bound
+from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, OPTIONS, REACH, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
@@ -66,7 +67,10 @@ def project(
             scale = exp_scale(log_scales[i])
             if in_view(t, axes, scale, view):
                 e = ellipse(exact, footprint(t, axes, scale, view), view)
-                write_splat(e, opacity, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
+                shows = fade(e, opacity, view)
+                if view.along_rays != 0 and shows[1] > 0.0:
+                    e = pinhole_bound(exact, wp.mat33d(axes * wp.diag(scale)), shows[1], view)
+                write_splat(e, shows, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
 
 
 @wp.kernel

@@ -13,9 +13,10 @@ from render.kernels.lenses import PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import PARAMS, Optics, params
 from render.kernels.motion import motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
+from render.kernels.ray_bound import lens_bound
 from render.kernels.sight import column, sight_functions
 from render.kernels.sigma import ROOT3, ROOT6, covariance_backward, reach, reach_backward
-from render.kernels.splat import colour_backward, cull, gather, no_gradient, write_splat
+from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, View
 
 ROLLED = OPTIONS | {"max_unroll": 0}
@@ -66,6 +67,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     pixel, jacobian, params_gradient, depth = lens
     planar, around = depth == PLANAR, depth == ROUND
     readout, placed, pixel_backward, nearest, sighted, spread, turns, ellipse = sight_functions(lens, rolling)
+    bound = lens_bound(lens, rolling)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens(
@@ -93,8 +95,13 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     ahead = in_view(wp.vec3(c.t), wp.mat33(c.rotation * axes), wp.vec3(1.0), view)
                 if ahead:
                     e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view.unscented))
+                    shows = fade(e, opacity, view)
+                    if view.along_rays != 0 and shows[1] > 0.0:
+                        e = bound(optics, motion, x, axes, c, shows[1], view)
+                        if motion.copy != 0 and e.seen > 1.0e8:
+                            shows = wp.vec2(0.0)  # its original is seen everywhere
                     sight = wp.vec3(wp.transpose(c.rotation) * c.t)
-                    write_splat(e, opacity, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)
+                    write_splat(e, shows, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens_backward(

@@ -16,7 +16,7 @@ import warp as wp
 
 from render.kernels.lanewise import below, cut
 from render.kernels.rows import exp_of, row_range
-from render.kernels.types import OPACITY, RAY_BOUNDS, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
+from render.kernels.types import OPACITY, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
 
 lanes64 = wp.types.vector(length=TILE, dtype=wp.float64)
 
@@ -125,8 +125,8 @@ def ray_functions(ray: bool, eyes: bool, squarings: int):
         return cut(s, record[S_MAX], exp_minus(s))
 
     @wp.func
-    def faded_along(record: lanes, ux: lanes64, uy: lanes64, uz: lanes64, qx: lanes64, qy: lanes64, qz: lanes64):
-        s_max = record[S_MAX] * wp.static(1.0 / RAY_BOUNDS)
+    def faded_along(record: lanes, column: lanes, x0: float, ux: lanes64, uy: lanes64, uz: lanes64, qx: lanes64, qy: lanes64, qz: lanes64):
+        s_max = record[S_MAX]
         along_ray = dot(ux, uy, uz, qx, qy, qz)
         t = wp.cw_div(along_ray, square(ux, uy, uz))
         mx = qx - wp.cw_mul(t, ux)
@@ -135,6 +135,9 @@ def ray_functions(ray: bool, eyes: bool, squarings: int):
         s = lanes(dot(mx, my, mz, mx, my, mz) * wp.float64(0.5))
         # what the ray leaves behind it is not seen, nor anything where there is no ray
         s = s + (lanes(1.0) - below(0.0, lanes(-along_ray))) * (2.0 * s_max)
+        # nor on the other side of an image that closes on itself, where its copy stands
+        beside = column - lanes(record[X] - x0)
+        s = s + (lanes(1.0) - below(0.0, wp.cw_mul(beside, beside) - lanes(record[X_REST] * record[X_REST]))) * (2.0 * s_max)
         return cut(s, s_max, exp_minus(s))
 
     return canonical, faded_conic, faded_along
@@ -174,7 +177,7 @@ def list_row(ray: bool, eyes: bool, ordered: bool, squarings: int):
                     if wp.static(ordered):
                         at = share(dot(ux, uy, uz, qx, qy, qz), square(ux, uy, uz), far)
                 if wp.static(ray):
-                    a = wp.min(faded_along(record, ux, uy, uz, qx, qy, qz) * record[OPACITY], lanes(alpha_max))
+                    a = wp.min(faded_along(record, column, x0, ux, uy, uz, qx, qy, qz) * record[OPACITY], lanes(alpha_max))
                 else:
                     a = wp.min(faded_conic(record, column, x0, y) * record[OPACITY], lanes(alpha_max))
                 reach[band, 2, count] = n - start

@@ -54,6 +54,7 @@ class Ellipse:
     xy: float
     yy: float
     det0: float
+    seen: float  # along rays, how far from x, in pixels
 
 
 @wp.struct
@@ -72,23 +73,30 @@ class EllipseGradient:
 
 
 @wp.func
-def write_splat(
-    e: Ellipse, opacity: float, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
-    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
-):  # fmt: skip
-    """Record j, its reach, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
-
-    sight: from the eye to the splat in its local frame, of any length.
-    """
-    xx = e.xx + view.dilation
-    yy = e.yy + view.dilation
-    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
+def fade(e: Ellipse, opacity: float, view: View):
+    """Opacity, compensated for dilation where that is wanted, and the exponent up to which the splat shows; 0 where it does not."""
     if view.antialias != 0:
+        det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
         opacity = opacity * wp.sqrt(e.det0 / wp.max(det, TINY))
     s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
     if opacity <= view.least_opacity:
         s_max = 0.0
-    s_max *= view.widen
+    return wp.vec2(opacity, s_max)
+
+
+@wp.func
+def write_splat(
+    e: Ellipse, shows: wp.vec2, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
+    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
+):  # fmt: skip
+    """Record j, its reach, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
+
+    shows: as of `fade`. sight: from the eye to the splat in its local frame, of any length.
+    """
+    xx = e.xx + view.dilation
+    yy = e.yy + view.dilation
+    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
+    s_max = shows[1]
     # written so that a NaN anywhere culls the splat instead of spreading
     if s_max > 0.0 and det > TINY and xx > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
         h = 0.5 / yy
@@ -101,10 +109,12 @@ def write_splat(
         records[j, Y] = y
         records[j, X_REST] = float(e.x - wp.float64(x))
         records[j, Y_REST] = float(e.y - wp.float64(y))
+        if view.along_rays != 0:
+            records[j, X_REST] = e.seen
         records[j, K] = k
         records[j, M] = e.xy / yy
         records[j, H] = h
-        records[j, OPACITY] = opacity
+        records[j, OPACITY] = shows[0]
         records[j, S_MAX] = s_max
         records[j, Z] = depth
         records[j, INSTANCE] = instance

@@ -17,16 +17,14 @@ RECORD = 16
 """Floats of a projected splat: one cache line. With dx, dy the pixel's offset from (X, Y), the exponent is
 s = (K (dx - M dy))^2 + H dy^2: the conic as a product of conditionals, which does not cancel for needles as
 a dx^2 + 2 b dx dy + c dy^2 does, and gives a row's exact extent by one square root. A centre is kept in two parts, since a float has
-0.0001 pixels at 2,000: X is what a float holds of it, X_REST what that leaves over. X - x0 is exact."""
+0.0001 pixels at 2,000: X is what a float holds of it, X_REST what that leaves over. X - x0 is exact. With response "ray" the conic only
+bounds a splat, and X_REST is how far from X it may be seen: half a turn, of a lens whose image closes on itself."""
 X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, Y_AT_EXT, X_REST, Y_REST = (wp.constant(i) for i in range(RECORD))
 # Y_EXT: the ellipse's reach in y; Y_AT_EXT: dy of its rightmost point
 
 GRADIENTS = 10
 """Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
 G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i) for i in range(GRADIENTS))
-
-RAY_BOUNDS = 1.5
-"""With response "ray" the conic only bounds a splat, which is no ellipse on the image: S_MAX is so many times its own."""
 
 
 class Wanted(NamedTuple):
@@ -101,7 +99,7 @@ class View:
     tiles_x: int
     tiles_y: int
     dilation: float
-    widen: float  # exponents to which a splat's bounds reach, of those to which it shows
+    along_rays: int  # whether records only bound a splat (`ray_bound.py`)
     near: float
     log_cutoff: float  # ln(1 / alpha cutoff)
     faint: float  # opacity below which a splat's cutoff shrinks with it
