@@ -26,11 +26,6 @@ WAYS = {
 OUTPUTS = ("rgb", "alpha", "depth", "instance")
 
 
-def small_splats(seed: int) -> list[Placed]:
-    """Two instances whose projected ellipses bound their rays' footprint: not too large for their distance."""
-    return [replace(p, gaussians=replace(p.gaussians, log_scales=p.gaussians.log_scales - 0.3)) for p in two_instances(seed)]
-
-
 def tangent(pose: torch.Tensor) -> torch.Tensor:
     """A pose's gradient along what keeps it a pose: `[4, 3]`. Off it a splat's inverse has no one form, and no motion leads there."""
     turn = pose[:3, :3].detach().T @ pose.grad[:3, :3]
@@ -40,7 +35,7 @@ def tangent(pose: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("way", WAYS)
 def test_forward_agrees_with_the_oracle(way):
     model, order = WAYS[way]
-    placed = small_splats(1)
+    placed = two_instances(1)
     rgb, alpha, depth, instance, unsure = oracle.render(
         oracle.as_oracle(placed), CAMERA, model, cutoff=1 / 255, alpha_max=0.999, order=order
     )
@@ -106,7 +101,7 @@ def assert_gradients(placed: list[Placed], camera: Camera, model: SplatModel, or
 def test_gradients_agree_with_the_oracle(way):
     model, order = WAYS[way]
     for seed in (2, 3):
-        assert_gradients(small_splats(seed), CAMERA, model, order)
+        assert_gradients(two_instances(seed), CAMERA, model, order)
 
 
 EYES = {
@@ -123,7 +118,6 @@ def test_rays_that_begin_in_places_of_their_own_draw_what_the_oracle_draws(name,
     """Of an orthographic lens, and where camera and car move while the image is read out: each pixel looks from where it was then."""
     (model, order), camera = WAYS[way], EYES[name]
     placed = traffic(1) if camera.shutter != "global" else around(1)
-    placed = [replace(p, gaussians=replace(p.gaussians, log_scales=p.gaussians.log_scales - 0.5)) for p in placed]
     model = replace(model, projection="ut") if camera.shutter != "global" else model
     ends = [p.world_from_local_end for p in placed]
     rgb, alpha, _, _, unsure = oracle.render(
@@ -142,7 +136,6 @@ def test_rays_that_begin_in_places_of_their_own_have_the_oracles_gradients(name)
     camera = EYES[name]
     moves = camera.shutter != "global"
     placed = traffic(2) if moves else around(2)
-    placed = [replace(p, gaussians=replace(p.gaussians, log_scales=p.gaussians.log_scales - 0.5)) for p in placed]
     named = assert_gradients(placed, camera, replace(RAY, antialias=moves), "pixel")
     assert {"camera end pose", "end pose of 1"} <= named or not moves
 
@@ -150,7 +143,7 @@ def test_rays_that_begin_in_places_of_their_own_have_the_oracles_gradients(name)
 @pytest.mark.parametrize("way", WAYS)
 def test_windows_crops_and_features_are_the_same_bits_as_the_whole(way):
     model, order = WAYS[way]
-    placed = small_splats(3)
+    placed = two_instances(3)
     features = torch.randn(170, 3, generator=torch.Generator().manual_seed(2))
     outputs = (*OUTPUTS, "median_depth", "features", "normal")
     whole = rasterize(placed, CAMERA, outputs, model=model, config=RenderConfig(order=order), features=features)
