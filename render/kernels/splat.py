@@ -41,6 +41,8 @@ from render.kernels.types import (
     Z,
 )
 
+LARGEST = wp.constant(1.0e16)  # px^2, of a variance: beyond it floats lose the rest
+
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
 
 
@@ -79,7 +81,7 @@ def fade(e: Ellipse, opacity: float, view: View):
         det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
         opacity = opacity * wp.sqrt(e.det0 / wp.max(det, TINY))
     s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
-    if opacity <= view.least_opacity:
+    if opacity <= view.least_opacity or not (e.xx < LARGEST and e.yy < LARGEST):
         s_max = 0.0
     return wp.vec2(opacity, s_max)
 
@@ -98,7 +100,7 @@ def write_splat(
     det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
     s_max = shows[1]
     # written so that a NaN anywhere culls the splat instead of spreading
-    if s_max > 0.0 and det > TINY and xx > TINY and yy > TINY and xx < 1.0e16 and yy < 1.0e16:
+    if s_max > 0.0 and det > TINY and xx > TINY and yy > TINY and xx < LARGEST and yy < LARGEST:
         h = 0.5 / yy
         k = wp.sqrt(0.5 * yy / det)
         x_ext = wp.sqrt(2.0 * s_max * xx)
