@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 
 from render import RenderConfig, rasterize
+from render.order import depth_order
 from tests.bench.limit import compositing, forward_limit
 from tests.bench.measure import CLOCKS, in_turns, lane_rate, peak_memory, timed
 from tests.bench.plot import Chart, save
@@ -45,8 +46,10 @@ def measure(name: str, preset: Preset, repeat: int, clock: str) -> dict:
         works |= {f"prototype {k}": lambda k=k: tiles.run(getattr(lanes, k), threads) for k in ("forward", "backward")}
     ms = in_turns(works, repeat, clock)
     if name == "uniform-100k":
+        depths = preset.placed[0].gaussians.means[:, 2].contiguous().view(torch.int32)  # as of a camera at the origin
         more = {
             "compositing alone": compositing(preset),
+            "depth order alone": lambda: depth_order(depths),
             "unscented": lambda: rasterize(preset.placed, camera, ("rgb",)),
             "depth and instance": lambda: rasterize(preset.placed, camera, ("rgb", "depth", "instance"), model=preset.model),
             "no termination": lambda: forward(config=RenderConfig(termination=0)),
