@@ -13,7 +13,7 @@ from render.kernels.lenses import PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import PARAMS, Optics, params
 from render.kernels.motion import motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
-from render.kernels.ray_bound import lens_bound
+from render.kernels.ray_bound import ANYWHERE, lens_bound
 from render.kernels.sight import column, sight_functions
 from render.kernels.sigma import ROOT3, ROOT6, covariance_backward, reach, reach_backward
 from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
@@ -98,7 +98,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     shows = fade(e, opacity, view)
                     if view.along_rays != 0 and shows[1] > 0.0:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
-                        if motion.copy != 0 and e.seen > 1.0e8:
+                        if motion.copy != 0 and e.seen == ANYWHERE:
                             shows = wp.vec2(0.0)  # its original is seen everywhere
                     sight = wp.vec3(wp.transpose(c.rotation) * c.t)
                     write_splat(e, shows, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)

@@ -13,12 +13,14 @@ import warp as wp
 
 from render.kernels.lenses import PARALLEL, PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import Optics
-from render.kernels.motion import Motion, rotation_at
+from render.kernels.motion import Motion
 from render.kernels.sight import Sight, column, sight_functions
 from render.kernels.sigma import inside
 from render.kernels.splat import Ellipse
 from render.kernels.types import TILE, View
 
+ANYWHERE = wp.constant(1.0e9)
+"""Pixels from its middle within which a splat is seen that no seam hides."""
 POINTS = wp.constant(16)
 vec_points = wp.types.vector(length=16, dtype=wp.float64)
 SHARE = wp.constant(wp.float64(1 / 16))
@@ -46,7 +48,7 @@ def everywhere(s_max: float, view: View):
     e.xx = float(half * side * side / wp.float64(s_max))
     e.yy = e.xx
     e.det0 = e.xx * e.yy
-    e.seen = 1.0e9
+    e.seen = ANYWHERE
     return e
 
 
@@ -90,7 +92,7 @@ def pinhole_bound(t: wp.vec3d, axes: wp.mat33d, s_max: float, view: View):
     my = -yz / ahead
     return ellipse_of(
         view.lens[0] * nx + view.lens[2] + rho2 * mx, view.lens[1] * ny + view.lens[3] + rho2 * my,
-        xx / ahead + rho2 * mx * mx, xy / ahead + rho2 * mx * my, yy / ahead + rho2 * my * my, wp.float64(1.0e9),
+        xx / ahead + rho2 * mx * mx, xy / ahead + rho2 * mx * my, yy / ahead + rho2 * my * my, wp.float64(ANYWHERE),
     )  # fmt: skip
 
 
@@ -106,16 +108,13 @@ def lens_bound(lens: LensFunctions, rolling: bool):
         """axes: the splat's scaled axes in its local frame, as columns."""
         one = wp.float64(1.0)
         rho2 = wp.float64(2.0) * wp.float64(s_max)
-        turn = m.r0
-        if wp.static(rolling):
-            turn = rotation_at(m, c.s)
         # the eye, or where it lies, in the frame in which the ellipsoid is a sphere
         eye = wp.vec3d()
         sight = c.t
         if wp.static(depth == PARALLEL):
             sight = wp.vec3d(wp.float64(0.0), wp.float64(0.0), one)
         for k in range(3):
-            a = turn * column(axes, k)
+            a = c.rotation * column(axes, k)
             eye[k] = -wp.dot(a, sight) / wp.max(wp.dot(a, a), wp.float64(1.0e-60))
         away = wp.length(eye)
         n = eye / away
@@ -172,7 +171,7 @@ def lens_bound(lens: LensFunctions, rolling: bool):
             dy = py[i] - sy
             widest = wp.max(widest, (yy * dx * dx - wp.float64(2.0) * xy * dx * dy + xx * dy * dy) / det)
         scale = widest * wp.float64(wp.static(room)) / rho2
-        seen = wp.float64(1.0e9)
+        seen = wp.float64(ANYWHERE)
         if o.period > wp.float64(0.0):
             seen = wp.float64(0.5) * o.period
         middle = at[0] + sx
