@@ -8,22 +8,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from torch.utils.weak import WeakTensorKeyDictionary
+import torch
 
+from render.kept import kept_beside
 from scenes.gaussians import SH_COUNTS, Gaussians
-
-_kept = WeakTensorKeyDictionary()  # by sh: its version, and the bands that are not zero
 
 
 def without_zero_bands(g: Gaussians) -> Gaussians:
     """The same splats with no more SH coefficients than say something; `g` itself where all do."""
     if g.sh.shape[1] == 1 or not len(g):
         return g
-    kept = _kept.get(g.sh)
-    if kept is None or kept[0] != g.sh._version:
-        used = g.sh.detach().ne(0).any(0).any(1)  # NaN is not zero
-        last = int(used.nonzero().max()) if used.any() else 0
-        count = next(c for c in SH_COUNTS if c > last)
-        kept = (g.sh._version, None if count == g.sh.shape[1] else g.sh.detach()[:, :count].contiguous())
-        _kept[g.sh] = kept
-    return g if kept[1] is None else replace(g, sh=kept[1])
+    said = _bands_that_say_something(g.sh)
+    return g if said is None else replace(g, sh=said)
+
+
+@kept_beside
+def _bands_that_say_something(sh: torch.Tensor) -> torch.Tensor | None:
+    """None where all do."""
+    used = sh.detach().ne(0).any(0).any(1)  # NaN is not zero
+    last = int(used.nonzero().max()) if used.any() else 0
+    count = next(c for c in SH_COUNTS if c > last)
+    return None if count == sh.shape[1] else sh.detach()[:, :count].contiguous()

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 import warp as wp
 
+from render.block_compositing import draw_blocks, draw_blocks_backward
 from render.chunks import Sums, add_to, room_in, window, windows
 from render.kernels.composite import BATCH, HELD, composite
 from render.kernels.composite_backward import SUMS, composite_gradient
-from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.types import GRADIENTS, TILE, Window, lanes
-from render.launch import BANDS, run, run_blocks, view
+from render.launch import BANDS, run, view
 from render.order import TileLists, tile_lists
 from render.projected import Part, Projected
 from render.ray_compositing import add_window, draw_rays, draw_rays_backward, lanes_of, lists_where, settled_tiles
@@ -87,16 +87,19 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
         slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
         channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
         grads = _of_part(settings, part, wanted)
-        if g_frames is not None and g_rays is not None:
+        frame_slots = None
+        if device.type == "cuda":
+            frame_slots = draw_blocks_backward(settings, part, lists, scene, grads, slots, channel_slots, g_rays)
+        elif g_rays is not None:
             settled, *ends = part.ends
             plain, crossing = lists_where(lists, settled), lists_where(lists, 1 - settled)
             _composite_backward(settings, replace(part, ends=tuple(ends)), plain, scene, grads, slots, channel_slots)
             frame_slots, of_window = draw_rays_backward(settings, part, crossing, scene, grads, slots, channel_slots, settled)
-            if len(frame_slots):
-                add_to(g_frames, counts, lists, frame_slots)
             add_window(g_rays, part.window, of_window)
         else:
             _composite_backward(settings, part, lists, scene, grads, slots, channel_slots)
+        if g_frames is not None and frame_slots is not None and len(frame_slots):
+            add_to(g_frames, counts, lists, frame_slots)
         if g_features is not None:
             add_to(g_features, counts, lists, channel_slots)
         if sums is None:
@@ -151,10 +154,12 @@ def _features(scene: Projected) -> list:
 
 def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected):
     """Planes, picks, and where compositing ended: one past the last entry of each row, and where in the tile's list each pixel went
-    dark (CPU); one past the last entry of each pixel (CUDA)."""
+    dark (CPU); as of `draw_blocks` (CUDA)."""
     device = scene.records.device
     planes = _planes(w, settings.wanted.first_channel + scene.channels, device)
     picks = _planes(w, 2 if settings.wanted.picks else 0, device)
+    if device.type == "cuda":
+        return planes, picks, draw_blocks(settings, w, lists, scene, planes, picks)
     if settings.by_rays:
         settled = settled_tiles(settings, w, lists, scene)
         ends = _by_tile(settings, w, lists_where(lists, settled), scene, planes, picks)
@@ -168,12 +173,6 @@ def _by_tile(settings: Settings, w: Window, lists: TileLists, scene: Projected, 
     device = scene.records.device
     lists_of = [view(lists.starts, int), view(lists.ids, int)]
     limits = [settings.alpha_max, settings.termination]
-    if device.type == "cuda":
-        last = torch.empty(planes.shape[1:], dtype=torch.int32, device=device)
-        kernel = composite_blocks(settings.wanted, TILE)
-        args = [*lists_of, view(scene.records, float), *_features(scene), w, *limits, view(planes, float), view(picks, float)]
-        run_blocks(kernel, w.tiles_x * w.tiles_y, TILE * TILE, [*args, view(last, int)], device)
-        return (last,)
     ends = planes.shape[1:] if settings.gradients else (0, 0)
     last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends)
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
@@ -184,19 +183,8 @@ def _by_tile(settings: Settings, w: Window, lists: TileLists, scene: Projected, 
 
 def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene: Projected, grads, slots, channel_slots) -> None:
     """Fill the gradient slots of the window's entries; grads are planes as of `_of_part`."""
-    device, w = scene.records.device, part.window
+    w = part.window
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int)]
-    if device.type == "cuda":
-        kernel = composite_blocks_gradient(settings.wanted, TILE)
-        args = [*lists_of, view(scene.records, float), *_features(scene), w, settings.alpha_max, view(part.planes, float)]
-        run_blocks(
-            kernel,
-            w.tiles_x * w.tiles_y,
-            TILE * TILE,
-            [*args, view(grads, float), view(part.ends[0], int), view(slots, float), view(channel_slots, float)],
-            device,
-        )
-        return
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
     terms = torch.empty(BANDS * int(3 * BATCH + SUMS), TILE)
     args += [
@@ -209,7 +197,7 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene:
     ends = [view(part.ends[0], int), lanes_of(part.ends[1])]
     out = [view(slots, float), view(channel_slots, float)]
     kernel = composite_gradient(settings.wanted, settings.squarings)
-    run(kernel, BANDS, [*args, lanes_of(part.planes), lanes_of(grads), *ends, *out, sums], device)
+    run(kernel, BANDS, [*args, lanes_of(part.planes), lanes_of(grads), *ends, *out, sums], grads.device)
 
 
 def _working(channels: int) -> list:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch.utils.weak import WeakTensorKeyDictionary
 
+from render.kept import kept_beside
 from render.kernels.types import ITEM, REACH
 from render.projection import moves
 from scenes.camera import Camera
@@ -27,8 +27,6 @@ from scenes.poses import inverse
 
 CLUSTER = 1024
 """Splats of a cluster: a whole number of items."""
-
-_bounds = WeakTensorKeyDictionary()  # by means: what they were made from, and the spheres
 
 
 def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> list[torch.Tensor | None]:
@@ -90,19 +88,15 @@ def _seen(placed: Sequence[Placed], camera: Camera, sides: torch.Tensor) -> list
 def bounds(g: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
     """Centres `[C, 3]` and radii `[C]`, float64 on the CPU, of spheres around the clusters' ellipsoids of 3.33 sigma; kept until the splats
     change."""
-    made_from = (g.means._version, g.log_scales._version, g.log_scales.data_ptr(), len(g))
-    kept = _bounds.get(g.means)
-    if kept is None or kept[0] != made_from:
-        kept = (made_from, _spheres(g))
-        _bounds[g.means] = kept
-    return kept[1]
+    return _spheres(g.means, g.log_scales, CLUSTER)
 
 
-def _spheres(g: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
-    spare = -len(g) % CLUSTER  # the last cluster is filled up with its last splat
-    means, reach = g.means.detach(), float(REACH) * g.log_scales.detach().amax(1).exp()
-    means = torch.cat([means, means[-1:].expand(spare, 3)]).view(-1, CLUSTER, 3)
-    reach = torch.cat([reach, reach[-1:].expand(spare)]).view(-1, CLUSTER)
+@kept_beside
+def _spheres(means: torch.Tensor, log_scales: torch.Tensor, cluster: int) -> tuple[torch.Tensor, torch.Tensor]:
+    spare = -len(means) % cluster  # the last cluster is filled up with its last splat
+    means, reach = means.detach(), float(REACH) * log_scales.detach().amax(1).exp()
+    means = torch.cat([means, means[-1:].expand(spare, 3)]).view(-1, cluster, 3)
+    reach = torch.cat([reach, reach[-1:].expand(spare)]).view(-1, cluster)
     centres = 0.5 * (means.amin(1) + means.amax(1))
     radii = ((means - centres[:, None]).norm(dim=2) + reach).amax(1)
     # float32's rounding here and in the kernels

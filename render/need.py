@@ -11,12 +11,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from render.frame_types import Frame
+from render.kept import kept_beside
 from render.rays import camera_rays
 from scenes.camera import Camera
-from scenes.gaussians import Gaussians, Placed
+from scenes.gaussians import Placed
 from scenes.poses import inverse
 from scenes.scene import Scene
 
@@ -36,31 +36,25 @@ FACING = math.cos(math.radians(60))
 """Photos that look further away than this from where the camera looks did not see what it sees."""
 
 
-_shapes = WeakTensorKeyDictionary()  # by log_scales: their version, and what `_shape` found
-
-
 def support_fields(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
     """By instance `[N, 2]`: how coarse each splat is on the image, and how stretched, 0 to 1."""
     fields = []
     cam_from_world = inverse(camera.world_from_cam.detach())
     for p in placed:
         pose = (cam_from_world @ p.world_from_local.detach()).to(p.gaussians.device, torch.float32)
-        middle, stretched = _shape(p.gaussians)
+        middle, stretched = _shape(p.gaussians.log_scales)
         depth = camera.lens.depth(p.gaussians.means.detach() @ pose[:3, :3].T + pose[:3, 3]).clamp_min(0.1)
         sigma = max(camera.lens.focal()) * middle / depth
         fields.append(torch.stack([_ramp(sigma, COARSE).nan_to_num(1.0), stretched], 1).float())
     return fields
 
 
-def _shape(g: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
-    """`[N]` each: the middle axis in metres, and how stretched the splat is, 0 to 1; kept until the scales change."""
-    kept = _shapes.get(g.log_scales)
-    if kept is None or kept[0] != g.log_scales._version:
-        shortest_first = g.log_scales.detach().sort(1).values
-        stretched = _ramp((shortest_first[:, 2] - shortest_first[:, 1]).exp(), STRETCHED).nan_to_num(1.0)
-        kept = (g.log_scales._version, shortest_first[:, 1].exp(), stretched)
-        _shapes[g.log_scales] = kept
-    return kept[1:]
+@kept_beside
+def _shape(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """`[N]` each: the middle axis in metres, and how stretched the splat is, 0 to 1."""
+    shortest_first = log_scales.detach().sort(1).values
+    stretched = _ramp((shortest_first[:, 2] - shortest_first[:, 1]).exp(), STRETCHED).nan_to_num(1.0)
+    return shortest_first[:, 1].exp(), stretched
 
 
 def need_of(scene: Scene, frame: Frame, shaded: torch.Tensor) -> torch.Tensor:

@@ -19,7 +19,7 @@ from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
-from render.rays import exact_rays
+from render.rays import exact_rays, on_device
 from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
@@ -153,6 +153,7 @@ def _along_rays(placed: list[Placed], camera: Camera, settings: Settings) -> tup
     """The splats' canonical frames and the camera's rays, which hold all gradients of response "ray"; an order has none."""
     with torch.set_grad_enabled(torch.is_grad_enabled() and settings.model.response == "ray"):
         rays, groups = exact_rays(camera, placed, settings.rolling)
+        rays = on_device(rays, placed[0].gaussians.device)
         cam_from_world = inverse(camera.world_from_cam)
         there = [(p.gaussians, cam_from_world @ p.world_from_local, group) for p, group in zip(placed, groups, strict=True)]
         return torch.cat([canonical_frames(*one) for one in there]), rays
@@ -184,10 +185,6 @@ def _check(placed, camera, outputs, flow_to, model, config) -> None:
         what, _, way = name.partition("_")
         if what in ("flow", "visible") and way not in (flow_to or {}):
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
-    if model.response == "ray" or config.order == "pixel":
-        which = 'response "ray"' if model.response == "ray" else 'order "pixel"'
-        if placed[0].gaussians.device.type != "cpu":
-            raise ValueError(f"{which} is drawn on the CPU only; move the splats there, or use the default")
     check_projection(camera, placed, model)
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:

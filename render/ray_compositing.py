@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 import warp as wp
-from torch.utils.weak import WeakTensorKeyDictionary
 
+from render.kept import kept_beside
 from render.kernels.composite_rays import SUMS, composite_rays, composite_rays_gradient
 from render.kernels.ray_rows import FRAME, LISTS, lanes64
 from render.kernels.settled import settle
@@ -18,21 +18,19 @@ from render.settings import Settings
 MOST_HELD = 1 << 19
 """Entries that the bands' working lists may hold together, at 640 bytes each."""
 
-_extents = WeakTensorKeyDictionary()  # by rays: middles and halves of what each tile of them spans
-
 
 def lanes_of(planes: torch.Tensor):
     """Planes `[.., rows, pitch * 16]` as lane vectors."""
     return view(planes.view(*planes.shape[:-1], planes.shape[-1] // TILE, TILE), lanes64 if planes.dtype == torch.float64 else lanes)
 
 
-def settled_tiles(settings: Settings, w: Window, lists: TileLists, scene: Projected) -> torch.Tensor:
-    """int32 `[tiles]`: 1 where the tiles' own kernel draws what each pixel's own order asks for."""
-    settled = torch.zeros(w.tiles_x * w.tiles_y, dtype=torch.int32)
+def settled_tiles(settings: Settings, w: Window, lists: TileLists, scene: Projected, tile: int = TILE) -> torch.Tensor:
+    """int32 `[tiles]`: 1 where the tile's order is proven to be each pixel's own. tile: pixels of its side."""
+    settled = torch.zeros(w.tiles_x * w.tiles_y, dtype=torch.int32, device=scene.records.device)
     if settings.config.order == "pixel" and settings.model.response == "conic":
         assert scene.frames is not None and scene.rays is not None
         args = [view(lists.starts, int), view(lists.ids, int), view(scene.frames, wp.float64)]
-        args += [view(extent, wp.float64) for extent in _extent(scene.rays)]
+        args += [view(extent, wp.float64) for extent in _extent(scene.rays, tile)]
         run(settle, len(settled), [*args, int(settings.eyes), w, view(settled, int)], settled.device)
     return settled
 
@@ -100,15 +98,12 @@ def _scene(w: Window, scene: Projected, planes: torch.Tensor) -> list:
     return [view(scene.records, lanes), view(scene.frames, wp.float64), view(features, float), scene.channels, lanes_of(rays)]
 
 
-def _extent(rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+@kept_beside
+def _extent(rays: torch.Tensor, tile: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Middle and half of the extent, `[G, C, tiles_y, tiles_x]` each, of the rays of every tile of the image."""
-    kept = _extents.get(rays)
-    if kept is None:
-        with torch.no_grad():
-            high, low = (sign * torch.nn.functional.max_pool2d(sign * rays, TILE, ceil_mode=True) for sign in (1, -1))
-            kept = 0.5 * (high + low), 0.5 * (high - low)
-        _extents[rays] = kept
-    return kept
+    with torch.no_grad():
+        high, low = (sign * torch.nn.functional.max_pool2d(sign * rays, tile, ceil_mode=True) for sign in (1, -1))
+        return 0.5 * (high + low), 0.5 * (high - low)
 
 
 def _working(lists: TileLists) -> tuple:

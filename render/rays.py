@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import torch
 
+from render.kept import kept_beside
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.lenses import Orthographic
@@ -71,6 +72,16 @@ def exact_rays(camera: Camera, placed: Sequence[Placed], moving: bool) -> tuple[
     shifts = shifts[:, :, None] if camera.shutter == "columns" else shifts[..., None]
     turned, begun = (torch.einsum(along, way[..., :3, :3], v) for v in (directions, origins))
     return torch.cat([turned, begun + shifts], 1), groups
+
+
+def on_device(rays: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """`rays` there; those that are the same for all frames of a clip are carried over once."""
+    return rays.to(device) if rays.device == device or rays.requires_grad else _carried(rays, device)
+
+
+@kept_beside
+def _carried(rays: torch.Tensor, device: torch.device) -> torch.Tensor:
+    return rays.to(device)
 
 
 def readout(camera: Camera, start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:

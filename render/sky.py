@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 import warp as wp
-from torch.utils.weak import WeakTensorKeyDictionary
 
+from render.kept import kept_beside
 from render.kernels.sky import lay_behind
 from render.launch import run, stage, view
 from render.rays import camera_rays, turns, world_directions
@@ -14,8 +14,6 @@ from scenes.sky import Sky, srgb_from_linear
 
 SKY_SHOWS = 1 / 512
 """Where less light than this passes the splats, the sky changes no 8-bit value."""
-
-_displayed = WeakTensorKeyDictionary()  # by linear radiance: its version, and display-referred colours
 
 
 def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:
@@ -28,18 +26,15 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -
     ways = turns(camera).to(rgb).contiguous()
     with stage(rgb.device):
         args = [view(camera_rays(camera).to(rgb.device), wp.vec3), view(ways, wp.mat33), int(camera.shutter != "columns")]
-        args += [view(_display(sky).to(rgb.device), wp.vec3), SKY_SHOWS, view(rgb, float), view(alpha, float), view(out, float)]
+        args += [view(_display(sky.linear).to(rgb.device), wp.vec3), SKY_SHOWS, view(rgb, float), view(alpha, float), view(out, float)]
         run(lay_behind, rgb.shape[0], args, rgb.device)
     return out
 
 
-def _display(sky: Sky) -> torch.Tensor:
-    """The sky's display-referred colours, kept until it changes."""
-    kept = _displayed.get(sky.linear)
-    if kept is None or kept[0] != sky.linear._version:
-        kept = (sky.linear._version, srgb_from_linear(sky.linear.detach()).contiguous())
-        _displayed[sky.linear] = kept
-    return kept[1]
+@kept_beside
+def _display(linear: torch.Tensor) -> torch.Tensor:
+    """A sky's display-referred colours."""
+    return srgb_from_linear(linear.detach()).contiguous()
 
 
 def _differentiably(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -> torch.Tensor:

@@ -10,27 +10,35 @@ import warp as wp
 from recon.kernels import descent as descent_kernels
 from recon.kernels import develop as develop_kernels
 from recon.kernels import sight as sight_kernels
-from render import rasterize
+from render import block_compositing, rasterize
+from render.block_compositing import draw_blocks, draw_blocks_backward
 from render.bridge import Rasterize
-from render.bridge import _told as told
 from render.chunks import window
+from render.compositing import draw, draw_backward
 from render.frame_types import RenderConfig
+from render.frames import canonical_frames
 from render.kernels import bin as bin_kernels
 from render.kernels import project as project_kernels
+from render.kernels import settled as settled_kernels
 from render.kernels import trace as trace_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
+from render.kernels.composite_cuda_order import order_blocks, order_blocks_gradient
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.project_lens import lens_kernels
+from render.kernels.ray_rows import GROUP
 from render.kernels.types import GRADIENTS, TILE, Wanted
-from render.launch import run, run_blocks, view
-from render.order import depth_order, tile_lists
+from render.order import TileLists, depth_order, tile_lists
+from render.projected import Part
+from render.rays import exact_rays
 from render.settings import Settings
-from scenes import Pinhole, SplatModel
+from scenes import Camera, Orthographic, Pinhole, SplatModel
 from scenes.poses import translation
-from tests.bench.presets import random_splats
+from tests.bench.presets import STILL, random_splats, uniform
 
 WIDTH, HEIGHT, CHANNELS = 37, 29, 3
 EVERYTHING = Wanted(depth=True, median=True, instance=True, channels=True)
+PIXELS = WIDTH * HEIGHT
+CPU = torch.device("cpu")
 KERNELS = {
     "project": lambda: project_kernels.project,
     "opencv": lambda: lens_kernels(LENS_FUNCTIONS["opencv"], False).forward,
@@ -41,8 +49,13 @@ KERNELS = {
     "descent": lambda: descent_kernels.descend,
     "develop": lambda: develop_kernels.develop_backward,
     "sight": lambda: sight_kernels.mark,
-    "composite": lambda: composite_blocks(EVERYTHING, TILE),
-    "composite backward": lambda: composite_blocks_gradient(EVERYTHING, TILE),
+    "settled": lambda: settled_kernels.settle,
+    "composite": lambda: composite_blocks(EVERYTHING, False, False, TILE),
+    "composite backward": lambda: composite_blocks_gradient(EVERYTHING, False, False, TILE),
+    "composite along rays": lambda: composite_blocks(EVERYTHING, True, True, TILE),
+    "composite along rays backward": lambda: composite_blocks_gradient(EVERYTHING, True, True, TILE),
+    "composite by pixel": lambda: order_blocks(EVERYTHING, True, True, TILE),
+    "composite by pixel backward": lambda: order_blocks_gradient(EVERYTHING, True, True, TILE),
 }
 
 
@@ -79,70 +92,94 @@ def whole(settings: Settings):
     return window(0, 0, settings.tiles_x, settings.tiles_y)
 
 
-def lane_result():
-    """Forward of the lane kernels with everything: settings, kept state, outputs."""
-    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), EVERYTHING, (5,))
-    features = torch.randn(80, CHANNELS, generator=torch.Generator().manual_seed(2))
-    return settings, *keep_forward(settings, random_splats(80, 1), translation(0, 0, 5), Pinhole(30.0, 30.0, 18.0, 14.0), features)
+def lists_of_every_pixel(kept) -> TileLists:
+    """Tiles of one pixel, each of which lists every splat: more than the exact lists."""
+    order, n = kept.scene.order, len(kept.scene.order)
+    first_slot = torch.zeros(len(kept.scene.records), dtype=torch.int32)
+    first_slot[order.long()] = torch.arange(n, dtype=torch.int32) * PIXELS
+    slot_of = (torch.arange(n)[None] * PIXELS + torch.arange(PIXELS)[:, None]).reshape(-1).to(torch.int32)
+    return TileLists(torch.arange(PIXELS + 1, dtype=torch.int32) * n, order.repeat(PIXELS), slot_of, first_slot)
 
 
-def test_block_kernels_agree_with_lane_kernels():
+WAYS = {
+    "conic by tile": (SplatModel(), "tile", Pinhole(30.0, 30.0, 18.0, 14.0)),
+    "ray by tile": (SplatModel(response="ray"), "tile", Pinhole(30.0, 30.0, 18.0, 14.0)),
+    "conic by pixel": (SplatModel(), "pixel", Pinhole(30.0, 30.0, 18.0, 14.0)),
+    "ray by pixel": (SplatModel(response="ray"), "pixel", Pinhole(30.0, 30.0, 18.0, 14.0)),
+    "ray by pixel, orthographic": (SplatModel(response="ray"), "pixel", Orthographic(7.0, 7.0, 18.0, 14.0)),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_block_kernels_agree_with_lane_kernels(way, monkeypatch):
     """One pixel a tile and one thread a block: the CUDA kernels' own arithmetic, on the CPU."""
-    settings, kept, outputs = lane_result()
-    generator = torch.Generator().manual_seed(3)
-    gradients = [torch.randn(*o.shape, generator=generator) for o in outputs[:5]]
-    expected = Rasterize.backward(kept, *gradients, None, None)
+    monkeypatch.setattr(block_compositing, "SEGMENT", 50)
+    model, order, lens = WAYS[way]
+    settings = Settings(WIDTH, HEIGHT, model, RenderConfig(order=order), EVERYTHING, (5,), type(lens))
+    pose, dice = translation(0, 0, 5), torch.Generator().manual_seed(3)
+    # so large and faint that a pixel sees more of them than a round of peeling takes
+    g = random_splats(120, 1)
+    g = replace(g, log_scales=g.log_scales + 0.6, logit_opacities=g.logit_opacities - 1.5)
+    frames = rays = None
+    if settings.by_rays:
+        frames, (rays, _) = canonical_frames(g, pose), exact_rays(Camera(lens, WIDTH, HEIGHT, STILL), [], False)
+    if settings.eyes:  # as if half of the splats moved while the image is read out: they are seen by rays of their own
+        rays = torch.cat([rays, rays + 0.002 * torch.randn(rays.shape, generator=dice)])
+        frames[60:, GROUP] = 1
+    kept, _ = keep_forward(settings, g, pose, lens, torch.randn(120, CHANNELS, generator=dice), frames, rays)
+    scene, expected = kept.scene, draw(settings, kept.scene)
+    w, lists = window(0, 0, WIDTH, HEIGHT), lists_of_every_pixel(kept)
+    planes, picks = torch.empty(len(expected.planes), HEIGHT, WIDTH), torch.empty(2, HEIGHT, WIDTH)
+    ends = draw_blocks(settings, w, lists, scene, planes, picks, tile=1)
+    assert (planes - expected.planes).abs().max() < 2e-5 * 5  # depths are about 5
+    assert (picks != expected.picks).float().mean() < 0.004
 
-    records, features, (group,) = kept.scene.records, kept.scene.features, kept.work.groups
-    visible = torch.where(kept.scene.counts > 0, records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
-    pixels = WIDTH * HEIGHT
-    # every pixel lists every splat: more than the exact lists
-    everywhere = torch.where(kept.scene.counts > 0, pixels, 0).to(torch.int32)
-    order = torch.argsort(visible, stable=True)[: int((kept.scene.counts > 0).sum())].to(torch.int32)
-    n = len(order)
-    starts = torch.arange(pixels + 1, dtype=torch.int32) * n
-    ids = order.repeat(pixels)
-    first_slot = torch.zeros(len(records), dtype=torch.int32)
-    first_slot[order.long()] = torch.arange(n, dtype=torch.int32) * pixels
-    slot_of = (torch.arange(n)[None] * pixels + torch.arange(pixels)[:, None]).reshape(-1).to(torch.int32)
+    gradients = [torch.randn(n, HEIGHT, WIDTH, generator=dice) for n in (1, 3, 1, 1, CHANNELS)]
+    truth = draw_backward(settings, scene, kept.parts, gradients)
+    grads = torch.cat(gradients)
+    grads[0] *= planes[0]
+    slots, channel_slots = torch.empty(len(lists.ids), GRADIENTS), torch.empty(len(lists.ids), CHANNELS)
+    g_rays = None if rays is None else torch.zeros_like(rays)
+    part = Part(w, lists, None, ends, planes)
+    frame_slots = draw_blocks_backward(settings, part, lists, scene, grads, slots, channel_slots, g_rays, tile=1)
 
-    planes = torch.empty(EVERYTHING.first_channel + CHANNELS, HEIGHT, WIDTH)
-    picks = torch.empty(2, HEIGHT, WIDTH)
-    last = torch.empty(HEIGHT, WIDTH, dtype=torch.int32)
-    lists = [view(starts, int), view(ids, int)]
-    limits = [settings.alpha_max, settings.config.termination]
-    scene = [view(records, float), view(features, float), CHANNELS, window(0, 0, WIDTH, HEIGHT)]
-    cpu = torch.device("cpu")
-    args = [*lists, *scene, *limits, view(planes, float), view(picks, float), view(last, int)]
-    run_blocks(composite_blocks(EVERYTHING, 1), pixels, 1, args, cpu)
-    rgb, alpha, z, weights, channels, median, instance = outputs
-    assert torch.allclose(planes[1:4], rgb, atol=2e-5) and torch.allclose(1 - planes[0], alpha, atol=2e-5)
-    assert torch.allclose(planes[4], z, atol=2e-4) and torch.allclose(planes[5], weights, atol=2e-5)
-    assert torch.allclose(planes[6:], channels, atol=2e-5)
-    assert (picks[0] != median).float().mean() < 0.002
-    assert (torch.where(alpha < 0.5, -1, picks[1]).int() != instance).float().mean() < 0.002
+    def summed(slots: torch.Tensor) -> torch.Tensor:
+        return slots.double().reshape(len(scene.order), PIXELS, -1).sum(1)
 
-    g_rgb, g_alpha, g_z, g_w, g_channels = gradients
-    slots, channel_slots = torch.empty(n * pixels, GRADIENTS), torch.empty(n * pixels, CHANNELS)
-    grads = torch.cat([-(g_alpha * planes[0])[None], g_rgb, g_z[None], g_w[None], g_channels])
-    args = [*lists, view(slot_of, int), *scene, settings.alpha_max, view(planes, float), view(grads, float), view(last, int)]
-    run_blocks(composite_blocks_gradient(EVERYTHING, 1), pixels, 1, [*args, view(slots, float), view(channel_slots, float)], cpu)
-    out = [torch.empty_like(t) for t in group.fields]
-    shared = torch.empty(2, 16)
-    types = [wp.vec3, wp.vec4, wp.vec3, float, wp.vec3]
-    fields = [view(t, d) for t, d in zip(group.fields, types, strict=True)]
-    results = [view(t, d) for t, d in zip(out, types, strict=True)]
-    tail = [view(everywhere, int), view(first_slot, int), view(slots, float), *results, view(shared, float)]
-    run(project_kernels.project_backward, 2, [*fields, *told(kept.told, kept.rows, group.items), *tail], cpu)
-    g_features = torch.zeros_like(features)
-    g_features[order.long()] = channel_slots.reshape(n, pixels, CHANNELS).sum(1)
-    for mine, reference in zip([g_features, *out], [expected[4], *expected[7:]], strict=True):
-        assert (mine - reference).abs().max() < 1e-3 * reference.abs().max()
+    visible = scene.order.long()
+    of_splat = torch.repeat_interleave(torch.arange(len(truth.counts)), truth.counts)
+    places = torch.repeat_interleave(truth.starts - (truth.counts.cumsum(0) - truth.counts), truth.counts) + torch.arange(len(of_splat))
+    values = torch.zeros(len(truth.counts), GRADIENTS, dtype=torch.float64).index_add(0, of_splat, truth.values[places].double())
+    pairs = [(summed(slots), values[visible]), (summed(channel_slots), truth.channels[visible])]
+    if model.response == "ray":
+        pairs += [(summed(frame_slots)[:, :12], truth.frames[visible][:, :12]), (g_rays.flatten(1).T, truth.rays.flatten(1).T)]
+    for mine, reference in pairs:
+        assert ((mine - reference).abs().amax(0) <= 1e-3 * reference.abs().amax(0) + 1e-9).all()
+    again = torch.empty_like(slots)  # no block adds to what another does: the same bits every time
+    assert torch.equal(draw_blocks_backward(settings, part, lists, scene, grads, again, channel_slots, g_rays, tile=1), frame_slots)
+    assert torch.equal(again, slots)
+
+
+def test_settled_tiles_are_drawn_by_pixel_as_the_tiles_kernel_draws_them():
+    """Flat splats that face the camera at rising depth: no two can change places, so no pixel looks for an order."""
+    g, camera, model = uniform(300, WIDTH, HEIGHT)
+    frames, (rays, _) = canonical_frames(g, STILL), exact_rays(camera, [], False)
+    w, found = window(0, 0, WIDTH, HEIGHT), []
+    for order in ("tile", "pixel"):
+        settings = Settings(WIDTH, HEIGHT, model, RenderConfig(order=order), Wanted(depth=True), (0,))
+        kept, _ = keep_forward(settings, g, STILL, camera.lens, None, frames, rays)
+        lists = lists_of_every_pixel(kept)
+        planes, slots = torch.empty(6, HEIGHT, WIDTH), torch.empty(len(lists.ids), GRADIENTS)
+        ends = draw_blocks(settings, w, lists, kept.scene, planes, torch.empty(0, HEIGHT, WIDTH), tile=1)
+        draw_blocks_backward(settings, Part(w, lists, None, ends, planes), lists, kept.scene, planes, slots, slots[:, :0], None, tile=1)
+        found.append((planes, slots))
+    assert ends[0].all() and all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 
 def test_sorted_pairs_make_the_same_lists_as_counting():
     """CUDA's way from depth order to tile lists (emit pairs, stable sort by tile), on the CPU, against the counting pass."""
-    settings, kept, _ = lane_result()
+    settings = Settings(WIDTH, HEIGHT, SplatModel(), RenderConfig(), EVERYTHING, (5,))
+    kept, _ = keep_forward(settings, random_splats(80, 1), translation(0, 0, 5), Pinhole(30.0, 30.0, 18.0, 14.0), torch.randn(80, 2))
     keys = torch.where(kept.scene.counts > 0, kept.scene.records[:, 10].view(torch.int32), 2**31 - 1).to(torch.int32)
     box = kept.scene.counts + (kept.scene.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
     count, pair = box.clone(), box.clone()
@@ -162,13 +199,25 @@ def test_sorted_pairs_make_the_same_lists_as_counting():
         assert torch.equal(mine, reference)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU: renders there and compares with the CPU")
-def test_a_gpu_draws_what_the_cpu_draws():
+ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+CONFIGS = {
+    "by tile": (SplatModel(), RenderConfig()),
+    "within 1/255": (SplatModel(), RenderConfig(max_error=1 / 255)),
+    "along rays": (SplatModel(response="ray"), RenderConfig()),
+    "along rays by pixel": (SplatModel(response="ray"), RenderConfig(order="pixel")),
+}
+
+
+@ON_A_GPU
+@pytest.mark.parametrize("way", CONFIGS)
+def test_a_gpu_draws_what_the_cpu_draws(way):
     from tests.render.test_rasterize import CAMERA, two_instances
+
+    model, config = CONFIGS[way]
 
     def gradients(device):
         placed = [replace(p, gaussians=p.gaussians.to(device).map(lambda t: t.requires_grad_())) for p in two_instances(1)]
-        frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"))
+        frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"), model=model, config=config)
         frame.rgb.square().sum().backward()
         return frame, [t.grad.cpu() for p in placed for t in p.gaussians.tensors().values()]
 
@@ -176,3 +225,23 @@ def test_a_gpu_draws_what_the_cpu_draws():
     assert (here.rgb - there.rgb.cpu()).abs().max() < 1e-2 and (here.rgb - there.rgb.cpu()).abs().mean() < 1e-5
     for a, b in zip(g_here, g_there, strict=True):
         assert (a - b).abs().max() < 1e-2 * a.abs().max()
+
+
+@ON_A_GPU
+@pytest.mark.parametrize("way", CONFIGS)
+def test_a_gpu_trains_to_the_same_bits_twice(way):
+    from tests.render.test_rasterize import CAMERA, two_instances
+
+    model, config = CONFIGS[way]
+
+    def trained() -> list[torch.Tensor]:
+        placed = [replace(p, gaussians=p.gaussians.to("cuda").map(lambda t: t.requires_grad_())) for p in two_instances(1)]
+        fields = [t for p in placed for t in p.gaussians.tensors().values()]
+        steps = torch.optim.Adam(fields, lr=1e-3)
+        for _ in range(200):
+            steps.zero_grad()
+            (rasterize(placed, CAMERA, ("rgb",), model=model, config=config).rgb - 0.5).square().sum().backward()
+            steps.step()
+        return [t.detach() for t in fields]
+
+    assert all(torch.equal(a, b) for a, b in zip(trained(), trained(), strict=True))

@@ -22,7 +22,6 @@ CAMERA = Camera(Pinhole(60.0, 62.0, 34.0, 22.0), 70, 50, STILL)
 @pytest.fixture(autouse=True)
 def small_clusters(monkeypatch):
     monkeypatch.setattr(cull, "CLUSTER", ITEM)
-    monkeypatch.setattr(cull, "_bounds", type(cull._bounds)())
 
 
 def scattered(seed: int, count: int = 60) -> Gaussians:
