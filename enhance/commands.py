@@ -24,8 +24,8 @@ class Pairs:
     data: tuple[Path, ...] = ()
     """The recordings that the scenes were reconstructed from, in the same order."""
     kinds: Names = None
-    """Which damage, of sparse, cycle, crossref, underfit, isp, relight, shadow, reinsert, clean; the reconstructions from less that the
-    first four take are fitted once, some minutes each."""
+    """Which damage, of sparse, cycle, crossref, underfit, isp (on instances, and as isp_frame on whole frames), relight, shadow, reinsert,
+    clean; the reconstructions from less that the first four take are fitted once, some minutes each."""
     cameras: Names = None
     """Cameras to use; the front camera's pairs are never trained on."""
     skies: tuple[Path, ...] = ()
@@ -83,7 +83,7 @@ class Train:
     start: str | None = None
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
-    """What of colour, objects, enhancer to train further; the rest of the weights stays as it is."""
+    """What of colour, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
     resume: Flag = False
     """Go on from the folder's checkpoint."""
 

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from enhance.clips import Clip
 from enhance.compositing import NoPlace, put_back, put_in
 from enhance.degrade import random_underfit, unfinish
-from enhance.isp import alter, random_isp
+from enhance.isp import Isp, alter, random_isp, random_pipeline
 from enhance.lighting import Illumination, random_sky, relit, smoothed, under
 from enhance.refits import Refit
 from enhance.shards import to_bytes
@@ -44,15 +44,20 @@ class Sources:
 
 @dataclass(frozen=True)
 class Damage:
-    """uint8 frames `[T, H, W, 3]` as they are and as they should be, the changed region `[T, H, W]` in 0..1, and what was done in words;
-    scene: what the frames show, where that is not the clip's own. Where photos say more than the frames (`render.references`): what,
-    uint8 like them, and how much that is to be trusted `[T, H, W]` in 0..1."""
+    """uint8 frames `[T, H, W, 3]` as they are and as they should be, the changed region `[T, H, W]` in 0..1, and what was done in words.
+
+    scene  what the frames show, where that is not the clip's own
+    told   ids uint8 `[T, H, W]` to tell in place of its instances
+    reference, trust  where photos say more than the frames (`render.references`): what, uint8 like them, and how much that is to be
+                      trusted `[T, H, W]` in 0..1
+    """
 
     input: torch.Tensor
     target: torch.Tensor
     region: torch.Tensor
     what: dict
     scene: Scene | None = None
+    told: torch.Tensor | None = None
     reference: torch.Tensor | None = None
     trust: torch.Tensor | None = None
 
@@ -98,16 +103,26 @@ def _rendered(clip: Clip, references: References, what: dict) -> Damage:
     frames = list(references.along(clip.render(references.recorded, *READS), clip.cameras))
     rgb, reference = (torch.stack([to_bytes(getattr(f, name)) for f in frames]) for name in ("rgb", "reference"))
     trust = torch.stack([f.trust for f in frames if f.trust is not None])
-    return Damage(rgb, clip.photos, torch.ones(clip.photos.shape[:3]), what, None, reference, trust)
+    return Damage(rgb, clip.photos, torch.ones(clip.photos.shape[:3]), what, reference=reference, trust=trust)
 
 
 def _isp(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
-    """Instances in other colours."""
+    """Instances in other colours, sharpened or noisy."""
     region, chosen = _some(clip, rng)
-    isp = random_isp(rng)
+    isp = random_pipeline(rng)
+    return Damage(_processed(clip, region, isp), clip.photos, region, {"instances": chosen, "isp": vars(isp)})
+
+
+def _isp_frame(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
+    """The whole picture in other colours, sharpened or noisy: only what right pictures look like can tell."""
+    everywhere, isp = torch.ones(clip.photos.shape[:3]), random_pipeline(rng)
+    damaged = _processed(clip, everywhere, isp)
+    return Damage(damaged, clip.photos, everywhere, {"instances": [1], "isp": vars(isp)}, told=everywhere.to(torch.uint8))
+
+
+def _processed(clip: Clip, region: torch.Tensor, isp: Isp) -> torch.Tensor:
     rgb = clip.photos.permute(0, 3, 1, 2).float() / 255
-    damaged = to_bytes(alter(rgb, region[:, None], isp).permute(0, 2, 3, 1))
-    return Damage(damaged, clip.photos, region, {"instances": chosen, "isp": vars(isp)})
+    return to_bytes(alter(rgb, region[:, None], isp).permute(0, 2, 3, 1))
 
 
 def _relight(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
@@ -170,5 +185,6 @@ MAKERS: dict[str, Callable[[Clip, np.random.Generator, Sources], Damage]] = {
     "relight": _relight,
     "shadow": _shadow,
     "reinsert": _reinsert,
+    "isp_frame": _isp_frame,
 }
 ORDER = tuple(MAKERS)  # a kind's place is part of its seed: new kinds go to the end

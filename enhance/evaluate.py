@@ -85,18 +85,13 @@ def evaluate(
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
     """
-    encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False)
-
-    def features(rgb: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return encoder.features(rgb)[:2]
-
-    rows, others = [], dict(beside or {})
+    features, rows, others = shipped_features(), [], dict(beside or {})
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
         for method in (*METHODS, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
-            rows.append(_row(kind, method, shards, others.get(method, enhancer), features))
+            rows.append(measured(kind, method, shards, others.get(method, enhancer), features))
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
@@ -112,7 +107,14 @@ def spread(shards: Sequence[Shard], most: int | None) -> Sequence[Shard]:
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
 
 
-def _row(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features) -> Row:
+def shipped_features() -> Features:
+    """Those of the shipped autoencoder."""
+    encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False)
+    return lambda rgb: encoder.features(rgb)[:2]
+
+
+def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features) -> Row:
+    """The row of one method, of METHODS, PHOTOS or an enhancer of another name, told the instances, on clips of a kind."""
     clips: dict[str, list[float]] = {m: [] for m in MEASURES}
     times: list[float] = []
     for shard in shards:

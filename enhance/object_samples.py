@@ -19,6 +19,7 @@ STORED = {"relight": 0.2, "reinsert": 0.1, "shadow": 0.12}
 """How often objects are drawn whose damage is stored: relit and re-inserted ones; and placed ones, right as they are."""
 RENDERED_ONES = 0.25  # how often a picture is a rendering and no photo, as where the enhancer is used
 ANY_REGION = 0.15  # how often the object is any region of a picture
+WHOLE = 0.12  # how often it is the whole picture, which only right pictures tell the colours of
 COARSE = 4  # how much smaller than the picture that region is drawn
 VARIANTS = 3  # how often an object is used, each time in other colours
 RIGHT = 0.35  # how often an object is right as it is
@@ -35,10 +36,10 @@ class Objects:
 
 
 class ObjectSampler:
-    """Draws objects of the training clips by kind, and of further photos."""
+    """Draws objects of the training clips by kind, and of further photos; `alters` them, or draws those alone whose damage is stored."""
 
-    def __init__(self, shards: dict[str, list[Shard]], photos: list[np.ndarray]):
-        self.shards, self.photos = shards, photos
+    def __init__(self, shards: dict[str, list[Shard]], photos: list[np.ndarray], alters: bool = True):
+        self.shards, self.photos, self.alters = shards, photos, alters
         self.places = {kind: [s for s in shards.get(kind, ()) if s.meta.get("instances")] for kind in STORED}
         self.plain = [s for kind in ("clean", "isp") for s in shards.get(kind, ())]
         self.rendered = [s for kind in RENDERED for s in shards.get(kind, ())]
@@ -62,6 +63,8 @@ class ObjectSampler:
             fresh = kind == "shadow"
         else:
             given, instance = self._picture(rng)
+            if rng.random() < WHOLE:
+                instance = torch.ones_like(instance)
             wanted, some, fresh = given, None, True
         found = boxes(torch.where(instance == 255, 0, instance.int()))
         ids = [i for i in found if some is None or i in some]
@@ -111,10 +114,10 @@ class ObjectSampler:
         drawn = []
         for _ in range(VARIANTS):
             (seen, target), whole = strips, thin
-            if rng.random() < 0.65:  # the whole picture in another light: what counts is the difference within it
+            if rng.random() < 0.65 and not mask.all():  # the whole picture in another light: what counts is the difference within it
                 grade = random_isp(rng, 0.7)
                 seen, target, whole = grade(seen), grade(target), grade(whole)
-            if fresh and rng.random() > RIGHT:
+            if fresh and self.alters and rng.random() > RIGHT:
                 isp = random_isp(rng)
                 seen = alter(seen, soft[y, x][None, None], isp)
                 if others.any() and rng.random() < 0.4:

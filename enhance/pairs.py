@@ -25,7 +25,7 @@ from scenes.names import unknown
 from scenes.scene import Scene
 from scenes.sky import Sky
 
-ANYWHERE = ("underfit", "isp", "clean")
+ANYWHERE = ("underfit", "isp", "isp_frame", "clean")
 """Kinds that need nothing but a scene and its recording."""
 
 
@@ -53,7 +53,7 @@ def make_pairs(
     config, sources = config or PairConfig(), sources or Sources()
     scene = open_reconstruction(scene_path)
     log = log_path if isinstance(log_path, Log) else open_log(log_path)
-    check_kinds(kinds)
+    kinds = check_kinds(kinds)
     both = [name for name in log.cameras if name in scene.rig]
     for name in cameras or ():
         if name not in both:
@@ -119,11 +119,13 @@ def open_reconstruction(path: str | Path | Scene) -> Scene:
     return scene
 
 
-def check_kinds(kinds: Sequence[str]) -> None:
-    """ValueError for a kind that there is not."""
+def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
+    """The kinds, with isp_frame beside isp: an image pipeline's doings on instances and on whole frames. ValueError for a kind that there
+    is not."""
     for kind in kinds:
         if kind not in KINDS:
             raise ValueError(unknown("kind", kind, "the pairs that can be made", KINDS))
+    return tuple(kinds) + (("isp_frame",) if "isp" in kinds and "isp_frame" not in kinds else ())
 
 
 def _sky(path: str | Path, width: int = 256) -> Sky:
@@ -134,6 +136,8 @@ def _sky(path: str | Path, width: int = 256) -> Sky:
 
 def _write(path: Path, kind: str, clip: Clip, damage: Damage) -> None:
     tensors = {"input": damage.input, "target": damage.target, "region": to_bytes(damage.region), **clip.geometry(damage.scene)}
+    if damage.told is not None:
+        tensors["instance"] = damage.told
     if damage.reference is not None and damage.trust is not None:
         tensors |= {"reference": damage.reference, "trust": to_bytes(damage.trust)}
     write_shard(path, tensors, {"kind": kind, **clip.meta, **damage.what})

@@ -1,4 +1,4 @@
-"""Pairs of places that were never reconstructed: photos and frames of videos, in which a region is in other colours or right."""
+"""Pairs of places that were never reconstructed: photos and frames of videos, in which a region or all is in other colours, or right."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from enhance.isp import alter, random_isp
+from enhance.isp import alter, random_pipeline
 from enhance.masks import random_mask
 from enhance.samples import Photos
 from enhance.shards import to_bytes, write_shard
 
 STRIDE = 8
-KINDS_OF_PHOTOS = ("isp", "clean")
+KINDS_OF_PHOTOS = ("isp", "isp_frame", "clean")
 
 
 def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0, width: int = 640) -> Path:
     """Of every photo in the folders and every STRIDE-th frame of the videos `paths`, `width` pixels wide, a clip of one frame of
-    KINDS_OF_PHOTOS in the folder `out`, which is returned. The same region is told as instance 1 in both; in "clean" it is as it was.
+    KINDS_OF_PHOTOS in the folder `out`, which is returned. Where a region is in other colours, it is told as instance 1; in "clean" the
+    same region is told and is as it was.
 
     They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path
     holds no photos.
@@ -30,9 +31,10 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
             rng = np.random.default_rng([seed, i])
             target = torch.from_numpy(photo).permute(2, 0, 1).float() / 255
             region = torch.from_numpy(random_mask(rng, *photo.shape[:2]))[None]
-            isp = random_isp(rng)
+            isp, everywhere = random_pipeline(rng), torch.ones_like(region)
             meta = {"split": "held out", "camera": path.stem, "start": i, "seed": seed, "instances": [1]}
             _write(out, "isp", alter(target, region, isp), target, region, region, {**meta, "isp": vars(isp)})
+            _write(out, "isp_frame", isp(target), target, everywhere, everywhere, {**meta, "isp": vars(isp)})
             _write(out, "clean", target, target, region, torch.zeros_like(region), meta)
     return out
 

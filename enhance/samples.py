@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -9,17 +10,17 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.isp import alter, random_isp
+from enhance.isp import alter, random_isp, random_pipeline
 from enhance.masks import random_mask
 from enhance.object_samples import Objects, ObjectSampler
 from enhance.shade_samples import Grounds, ShadeSampler
-from enhance.shards import RENDERED, PairSet, Shard, Window
+from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
 
 KIND_WEIGHTS = {
     "underfit": 0.2, "sparse": 0.1, "cycle": 0.1, "crossref": 0.05,
-    "isp": 0.13, "relight": 0.1, "shadow": 0.14, "reinsert": 0.06, "clean": 0.12,
+    "isp": 0.13, "isp_frame": 0.07, "relight": 0.1, "shadow": 0.14, "reinsert": 0.06, "clean": 0.12,
 }  # fmt: skip
-AFRESH = ("isp", "clean")
+AFRESH = ("isp", "isp_frame", "clean")
 """Kinds that are made of any clip's targets each time anew; of the others the stored frames are drawn."""
 PLACED = ("relight", "shadow", "reinsert")
 """Kinds that change a part of the frame; crops look for it."""
@@ -91,15 +92,15 @@ class Photos:
 class Sampler:
     """Draws samples. The draw depends on the seed and the step alone, so a resumed training sees what an unbroken one sees."""
 
-    def __init__(self, pairs: PairSet | None, photos: Photos | None, seed: int):
+    def __init__(self, pairs: PairSet | None, photos: Photos | None, seed: int, kinds: Sequence[str] = KINDS):
         if pairs is None and photos is None:
             raise ValueError("there is nothing to train on: give pairs, photos or both")
-        self.pairs, self.photos, self.seed = pairs, photos, seed
-        self.shards = {kind: pairs.of(kind, "train") if pairs else [] for kind in KIND_WEIGHTS}
+        self.pairs, self.photos, self.seed, self.kinds = pairs, photos, seed, kinds
+        self.shards = {kind: pairs.of(kind, "train") if pairs and kind in kinds else [] for kind in KIND_WEIGHTS}
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
         self._shade = ShadeSampler(self.shards["shadow"], seed)
-        self._objects = ObjectSampler(self.shards, photos.frames if photos else [])
+        self._objects = ObjectSampler(self.shards, photos.frames if photos else [], "isp" in kinds)
         if pairs and not any(self.shards.values()) and photos is None:
             raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')
 
@@ -182,22 +183,25 @@ class Sampler:
         return rgb[y, x].permute(2, 0, 1).float() / 255, instance[y, x]
 
     def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
-        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k in AFRESH or self.shards[k]]
+        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k in self.kinds and (k in AFRESH or self.shards[k])]
         weights = np.array([KIND_WEIGHTS[k] for k in kinds])
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
-        w = _regraded(rng, w)
+        w = w if kind == "isp_frame" else _regraded(rng, w)  # which knows its colours by those of right pictures alone
         objects = w.instance.clamp_min(0).float()
         if kind == "isp":
             region = self._moving_mask(rng, w)
-            damaged, told = alter(w.target, region, random_isp(rng)), _with_alien(objects, region)
+            damaged, told = alter(w.target, region, random_pipeline(rng)), _with_alien(objects, region)
             if rng.random() < 0.25:
                 told = _with_alien(torch.zeros_like(objects), region)
+        elif kind == "isp_frame":
+            damaged, region = random_pipeline(rng)(w.target), torch.ones_like(w.region)
+            told = region * ALIEN
         elif kind in RENDERED:
             damaged, region, told = w.input, torch.ones_like(w.region), objects
             if rng.random() < REFERENCED:
                 damaged = torch.lerp(damaged, w.reference, w.trust)
-            if rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
+            if "isp" in self.kinds and rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
                 alien = self._moving_mask(rng, w)
                 damaged, told = alter(damaged, alien, random_isp(rng)), _with_alien(objects, alien)
         elif kind in PLACED:
@@ -206,7 +210,7 @@ class Sampler:
             damaged, region = w.target, torch.zeros_like(w.region)
             told = objects if objects.any() and rng.random() < 0.5 else _with_alien(torch.zeros_like(objects), self._moving_mask(rng, w))
         damaged = (damaged * 255).round() / 255
-        mask = told if rng.random() < MASK_KNOWN else torch.full_like(told, torch.nan)
+        mask = told if rng.random() < MASK_KNOWN or kind == "isp_frame" else torch.full_like(told, torch.nan)
         return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
 
     def _window(self, rng: np.random.Generator, kind: str, frames: int, size: int) -> Window:

@@ -5,7 +5,7 @@
 input     uint8 `[T, H, W, 3]`    the damaged frames
 target    uint8 `[T, H, W, 3]`    what they should be
 region    uint8 `[T, H, W]`       where they were damaged, 0..255
-instance  uint8 `[T, H, W]`       rendered instance id, 255 where none
+instance  uint8 `[T, H, W]`       rendered instance id, 255 where none; 1 throughout where the whole frame is in other colours
 flow      float16 `[T, H, W, 2]`  exact flow to the previous frame, pixels; NaN in the first frame and where unknown
 visible   uint8 `[T, H, W]`       1 where the previous frame shows the same point
 depth     float16 `[T, H, W]`     z in metres, inf where nothing is (clips made before it was kept lack it)
@@ -30,7 +30,7 @@ import torch
 from scenes.atomic import atomic_file
 from scenes.checks import check_tensor
 
-KINDS = ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert")
+KINDS = ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert", "isp_frame")
 RENDERED = ("underfit", "sparse", "cycle", "crossref")
 """Kinds whose whole frame comes from a reconstruction."""
 FIELDS = {

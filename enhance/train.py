@@ -1,5 +1,5 @@
-"""Training: the autoencoder on single images, the colour network on thinned pictures, the objects' colours on objects, then, with
-these frozen, the enhancer on pairs.
+"""Training: the autoencoder on single images, the prior on its latents, the colour network on thinned pictures, the objects' colours on
+objects, then, with all but the prior frozen, the enhancer on pairs.
 
 The enhancer's batches alternate: images without a past, and clips that the network walks through with its own earlier outputs as
 their past, with any number of latents from 0 to K, so that it never sees a past better than the one it will make itself.
@@ -26,9 +26,10 @@ from enhance.net import Net, NetConfig
 from enhance.objects import changed
 from enhance.past import Past
 from enhance.precision import autocast, channels_last
+from enhance.prior import Time, flow_matching_loss
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shade import optical_depth, shaded
-from enhance.shards import PairSet
+from enhance.shards import KINDS, PairSet
 from enhance.weights_file import BUILTIN, load_net, save_net
 from scenes.atomic import atomic_file
 from scenes.names import unknown
@@ -37,7 +38,9 @@ NEAR_ENOUGH = 3e-4
 """Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
 SHADE_NEAR_ENOUGH = 1e-3
 """The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
-STAGES = ("autoencoder", "colour", "objects", "shade", "enhancer")
+STAGES = ("autoencoder", "prior", "colour", "objects", "shade", "enhancer")
+FURTHER = STAGES[2:]
+"""What trained weights are trained further by: a prior would undo what their transformer has learnt since."""
 RATES = {"autoencoder": 2.5, "objects": 2.0, "shade": 7.5}  # of the highest rate
 FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
 
@@ -48,6 +51,8 @@ class TrainConfig:
 
     autoencoder: float = 0.07
     """Share of the budget for the autoencoder."""
+    prior: float = 0.04
+    """Share of the budget for the transformer's prior."""
     colour: float = 0.35
     """Share of the budget for the colour network."""
     objects: float = 0.25
@@ -80,6 +85,8 @@ class TrainConfig:
     """Weight of the perceptual distance on a random patch."""
     temporal: float = 1.0
     """Weight of the warp error in temporal batches."""
+    kinds: tuple[str, ...] = KINDS
+    """Kinds of damage to learn from, of those that the pairs hold."""
 
     def __post_init__(self):
         if self.temporal_every < 2:
@@ -97,11 +104,17 @@ class _Run:
         self.autoencoder = channels_last(Autoencoder())
         self.average = Net(net.config)
         self.average.load_state_dict(net.state_dict())
+        self.time = Time(net.config.width)
         self.net = channels_last(net)
         self.step = dict.fromkeys(STAGES, 0)
         self.seconds = dict.fromkeys(STAGES, 0.0)
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
+            "prior": torch.optim.AdamW(
+                [p for part in (self.time, net.embed, net.blocks, net.norm, net.denoise) for p in part.parameters()],
+                betas=(0.9, 0.98),
+                weight_decay=1e-2,
+            ),
             "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "objects": torch.optim.AdamW(
                 [p for n, p in self.net.objects.named_parameters() if not n.startswith("shade.")], betas=(0.9, 0.98), weight_decay=1e-2
@@ -113,7 +126,7 @@ class _Run:
         }
 
     def parts(self) -> dict:
-        return {"autoencoder": self.autoencoder, "net": self.net, "average": self.average} | {
+        return {"autoencoder": self.autoencoder, "time": self.time, "net": self.net, "average": self.average} | {
             f"optimiser {k}": v for k, v in self.optimiser.items()
         }
 
@@ -139,7 +152,7 @@ class _Run:
     def share(self, stage: str) -> float:
         """A stage's share of the budget, of which those that are left out take nothing."""
         c = self.config
-        all_of = {"autoencoder": c.autoencoder, "colour": c.colour, "objects": c.objects, "shade": c.shade}
+        all_of = {"autoencoder": c.autoencoder, "prior": c.prior, "colour": c.colour, "objects": c.objects, "shade": c.shade}
         all_of["enhancer"] = 1 - sum(all_of.values())
         return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 
@@ -196,22 +209,24 @@ def train(
     if checkpoint.exists() and not resume:
         raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
-    sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed)
-    clean = pair_set.of("clean", "train") if pair_set else []
+    config = config or TrainConfig()
+    sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
+    clean = pair_set.of("clean", "train") if pair_set and "clean" in config.kinds else []
     begun, origin = load_net(BUILTIN if start == "builtin" else start) if start is not None else (None, None)
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    run = _Run(config or TrainConfig(), begun, minutes, steps, seed, only or (STAGES if start is None else STAGES[1:]))
+    run = _Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER))
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
     report = _Reporter(run, progress)
     try:
         _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
-        _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
         if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+        _stage(run, "prior", lambda step: _prior_step(run, sampler, step), checkpoint, save_every, report)
+        _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
         if "colour" in run.stages:
             calibrate_colour(run.net, clean)
         _stage(run, "objects", lambda step: _objects_step(run, sampler, step), checkpoint, save_every, report)
@@ -278,6 +293,16 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
     slopes = (d[..., 1:] - d[..., :-1]).abs().mean() + (d[..., 1:, :] - d[..., :-1, :]).abs().mean()
     spread = latent.mean((0, 2, 3)).square().mean() + (latent.var((0, 2, 3)) - 1).square().mean()
     return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
+
+
+def _prior_step(run: _Run, sampler: Sampler, step: int) -> float:
+    right = sampler.batch(5 * step + 4, run.config.images, 1, run.config.crop, "clean").target[:, 0]
+    with torch.no_grad(), autocast(right.device):
+        latents = run.net.encoder(right.contiguous(memory_format=torch.channels_last))
+    drawn = torch.Generator().manual_seed(run.seed * 1_000_003 + step)
+    with autocast(right.device):
+        loss = flow_matching_loss(run.net, run.time, latents.float(), drawn)
+    return _update(run, "prior", [loss])
 
 
 def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from enhance.isp import Isp, alter, random_isp
+from enhance.isp import Isp, alter, random_isp, random_pipeline
 from enhance.masks import random_mask
 
 
@@ -37,18 +37,40 @@ def test_pixels_outside_the_mask_are_exact():
     assert torch.equal(y[outside], x[outside]) and not torch.equal(y, x)
 
 
+def test_noise_has_the_spread_that_was_asked_for():
+    from kornia.color import rgb_to_linear_rgb
+
+    grey = torch.full((3, 200, 200), 0.6)
+    light = rgb_to_linear_rgb(grey)
+    y = rgb_to_linear_rgb(Isp(noise=0.02, seed=3)(grey)) - light
+    assert abs(float(y.std() / (0.02 * (light.mean() + 0.02).sqrt())) - 1) < 0.02 and abs(float(y.mean())) < 1e-3
+    assert torch.equal(Isp(noise=0.02, seed=3)(grey), Isp(noise=0.02, seed=3)(grey))
+    assert not torch.equal(Isp(noise=0.02, seed=3)(grey), Isp(noise=0.02, seed=4)(grey))
+
+
+def test_sharpening_leaves_what_is_even_and_overshoots_at_edges():
+    x = torch.full((3, 16, 16), 0.4)
+    assert torch.allclose(Isp(sharpen=1.0)(x), x, atol=2e-6)
+    x[..., 8:] = 0.6
+    y = Isp(sharpen=1.0)(x)
+    assert y[..., 7].max() < 0.39 and y[..., 8].min() > 0.61 and torch.allclose(y[..., :4], x[..., :4], atol=2e-6)
+
+
 def test_results_stay_in_range():
     rng = np.random.default_rng(3)
-    for _ in range(50):
-        y = random_isp(rng)(image())
+    for draw in (random_isp, random_pipeline) * 25:
+        y = draw(rng)(image())
         assert torch.isfinite(y).all() and y.min() >= 0 and y.max() <= 1
 
 
 def test_random_settings_follow_the_seed():
-    assert random_isp(np.random.default_rng(4)) == random_isp(np.random.default_rng(4)) != random_isp(np.random.default_rng(5))
+    for draw in (random_isp, random_pipeline):
+        assert draw(np.random.default_rng(4)) == draw(np.random.default_rng(4)) != draw(np.random.default_rng(5))
 
 
-@pytest.mark.parametrize("wrong", [{"gamma": 0}, {"saturation": -1}, {"tone": -1}, {"exposure": float("nan")}])
+@pytest.mark.parametrize(
+    "wrong", [{"gamma": 0}, {"saturation": -1}, {"tone": -1}, {"noise": -1}, {"sharpen": -1}, {"exposure": float("nan")}]
+)
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Isp(**wrong)

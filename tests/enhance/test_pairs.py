@@ -75,7 +75,7 @@ def test_every_kind_damages_some_clip_and_says_so(folder):
 
 
 def test_kinds_keep_their_seeds(folder):
-    assert ORDER == KINDS == ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert")
+    assert ORDER == KINDS == ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert", "isp_frame")
 
 
 def test_a_shadow_only_darkens_and_lies_beside_what_was_put_in(folder, street):
@@ -124,7 +124,15 @@ def test_without_being_told_kinds_are_those_that_can_be_made(street, recording):
 def test_kinds_may_be_added_to_a_folder(street, recording, tmp_path):
     out = make_pairs(street, recording, tmp_path / "pairs", kinds=("clean",), cameras=["left_camera"], config=CONFIG)
     make_pairs(street, recording, out, kinds=("isp",), cameras=["left_camera"], config=CONFIG)
-    assert {s.meta["kind"] for s in PairSet(out).shards} == {"clean", "isp"}
+    assert {s.meta["kind"] for s in PairSet(out).shards} == {"clean", "isp", "isp_frame"}
+
+
+def test_a_whole_frame_in_other_colours_is_told_as_such(folder):
+    shards = PairSet(folder).of("isp_frame")
+    assert any(s.meta["isp"]["noise"] for s in shards) or any(s.meta["isp"]["sharpen"] for s in shards)
+    for shard in shards:
+        w = shard.window()
+        assert (w.region == 1).all() and (w.instance == 1).all() and not torch.equal(w.input, w.target)
 
 
 def test_a_folder_of_scenes_is_one_set(folder, tmp_path):
