@@ -1,6 +1,6 @@
 """What each part of the enhancer's training is worth: the whole, and the whole less one part, trained alike on little.
 
-    python -m tests.bench.ablate PAIRS... [-o ablation] [--steps 200] [--limit 4] [--only ROW ...]
+    python -m tests.bench.ablate PAIRS... [-o ablation] [--steps 150] [--limit 4] [--only ROW ...]
 
 Pairs are halved (320x180 of 640x360), every second training clip is used. The autoencoder and the colour network, which does nothing where
 objects are told, are the shipped ones; prior, objects' colours, missing shadows and the enhancer are trained anew in each row, with the
@@ -211,7 +211,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.ablate", description=__doc__)
     parser.add_argument("pairs", type=Path, nargs="+", help="folders that sidestep pairs made")
     parser.add_argument("-o", "--output", type=Path, default=Path("ablation"), help="folder of the trainings")
-    parser.add_argument("--steps", type=int, default=200, help="steps of the enhancer in each row")
+    parser.add_argument("--steps", type=int, default=150, help="steps of the enhancer in each row")
     parser.add_argument("--limit", type=int, default=4, help="most held-out clips of a kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", help="names of rows")
