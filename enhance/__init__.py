@@ -18,7 +18,7 @@ _HOME = {
     "make_pairs": "pairs",
     "PairSet": "shards",
     "train": "train",
-    "TrainConfig": "train",
+    "TrainConfig": "run",
     "evaluate": "evaluate",
 }
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from enhance.isp import Isp as Isp
     from enhance.isp import random_isp as random_isp
     from enhance.pairs import make_pairs as make_pairs
+    from enhance.run import TrainConfig as TrainConfig
     from enhance.shards import PairSet as PairSet
-    from enhance.train import TrainConfig as TrainConfig
     from enhance.train import train as train
 
 

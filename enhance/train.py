@@ -7,17 +7,15 @@ their past, with any number of latents from 0 to K, so that it never sees a past
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.autoencoder import Autoencoder
 from enhance.calibrate import calibrate_colour, calibrate_gate
 from enhance.colour import altered_logits, colour_change
 from enhance.corrections import corrected
@@ -25,145 +23,19 @@ from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_lo
 from enhance.net import Net, NetConfig
 from enhance.objects import changed
 from enhance.past import Past
-from enhance.precision import autocast, channels_last
-from enhance.prior import Time, flow_matching_loss
+from enhance.precision import autocast
+from enhance.prior import flow_matching_loss
+from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shade import optical_depth, shaded
-from enhance.shards import KINDS, PairSet
+from enhance.shards import PairSet
 from enhance.weights_file import BUILTIN, load_net, save_net
-from scenes.atomic import atomic_file
 from scenes.names import unknown
 
 NEAR_ENOUGH = 3e-4
 """Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
 SHADE_NEAR_ENOUGH = 1e-3
 """The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
-STAGES = ("autoencoder", "prior", "colour", "objects", "shade", "enhancer")
-FURTHER = STAGES[2:]
-"""What trained weights are trained further by: a prior would undo what their transformer has learnt since."""
-RATES = {"autoencoder": 2.5, "objects": 2.0, "shade": 7.5}  # of the highest rate
-FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """How to train."""
-
-    autoencoder: float = 0.07
-    """Share of the budget for the autoencoder."""
-    prior: float = 0.04
-    """Share of the budget for the transformer's prior."""
-    colour: float = 0.35
-    """Share of the budget for the colour network."""
-    objects: float = 0.25
-    """Share of the budget for objects' colours."""
-    shade: float = 0.01
-    """Share of the budget for objects' missing shadows."""
-    crop: int = 160
-    """Side of the smallest training crops in pixels, a multiple of 16."""
-    images: int = 8
-    """Smallest crops in an image batch; larger ones are fewer."""
-    clips: int = 3
-    """Clips of smallest crops in a temporal batch."""
-    thinned: int = 24
-    """Thinned pictures in a batch of the colour network."""
-    looked_at: int = 32
-    """Objects in a batch of objects' colours, and of missing shadows."""
-    frames: int = 4
-    """Frames of a training clip."""
-    temporal_every: int = 4
-    """Every how many steps a temporal batch comes; the others are images."""
-    rate: float = 8e-4
-    """Highest learning rate; half of it where trained weights are trained further."""
-    latent: float = 0.1
-    """Weight of the distance of the enhanced latent to the target's."""
-    logarithm: float = 0.1
-    """Weight of the logarithm of the squared error beside the absolute one, in the region."""
-    gate: float = 0.1
-    """Weight of the cross entropy of the gate."""
-    perceptual: float = 0.01
-    """Weight of the perceptual distance on a random patch."""
-    temporal: float = 1.0
-    """Weight of the warp error in temporal batches."""
-    kinds: tuple[str, ...] = KINDS
-    """Kinds of damage to learn from, of those that the pairs hold."""
-
-    def __post_init__(self):
-        if self.temporal_every < 2:
-            raise ValueError(f"temporal_every must be at least 2, got {self.temporal_every}")
-        if self.crop % 16 or self.crop < 32:
-            raise ValueError(f"crop must be a multiple of 16 from 32, got {self.crop}")
-
-
-class _Run:
-    """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
-
-    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, stages: Sequence[str]):
-        torch.manual_seed(seed)
-        self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
-        self.autoencoder = channels_last(Autoencoder())
-        self.average = Net(net.config)
-        self.average.load_state_dict(net.state_dict())
-        self.time = Time(net.config.width)
-        self.net = channels_last(net)
-        self.step = dict.fromkeys(STAGES, 0)
-        self.seconds = dict.fromkeys(STAGES, 0.0)
-        self.optimiser = {
-            "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
-            "prior": torch.optim.AdamW(
-                [p for part in (self.time, net.embed, net.blocks, net.norm, net.denoise) for p in part.parameters()],
-                betas=(0.9, 0.98),
-                weight_decay=1e-2,
-            ),
-            "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
-            "objects": torch.optim.AdamW(
-                [p for n, p in self.net.objects.named_parameters() if not n.startswith("shade.")], betas=(0.9, 0.98), weight_decay=1e-2
-            ),
-            "shade": torch.optim.AdamW(self.net.objects.shade.parameters(), betas=(0.9, 0.98), weight_decay=3e-2),
-            "enhancer": torch.optim.AdamW(
-                [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
-            ),
-        }
-
-    def parts(self) -> dict:
-        return {"autoencoder": self.autoencoder, "time": self.time, "net": self.net, "average": self.average} | {
-            f"optimiser {k}": v for k, v in self.optimiser.items()
-        }
-
-    def save(self, path: Path) -> None:
-        state = {name: part.state_dict() for name, part in self.parts().items()}
-        facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds}
-        # through Python's file, which says that the disk is full; torch's own writer says "unexpected pos"
-        with atomic_file(path) as half, open(half, "wb") as file:
-            torch.save({**facts, **state}, file)
-
-    def load(self, path: Path) -> None:
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            for name, part in self.parts().items():
-                part.load_state_dict(state[name])
-            self.step, self.seconds = state["step"], state["seconds"]
-        except (LookupError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
-        if state["seed"] != self.seed:
-            raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
-
-    def share(self, stage: str) -> float:
-        """A stage's share of the budget, of which those that are left out take nothing."""
-        c = self.config
-        all_of = {"autoencoder": c.autoencoder, "prior": c.prior, "colour": c.colour, "objects": c.objects, "shade": c.shade}
-        all_of["enhancer"] = 1 - sum(all_of.values())
-        return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
-
-    def done(self, stage: str) -> float:
-        """How much of a stage's budget is spent, from 0 to 1."""
-        share = self.share(stage)
-        if share <= 0:
-            return 1.0
-        if self.steps is not None:
-            return min(1.0, self.step[stage] / max(share * self.steps, 1))
-        return min(1.0, self.seconds[stage] / 60 / max(share * (self.minutes or 0), 1e-9))
 
 
 def train(
@@ -216,7 +88,7 @@ def train(
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    run = _Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER))
+    run = Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER))
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
@@ -254,11 +126,11 @@ def train(
     return weights
 
 
-def _stage(run: _Run, name: str, step: Callable[[int], float], checkpoint: Path, save_every: float, report: _Reporter) -> None:
+def _stage(run: Run, name: str, step: Callable[[int], float], checkpoint: Path, save_every: float, report: _Reporter) -> None:
     saved = time.monotonic()
     while run.done(name) < 1:
         start = time.monotonic()
-        _set_rate(run, name)
+        run.set_rate(name)
         loss = step(run.step[name])
         run.step[name] += 1
         run.seconds[name] += time.monotonic() - start
@@ -268,15 +140,7 @@ def _stage(run: _Run, name: str, step: Callable[[int], float], checkpoint: Path,
             saved = time.monotonic()
 
 
-def _set_rate(run: _Run, stage: str) -> None:
-    """Warm up over 100 steps, then half a cosine down to a hundredth."""
-    highest = run.config.rate * RATES.get(stage, 1.0) * (1.0 if "autoencoder" in run.stages else 0.5)
-    rate = highest * min(1.0, (run.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * run.done(stage)))
-    for group in run.optimiser[stage].param_groups:
-        group["lr"] = float(rate)
-
-
-def _autoencoder_step(run: _Run, sampler: Sampler, step: int) -> float:
+def _autoencoder_step(run: Run, sampler: Sampler, step: int) -> float:
     size = max(32, run.config.crop * 2 // 3 // 16 * 16)
     x = sampler.images(2 * step, 2 * run.config.images, size).contiguous(memory_format=torch.channels_last)
     torch.manual_seed(run.seed * 1_000_003 + step)
@@ -295,7 +159,7 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
     return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
 
 
-def _prior_step(run: _Run, sampler: Sampler, step: int) -> float:
+def _prior_step(run: Run, sampler: Sampler, step: int) -> float:
     right = sampler.batch(5 * step + 4, run.config.images, 1, run.config.crop, "clean").target[:, 0]
     with torch.no_grad(), autocast(right.device):
         latents = run.net.encoder(right.contiguous(memory_format=torch.channels_last))
@@ -305,7 +169,7 @@ def _prior_step(run: _Run, sampler: Sampler, step: int) -> float:
     return _update(run, "prior", [loss])
 
 
-def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
+def _colour_step(run: Run, sampler: Sampler, step: int) -> float:
     drawn = sampler.thinned(3 * step + 2, run.config.thinned)
     known = torch.isfinite(drawn.mask).float()
     with autocast(drawn.given.device):
@@ -317,7 +181,7 @@ def _colour_step(run: _Run, sampler: Sampler, step: int) -> float:
     return _update(run, "colour", [loss + 0.1 * where_loss(logits, drawn.region)])
 
 
-def _objects_step(run: _Run, sampler: Sampler, step: int) -> float:
+def _objects_step(run: Run, sampler: Sampler, step: int) -> float:
     drawn = sampler.objects(4 * step + 3, run.config.looked_at)
     with autocast(drawn.given.device):
         coefficients = run.net.objects(drawn.evidence)
@@ -325,7 +189,7 @@ def _objects_step(run: _Run, sampler: Sampler, step: int) -> float:
     return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
 
 
-def _shade_step(run: _Run, sampler: Sampler, step: int) -> float:
+def _shade_step(run: Run, sampler: Sampler, step: int) -> float:
     drawn = sampler.grounds(step, 2 * run.config.looked_at)
     if drawn is None:
         return 0.0
@@ -338,7 +202,7 @@ CROPS = (1.0, 1.0, 1.5, 2.0)
 """Sides of the crops that batches are made of, against the smallest: attention must work on small pictures and on large ones."""
 
 
-def _enhancer_step(run: _Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
+def _enhancer_step(run: Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
     c = run.config
     temporal = step % c.temporal_every == 1 and c.frames > 1
     rng = np.random.default_rng([run.seed, 7, step])
@@ -383,7 +247,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
         yield loss / frames
 
 
-def _update(run: _Run, stage: str, losses) -> float:
+def _update(run: Run, stage: str, losses) -> float:
     optimiser, total = run.optimiser[stage], 0.0
     optimiser.zero_grad()
     for loss in losses:
@@ -399,7 +263,7 @@ def _update(run: _Run, stage: str, losses) -> float:
 class _Reporter:
     """Tells `progress` the smoothed loss, a few times a minute."""
 
-    def __init__(self, run: _Run, progress: Callable[[float, str], None] | None):
+    def __init__(self, run: Run, progress: Callable[[float, str], None] | None):
         self.run, self.progress, self.told = run, progress, 0.0
         self.loss: dict[str, float] = {}
 

@@ -26,10 +26,11 @@ from enhance.evaluate import TOLD, Row, measured, shipped_features, spread
 from enhance.losses import PatchPerceptual, pixel_loss
 from enhance.net import Net, told_of
 from enhance.precision import autocast, channels_last
+from enhance.run import TrainConfig
 from enhance.samples import Sampler
 from enhance.shards import KINDS, PairSet, Shard, to_bytes, write_shard
 from enhance.step import Steps
-from enhance.train import TrainConfig, train
+from enhance.train import train
 from enhance.weights_file import BUILTIN, load_net, save_net
 from render.frame_types import Frame
 from scenes.atomic import atomic_file

@@ -12,8 +12,9 @@ from small_net import SMALL
 from enhance.enhancer import Enhancer
 from enhance.evaluate import METHODS, PHOTOS, evaluate, table
 from enhance.net import Net
+from enhance.run import TrainConfig
 from enhance.shards import PairSet, to_bytes, write_shard
-from enhance.train import TrainConfig, train
+from enhance.train import train
 from enhance.weights_file import load_net
 
 QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2, looked_at=2)
@@ -131,7 +132,7 @@ def test_a_full_disk_is_called_that(pairs, trained, monkeypatch):
     def full(path):
         yield Path("/dev/full")
 
-    monkeypatch.setattr(sys.modules["enhance.train"], "atomic_file", full)
+    monkeypatch.setattr(sys.modules["enhance.run"], "atomic_file", full)
     with pytest.raises(OSError, match="No space left"):
         train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
 

@@ -1,0 +1,152 @@
+"""A training under way: its settings, how far each stage is, and what must be kept to go on from there."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from enhance.autoencoder import Autoencoder
+from enhance.net import Net
+from enhance.precision import channels_last
+from enhance.prior import Time
+from enhance.shards import KINDS
+from scenes.atomic import atomic_file
+
+STAGES = ("autoencoder", "prior", "colour", "objects", "shade", "enhancer")
+FURTHER = STAGES[2:]
+"""What trained weights are trained further by: a prior would undo what their transformer has learnt since."""
+RATES = {"autoencoder": 2.5, "objects": 2.0, "shade": 7.5}  # of the highest rate
+FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train."""
+
+    autoencoder: float = 0.07
+    """Share of the budget for the autoencoder."""
+    prior: float = 0.04
+    """Share of the budget for the transformer's prior."""
+    colour: float = 0.35
+    """Share of the budget for the colour network."""
+    objects: float = 0.25
+    """Share of the budget for objects' colours."""
+    shade: float = 0.01
+    """Share of the budget for objects' missing shadows."""
+    crop: int = 160
+    """Side of the smallest training crops in pixels, a multiple of 16."""
+    images: int = 8
+    """Smallest crops in an image batch; larger ones are fewer."""
+    clips: int = 3
+    """Clips of smallest crops in a temporal batch."""
+    thinned: int = 24
+    """Thinned pictures in a batch of the colour network."""
+    looked_at: int = 32
+    """Objects in a batch of objects' colours, and of missing shadows."""
+    frames: int = 4
+    """Frames of a training clip."""
+    temporal_every: int = 4
+    """Every how many steps a temporal batch comes; the others are images."""
+    rate: float = 8e-4
+    """Highest learning rate; half of it where trained weights are trained further."""
+    latent: float = 0.1
+    """Weight of the distance of the enhanced latent to the target's."""
+    logarithm: float = 0.1
+    """Weight of the logarithm of the squared error beside the absolute one, in the region."""
+    gate: float = 0.1
+    """Weight of the cross entropy of the gate."""
+    perceptual: float = 0.01
+    """Weight of the perceptual distance on a random patch."""
+    temporal: float = 1.0
+    """Weight of the warp error in temporal batches."""
+    kinds: tuple[str, ...] = KINDS
+    """Kinds of damage to learn from, of those that the pairs hold."""
+
+    def __post_init__(self):
+        if self.temporal_every < 2:
+            raise ValueError(f"temporal_every must be at least 2, got {self.temporal_every}")
+        if self.crop % 16 or self.crop < 32:
+            raise ValueError(f"crop must be a multiple of 16 from 32, got {self.crop}")
+
+
+class Run:
+    """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
+
+    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, stages: Sequence[str]):
+        torch.manual_seed(seed)
+        self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
+        self.autoencoder = channels_last(Autoencoder())
+        self.average = Net(net.config)
+        self.average.load_state_dict(net.state_dict())
+        self.time = Time(net.config.width)
+        self.net = channels_last(net)
+        self.step = dict.fromkeys(STAGES, 0)
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self.optimiser = {
+            "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
+            "prior": torch.optim.AdamW(
+                [p for part in (self.time, net.embed, net.blocks, net.norm, net.denoise) for p in part.parameters()],
+                betas=(0.9, 0.98),
+                weight_decay=1e-2,
+            ),
+            "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
+            "objects": torch.optim.AdamW(
+                [p for n, p in self.net.objects.named_parameters() if not n.startswith("shade.")], betas=(0.9, 0.98), weight_decay=1e-2
+            ),
+            "shade": torch.optim.AdamW(self.net.objects.shade.parameters(), betas=(0.9, 0.98), weight_decay=3e-2),
+            "enhancer": torch.optim.AdamW(
+                [p for n, p in self.net.named_parameters() if not n.startswith(FROZEN)], betas=(0.9, 0.98), weight_decay=1e-2
+            ),
+        }
+
+    def parts(self) -> dict:
+        return {"autoencoder": self.autoencoder, "time": self.time, "net": self.net, "average": self.average} | {
+            f"optimiser {k}": v for k, v in self.optimiser.items()
+        }
+
+    def save(self, path: Path) -> None:
+        state = {name: part.state_dict() for name, part in self.parts().items()}
+        facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds}
+        # through Python's file, which says that the disk is full; torch's own writer says "unexpected pos"
+        with atomic_file(path) as half, open(half, "wb") as file:
+            torch.save({**facts, **state}, file)
+
+    def load(self, path: Path) -> None:
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            for name, part in self.parts().items():
+                part.load_state_dict(state[name])
+            self.step, self.seconds = state["step"], state["seconds"]
+        except (LookupError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
+        if state["seed"] != self.seed:
+            raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
+
+    def share(self, stage: str) -> float:
+        """A stage's share of the budget, of which those that are left out take nothing."""
+        c = self.config
+        all_of = {"autoencoder": c.autoencoder, "prior": c.prior, "colour": c.colour, "objects": c.objects, "shade": c.shade}
+        all_of["enhancer"] = 1 - sum(all_of.values())
+        return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
+
+    def done(self, stage: str) -> float:
+        """How much of a stage's budget is spent, from 0 to 1."""
+        share = self.share(stage)
+        if share <= 0:
+            return 1.0
+        if self.steps is not None:
+            return min(1.0, self.step[stage] / max(share * self.steps, 1))
+        return min(1.0, self.seconds[stage] / 60 / max(share * (self.minutes or 0), 1e-9))
+
+    def set_rate(self, stage: str) -> None:
+        """Warm up over 100 steps, then half a cosine down to a hundredth."""
+        highest = self.config.rate * RATES.get(stage, 1.0) * (1.0 if "autoencoder" in self.stages else 0.5)
+        rate = highest * min(1.0, (self.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * self.done(stage)))
+        for group in self.optimiser[stage].param_groups:
+            group["lr"] = float(rate)
