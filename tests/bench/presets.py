@@ -89,7 +89,7 @@ def presets(drive_folder: Path | None = None, lund_folder: Path | None = None) -
 
     def lund() -> Preset:
         if lund_folder is None:
-            raise Missing("no scene: reconstruct ../shared/data/lund, then pass --lund FOLDER")
+            raise Missing("no scene: `sidestep recon ../shared/data/lund -o FOLDER --camera-height 1.6m`, then pass --lund FOLDER")
         return drive(960, 540, lund_folder)
 
     def uniform_of(n: int) -> Preset:

@@ -1,10 +1,14 @@
 """`RenderConfig(max_error=e)`: no pixel is further than e from truth, on random scenes of every kind and on the presets."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from recon import open_log, reconstruct
+from recon.fit import FitConfig
 from render import RenderConfig, rasterize
 from render.budget import split
 from render.cull import in_sight, those_in_sight
@@ -15,7 +19,7 @@ from render.settings import Settings
 from scenes import Camera, Pinhole, Placed, SplatModel
 from scenes.poses import matrix_from_quat, translation
 from tests import oracle
-from tests.bench.presets import Missing, drive, presets, random_splats, uniform
+from tests.bench.presets import Missing, Preset, drive, presets, random_splats, uniform
 from tests.render.test_cuda import keep_forward
 from tests.render.test_lenses import LENSES, around, camera_of
 from tests.render.test_shutter import FISHEYE, PINHOLE, driven, traffic
@@ -85,13 +89,31 @@ def test_the_drive_keeps_every_budget():
     assert_kept(thinned, preset.camera, preset.model, "drive")
 
 
-@pytest.mark.parametrize("name", ["drive-480x270", "drive-960x540", "drive-1920x1080", "lund", "biker", "street-1M", "street-3M"])
+@pytest.fixture(scope="session")
+def lund(shared, tmp_path_factory) -> Path:
+    """A scene of the photos of lund: the folder that SIDESTEP_LUND names, else one that is fitted for a few seconds."""
+    if "SIDESTEP_LUND" in os.environ:
+        return Path(os.environ["SIDESTEP_LUND"])
+    folder = tmp_path_factory.mktemp("lund") / "scene"
+    reconstruct(open_log(shared / "lund", camera_height=1.6), folder, size=(480, 270), config=FitConfig(steps=40))
+    return folder
+
+
+def test_lund_keeps_every_budget(lund):
+    assert_small_cameras_keep_every_budget("lund", presets(lund_folder=lund)["lund"]())
+
+
+@pytest.mark.parametrize("name", ["drive-480x270", "drive-960x540", "drive-1920x1080", "biker", "street-1M", "street-3M"])
 def test_every_preset_keeps_every_budget(name):
-    """Three small cameras that look at what the preset's shows at full size: near its bottom, at the horizon, and to one side."""
     try:
         preset = presets()[name]()
     except Missing as missing:
         pytest.skip(str(missing))
+    assert_small_cameras_keep_every_budget(name, preset)
+
+
+def assert_small_cameras_keep_every_budget(name: str, preset: Preset) -> None:
+    """Three small cameras that look at what the preset's shows at full size: near its bottom, at the horizon, and to one side."""
     whole = preset.camera
     for x, y in [(0.5, 0.8), (0.45, 0.5), (0.8, 0.45)]:
         left, top = int(x * whole.width), int(y * whole.height)
