@@ -7,15 +7,15 @@ from dataclasses import replace
 import torch
 import warp as wp
 
-from render.compositing import draw, draw_backward
+from render.compositing import Picture, draw, draw_backward
 from render.kernels.bin import REACH_INTS
 from render.kernels.types import ITEM, MEDIAN, RECORD, WHO
-from render.launch import run_each, stage, view
+from render.launch import run_each, stage, upload, view
 from render.order import depth_order
 from render.projected import Projected
 from render.projection import projection, uniforms
 from render.settings import Settings
-from render.work import work
+from render.work import Work, work
 
 FIELDS = 5
 """Tensors of one `Gaussians`."""
@@ -35,6 +35,39 @@ def _threads(device: torch.device) -> int:
     return ITEM if device.type == "cuda" else 1
 
 
+def prepare(settings: Settings, seen, poses: torch.Tensor, lens: torch.Tensor, fields) -> tuple[Work, list, torch.Tensor]:
+    """What the host finds out before the device begins: arguments as of `Rasterize`; the work, and what its kernels are told: of all poses
+    together, and of each as rows, still on the host."""
+    copies = projection(settings.lens, settings.rolling).copies
+    instances = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
+    *told, rows = uniforms(settings, settings.lens(*lens.tolist()), poses.detach().cpu(), copies)
+    return work(instances, seen, copies), told, rows
+
+
+def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, features, frames, rays) -> tuple[Projected, Picture]:
+    """Project and composite. With a room and without gradients nothing in here waits for the device, so a graph can record it."""
+    ways, device = projection(settings.lens, settings.rolling), rows.device
+    records = torch.empty(todo.records, RECORD, device=device)
+    reach = torch.empty(todo.records, REACH_INTS, dtype=torch.int32, device=device)
+    keys, counts = (torch.empty(todo.records, dtype=torch.int32, device=device) for _ in range(2))
+    out = [view(records, float), view(reach, int), view(keys, int), view(counts, int)]
+    jobs = [(len(g.items) * _threads(device), [*_arrays(g.fields), *_told(told, rows, g.items), *out]) for g in todo.groups]
+    run_each(ways.forward, jobs, device)
+    per_record, frames = (None if t is None else t.contiguous().repeat(ways.copies, 1) for t in (features, frames))
+    scene = Projected(records, reach, counts, depth_order(keys), per_record, frames, rays)
+    return scene, draw(settings, scene)
+
+
+def pictures(settings: Settings, picture: Picture) -> tuple[torch.Tensor | None, ...]:
+    """What `Rasterize` gives; None for what is not wanted."""
+    alpha = 1 - picture.planes[0]
+    z, weights = picture.planes[4:6] if settings.wanted.depth else (None, None)
+    channels = picture.planes[settings.wanted.first_channel :] if settings.wanted.channels else None
+    median = picture.picks[MEDIAN] if settings.wanted.median else None
+    instance = torch.where(alpha < 0.5, -1, picture.picks[WHO]).to(torch.int32) if settings.wanted.instance else None
+    return picture.planes[1:4], alpha, z, weights, channels, median, instance
+
+
 class Rasterize(torch.autograd.Function):
     """The kernels behind `rasterize`, which calls this inside a `stage`.
 
@@ -49,30 +82,14 @@ class Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, settings: Settings, seen, poses, lens, features, frames, rays, *fields):
         settings = replace(settings, gradients=settings.gradients and any(ctx.needs_input_grad))
-        ways = projection(settings.lens, settings.rolling)
-        device = fields[0].device
-        instances = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
-        todo = work(instances, seen, ways.copies)
-        records = torch.empty(todo.records, RECORD, device=device)
-        reach = torch.empty(todo.records, REACH_INTS, dtype=torch.int32, device=device)
-        keys, counts = (torch.empty(todo.records, dtype=torch.int32, device=device) for _ in range(2))
-        *told, rows = uniforms(settings, settings.lens(*lens.tolist()), poses.detach().cpu(), ways.copies)
-        rows = rows.to(device)
-        out = [view(records, float), view(reach, int), view(keys, int), view(counts, int)]
-        jobs = [(len(g.items) * _threads(device), [*_arrays(g.fields), *_told(told, rows, g.items), *out]) for g in todo.groups]
-        run_each(ways.forward, jobs, device)
-        per_record, frames = (None if t is None else t.contiguous().repeat(ways.copies, 1) for t in (features, frames))
-        scene = Projected(records, reach, counts, depth_order(keys), per_record, frames, rays)
-        picture = draw(settings, scene)
+        todo, told, rows = prepare(settings, seen, poses, lens, fields)
+        rows = upload(rows, fields[0].device)
+        scene, picture = paint(settings, todo, told, rows, features, frames, rays)
         ctx.settings, ctx.work, ctx.told, ctx.rows, ctx.scene, ctx.parts = settings, todo, told, rows, scene, picture.parts
         ctx.like_poses, ctx.like_lens = poses.new_empty(poses.shape), lens.new_empty(lens.shape)
-        alpha = 1 - picture.planes[0]
-        z, weights = picture.planes[4:6] if settings.wanted.depth else (None, None)
-        channels = picture.planes[settings.wanted.first_channel :] if settings.wanted.channels else None
-        median = picture.picks[MEDIAN] if settings.wanted.median else None
-        instance = torch.where(alpha < 0.5, -1, picture.picks[WHO]).to(torch.int32) if settings.wanted.instance else None
+        *sums, median, instance = pictures(settings, picture)
         ctx.mark_non_differentiable(*(t for t in (median, instance) if t is not None))
-        return picture.planes[1:4], alpha, z, weights, channels, median, instance
+        return *sums, median, instance
 
     @staticmethod
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):

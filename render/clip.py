@@ -9,6 +9,7 @@ import torch
 from render.frame import DEFAULT, render_frame
 from render.frame_types import Frame, RenderConfig
 from render.outputs import check_outputs
+from render.room import Room, one_ahead
 from scenes.asset import Actor
 from scenes.camera import Camera
 from scenes.metres import require_metres
@@ -113,8 +114,12 @@ def _evenly(begin: int, end: int, fps: float) -> torch.Tensor:
 
 def _frames(scene: Scene, cameras: list[Camera], outputs: tuple[str, ...], shadows: bool, config: RenderConfig) -> Iterator[Frame]:
     last = len(cameras) - 1
-    for i, camera in enumerate(cameras):
+
+    def draw(i: int) -> Frame:
         wanted = tuple(o for o in outputs if not (o.endswith("_prev") and i == 0) and not (o.endswith("_next") and i == last))
         previous = cameras[i - 1] if i > 0 else None
         following = cameras[i + 1] if i < last else None
-        yield render_frame(scene, camera, wanted, previous, following, shadows, config)
+        return render_frame(scene, cameras[i], wanted, previous, following, shadows, config, room)
+
+    room = Room() if scene.background.gaussians.device.type == "cuda" else None
+    yield from map(draw, range(len(cameras))) if room is None else one_ahead(draw, range(len(cameras)), room)

@@ -47,7 +47,7 @@ def draw(settings: Settings, scene: Projected) -> Picture:
     x, y, width, height = settings.part
     whole = window(settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y)
     parts: list[Part] = []
-    divided = windows(scene.records, scene.counts, whole, settings.config.most_entries)
+    divided = [whole] if settings.room else windows(scene.records, scene.counts, whole, settings.config.most_entries)
     planes = picks = scene.records
     for w in divided:
         lists, counts = _lists(settings, scene, w, alone=len(divided) == 1)
@@ -112,8 +112,9 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
 def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tuple[TileLists, torch.Tensor]:
     """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up."""
     counts = scene.counts if alone else room_in(scene.records, scene.counts, w)
-    drawn = settings.drawn_tiles().to(counts.device)
-    return tile_lists(scene.records, scene.reach, scene.order, counts, w, drawn, settings.gradients, counts.device.type == "cpu"), counts
+    drawn = settings.drawn_tiles(counts.device)
+    told = (w, drawn, settings.gradients, counts.device.type == "cpu" and settings.room is None, settings.room)
+    return tile_lists(scene.records, scene.reach, scene.order, counts, *told), counts
 
 
 def _planes(w: Window, count: int, device) -> torch.Tensor:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import torch
 
 from render.frame_types import Frame, RenderConfig
+from render.launch import upload
 from render.need import need_of, support_fields
 from render.outputs import check_outputs
 from render.rasterize import rasterize
+from render.room import Room
 from render.shadow import cast, shadow_casters
 from render.sky import over_sky
 from scenes.camera import Camera
@@ -27,12 +29,13 @@ def render_frame(
     following: Camera | None = None,
     shadows: bool = True,
     config: RenderConfig = DEFAULT,
+    room: Room | None = None,
 ) -> Frame:
     """Background and actors at `camera.time_us`, shadows of inserted assets, the sky, and last the camera's exposure.
 
     previous, following: the cameras that flow_prev and flow_next lead to, and visible_prev and visible_next; needed exactly where those
     are asked for.
-    Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky.
+    Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky. room: as of `rasterize`.
     Raises ValueError for an output that does not exist and for a flow without its other camera.
     """
     outputs = check_outputs(outputs)
@@ -57,7 +60,7 @@ def render_frame(
         needed |= {"depth", "instance"}
     placed = scene.placed(camera.time_us, camera.readout_us)
     features = support_fields(placed, camera) if "need" in outputs else None
-    frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model, config, features)
+    frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model, config, features, room=room)
 
     rgb = cast(frame, casters) if casters else frame.rgb
     need = None
@@ -77,7 +80,7 @@ def render_frame(
 
 def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     """rgb' = E[:, :3] rgb + E[:, 3] for an affine colour `[3, 4]`."""
-    exposure = exposure.to(rgb)
     if torch.equal(exposure, torch.eye(3, 4).to(exposure)):
         return rgb
+    exposure = upload(exposure, rgb.device).to(rgb.dtype)
     return rgb @ exposure[:, :3].T + exposure[:, 3]

@@ -127,7 +127,8 @@ def stage(device: torch.device):
     torch is loaded, as the front door does, ends the spinning after the caller's operations too.)
     """
     if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+        # nothing runs on Warp's own stream that this one should wait for
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
             yield
         return
     threads = torch.get_num_threads()
@@ -147,6 +148,11 @@ _cores = _Cores()
 
 
 _WARP_TYPES = {float: wp.float32, int: wp.int32}
+
+
+def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """A tensor of the host, there; a copy from memory that is not pinned would hold the host up until the device has done all before it."""
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and tensor.device.type == "cpu" else tensor.to(device)
 
 
 def view(tensor: torch.Tensor, dtype) -> object:

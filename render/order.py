@@ -10,6 +10,7 @@ import torch
 from render.kernels.bin import WITH_SLOTS, deal, emit_pairs
 from render.kernels.types import CULLED, Window
 from render.launch import run, sort_pairs, view
+from render.room import Room
 
 CHUNKS = 8
 """Chunks of the depth order that are counted and emitted side by side on CPU threads."""
@@ -31,7 +32,8 @@ class TileLists:
 
 
 def depth_order(keys: torch.Tensor) -> torch.Tensor:
-    """Indices int32 of the records that are not culled, by rising depth, ties by index."""
+    """Indices int32 of the records by rising depth, ties by index; on the CPU without those that are culled, on CUDA they come last: how
+    many there are is not asked."""
     if keys.device.type == "cpu":  # key and index in one number: its sort on a CPU's vectors beats a radix sort of pairs by two
         culled = keys.numpy()
         (there,) = np.nonzero(culled != int(CULLED))
@@ -39,10 +41,9 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
         pairs[:, 0], pairs[:, 1] = there, culled[there]
         pairs.reshape(-1).view("<i8").sort()
         return torch.from_numpy(pairs[:, 0].copy())
-    visible = torch.nonzero(keys != int(CULLED)).flatten()
-    n = visible.shape[0]
+    n = len(keys)
     pair = keys.new_empty(2, 2 * n)
-    pair[0, :n], pair[1, :n] = keys[visible], visible
+    pair[0, :n], pair[1, :n] = keys, torch.arange(n, dtype=torch.int32, device=keys.device)
     if n:
         sort_pairs(pair[0], pair[1], n)
     return pair[1, :n]
@@ -50,19 +51,19 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
 
 def tile_lists(
     records: torch.Tensor, reach: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, drawn: torch.Tensor,
-    slots: bool = True, counting: bool = True,
+    slots: bool = True, counting: bool = True, room: Room | None = None,
 ) -> TileLists:  # fmt: skip
     """Deal the visible records, sorted by depth, to the window's tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
     counts `[N]`: entries to set aside for each record. drawn int32 `[tiles_y, tiles_x]` of the image: 0 for tiles that shall have no
-    entries. slots: whether gradients will need slots; then counts become how many each record has.
+    entries. slots: whether gradients will need slots; then counts become how many each record has. room: for as many entries, of a sort.
     """
     if len(order) == 0:
         none = torch.empty(0, dtype=torch.int32, device=records.device)
         return TileLists(none.new_zeros(window.tiles_x * window.tiles_y + 1), none, none, torch.zeros_like(counts))
     if counting:
         return _by_counting(records, reach, order, counts, window, drawn, slots)
-    return _by_sorting(records, order, counts, window, drawn)
+    return _by_sorting(records, order, counts, window, drawn, room)
 
 
 def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bool) -> TileLists:
@@ -91,15 +92,21 @@ def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bo
     return TileLists(starts, ids, slot_of, first_slot)
 
 
-def _by_sorting(records, order, counts, window: Window, drawn) -> TileLists:
+def _by_sorting(records, order, counts, window: Window, drawn, room: Room | None) -> TileLists:
     device, tiles = records.device, window.tiles_x * window.tiles_y
-    ends = counts[order].cumsum(0)
-    total = int(ends[-1])
+    in_order = counts[order]
+    ends = in_order.cumsum(0)
+    if room is None:
+        total = max(1, int(ends[-1]))
+    else:
+        total = room.entries
+        room.note(ends[-1])
     first_slot = torch.empty_like(counts)
-    first_slot[order] = (ends - counts[order]).to(torch.int32)
-    pair = torch.empty(2, 2 * total, dtype=torch.int32, device=device)
-    owner = torch.empty(total, dtype=torch.int32, device=device)
-    told = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int)]
+    first_slot[order] = (ends - in_order).clamp(max=total).to(torch.int32)
+    pair = torch.zeros(2, 2 * total, dtype=torch.int32, device=device)
+    pair[0] = tiles
+    owner = torch.zeros(total, dtype=torch.int32, device=device)
+    told = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int), total]
     run(emit_pairs, len(order), [*told, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
     sort_pairs(pair[0], pair[1], total)
     slot_of = pair[1, :total].clone()

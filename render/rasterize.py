@@ -20,6 +20,7 @@ from render.launch import stage
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
 from render.rays import exact_rays, on_device
+from render.room import Room
 from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
@@ -39,6 +40,7 @@ def rasterize(
     features: Features | None = ...,
     crop: tuple[int, int, int, int] | None = ...,
     mask: torch.Tensor | None = ...,
+    room: Room | None = ...,
 ) -> Frame: ...
 @overload
 def rasterize(
@@ -52,6 +54,7 @@ def rasterize(
     features: Features | None = ...,
     crop: tuple[int, int, int, int] | None = ...,
     mask: torch.Tensor | None = ...,
+    room: Room | None = ...,
 ) -> list[Frame]: ...
 def rasterize(
     splats: Gaussians | Placed | Sequence[Placed],
@@ -64,6 +67,7 @@ def rasterize(
     features: Features | None = None,
     crop: tuple[int, int, int, int] | None = None,
     mask: torch.Tensor | None = None,
+    room: Room | None = None,
 ) -> Frame | list[Frame]:
     """Draw Gaussian splats (Kerbl et al. 2023) as `camera` sees them; one Frame a camera.
 
@@ -72,23 +76,25 @@ def rasterize(
     placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose. features: a further
     field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
     the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
-    nothing stands.
+    nothing stands. room: what earlier frames needed, so that the host does not wait for this one (`render/room.py`, `one_ahead`).
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
     instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. ValueError for what
     cannot be drawn.
     """
     if not isinstance(camera, Camera):
-        return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask) for c in camera]
+        return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
     outputs = check_outputs(outputs)
-    placed = _as_placed(splats)
+    placed = as_placed(splats)
     _check(placed, camera, outputs, flow_to, model, config)
     _check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
-        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features, crop, mask)
+        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features, crop, mask, room)
 
 
-def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None) -> Frame:
+def _draw(
+    placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None, room=None
+) -> Frame:
     seen = None
     if not differentiated(placed, camera, features):
         placed = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
@@ -112,6 +118,7 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         crop=crop,
         mask=mask,
         gradients=torch.is_grad_enabled(),
+        room=room,
     )
     frames = rays = None
     if settings.by_rays:
@@ -120,11 +127,28 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
         frames, rays = _along_rays(placed, camera, settings)
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
     lens = camera.lens.params()
-    rgb, alpha, z, weights, sums, median, instance = Rasterize.apply(settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
+    drawn = Rasterize.apply(settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
+    frame = picture_of(settings, background if "rgb" in outputs else None, *drawn)
+    if settings.wanted.channels:
+        parts = frame["sums"].split([field.shape[1] for field in summed.values()], -1)
+        frame |= dict(zip(summed, parts, strict=True))
+    if "normal" in outputs:
+        frame["normal"] = unit(frame["normal"])
+    for way in {o.split("_")[1] for o in outputs if o.startswith(("flow_", "visible_"))}:
+        there, other = flow_to[way]
+        same = correspond(placed, camera, frame["depth"].detach(), frame["instance"], there, other, settings.part[:2])
+        frame[f"flow_{way}"] = same.flow
+        if f"visible_{way}" in outputs:
+            shown = _draw(as_placed(there), other, ("depth",), None, {}, model, config, room=room).depth
+            assert shown is not None
+            frame[f"visible_{way}"] = same.visible(shown.detach())
+    return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
-    frame: dict[str, torch.Tensor] = {"alpha": alpha, "instance": instance}
-    frame["rgb"] = rgb.permute(1, 2, 0)
-    if background is not None and "rgb" in outputs:
+
+def picture_of(settings: Settings, background, rgb, alpha, z, weights, sums, median, instance) -> dict[str, torch.Tensor]:
+    """A frame's fields by name, and "sums" of all channels `[H, W, C]`, from what `Rasterize` gives."""
+    frame = {"alpha": alpha, "rgb": rgb.permute(1, 2, 0), "instance": instance}
+    if background is not None:
         behind = background if background.ndim == 1 else background[settings.of_image]
         frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind
     if settings.wanted.depth:
@@ -134,19 +158,8 @@ def _draw(placed: list[Placed], camera: Camera, outputs, background, flow_to, mo
     if settings.wanted.median:
         frame["median_depth"] = torch.where(median > 0, median, torch.inf)
     if settings.wanted.channels:
-        parts = sums.permute(1, 2, 0).split([field.shape[1] for field in summed.values()], -1)
-        frame |= dict(zip(summed, parts, strict=True))
-    if "normal" in outputs:
-        frame["normal"] = unit(frame["normal"])
-    for way in {o.split("_")[1] for o in outputs if o.startswith(("flow_", "visible_"))}:
-        there, other = flow_to[way]
-        same = correspond(placed, camera, frame["depth"].detach(), instance, there, other, settings.part[:2])
-        frame[f"flow_{way}"] = same.flow
-        if f"visible_{way}" in outputs:
-            shown = _draw(_as_placed(there), other, ("depth",), None, {}, model, config).depth
-            assert shown is not None
-            frame[f"visible_{way}"] = same.visible(shown.detach())
-    return Frame(camera=camera, **{name: frame[name] for name in outputs})
+        frame["sums"] = sums.permute(1, 2, 0)
+    return frame
 
 
 def _along_rays(placed: list[Placed], camera: Camera, settings: Settings) -> tuple[torch.Tensor, torch.Tensor]:
@@ -159,7 +172,8 @@ def _along_rays(placed: list[Placed], camera: Camera, settings: Settings) -> tup
         return torch.cat([canonical_frames(*one) for one in there]), rays
 
 
-def _as_placed(splats) -> list[Placed]:
+def as_placed(splats) -> list[Placed]:
+    """Splats as `rasterize` takes them, placed; never none."""
     if isinstance(splats, Gaussians):
         splats = Placed(splats, torch.eye(4, dtype=torch.float64))
     placed = [splats] if isinstance(splats, Placed) else list(splats)

@@ -9,6 +9,7 @@ import torch
 
 from render.frame_types import RenderConfig
 from render.kernels.types import TILE, Wanted
+from render.room import Room
 from scenes.gaussians import SplatModel
 from scenes.lenses import Lens, Orthographic, Pinhole
 
@@ -18,7 +19,7 @@ class Settings:
     """Image size, model, config, what is wanted, each instance's id, lens type, and what the shutter does.
 
     crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask bool `[H, W]` of the whole
-    image: which pixels are drawn. gradients: whether any may be asked for, of anything.
+    image: which pixels are drawn. gradients: whether any may be asked for, of anything. room: for tile lists whose length is not asked for.
     """
 
     width: int
@@ -33,6 +34,7 @@ class Settings:
     crop: tuple[int, int, int, int] | None = None
     mask: torch.Tensor | None = None
     gradients: bool = True
+    room: Room | None = None
 
     @property
     def part(self) -> tuple[int, int, int, int]:
@@ -62,11 +64,11 @@ class Settings:
         x, y, width, height = self.part
         return slice(y, y + height), slice(x, x + width)
 
-    def drawn_tiles(self) -> torch.Tensor:
+    def drawn_tiles(self, device: torch.device) -> torch.Tensor:
         """int32 `[rows, columns]` of all the image's tiles: 0 for those without a pixel of the mask."""
         if self.mask is None:
-            return torch.ones(-(-self.height // TILE), -(-self.width // TILE), dtype=torch.int32)
-        pixels = self.mask[None, None].to(torch.float32)
+            return torch.ones(-(-self.height // TILE), -(-self.width // TILE), dtype=torch.int32, device=device)
+        pixels = self.mask[None, None].to(device, torch.float32)
         return torch.nn.functional.max_pool2d(pixels, TILE, ceil_mode=True)[0, 0].to(torch.int32)
 
     @property

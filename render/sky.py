@@ -7,8 +7,8 @@ import warp as wp
 
 from render.kept import kept_beside
 from render.kernels.sky import lay_behind
-from render.launch import run, stage, view
-from render.rays import camera_rays, turns, world_directions
+from render.launch import run, stage, upload, view
+from render.rays import camera_rays, on_device, turns, world_directions
 from scenes.camera import Camera
 from scenes.sky import Sky, srgb_from_linear
 
@@ -20,13 +20,19 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -
     """Premultiplied `rgb` `[H, W, 3]` over the sky, looked up only where `alpha` `[H, W]` lets light pass; differentiable in all three."""
     if torch.is_grad_enabled() and any(t.requires_grad for t in (rgb, alpha, sky.linear)):
         return _differentiably(rgb, alpha, sky, camera)
-    if not (alpha < 1 - SKY_SHOWS).any():
+    if rgb.device.type == "cpu" and not (alpha < 1 - SKY_SHOWS).any():  # to ask a GPU takes longer than to look
         return rgb
     out = torch.empty(rgb.shape, device=rgb.device)
-    ways = turns(camera).to(rgb).contiguous()
+    ways = upload(turns(camera).to(rgb.dtype).contiguous(), rgb.device)
     with stage(rgb.device):
-        args = [view(camera_rays(camera).to(rgb.device), wp.vec3), view(ways, wp.mat33), int(camera.shutter != "columns")]
-        args += [view(_display(sky.linear).to(rgb.device), wp.vec3), SKY_SHOWS, view(rgb, float), view(alpha, float), view(out, float)]
+        args = [view(on_device(camera_rays(camera), rgb.device), wp.vec3), view(ways, wp.mat33), int(camera.shutter != "columns")]
+        args += [
+            view(on_device(_display(sky.linear), rgb.device), wp.vec3),
+            SKY_SHOWS,
+            view(rgb, float),
+            view(alpha, float),
+            view(out, float),
+        ]
         run(lay_behind, rgb.shape[0], args, rgb.device)
     return out
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from render.kernels.types import ITEM
+from render.launch import upload
 
 SMALL = 8192
 """Splats below which an instance is put together with others: its copy then costs less than a launch."""
@@ -72,7 +73,7 @@ def work(instances: Sequence[Fields], seen: Sequence[torch.Tensor | None] | None
             own[:, 0] += before.repeat_interleave(torch.tensor(counts))
         for copy in range(copies):
             there = own + torch.tensor([0, 0, copy * projected, copy * len(instances)], dtype=torch.int32)
-            groups.append(Group(fields, members, lengths, there.to(device), [per_instance[p] for p in members]))
+            groups.append(Group(fields, members, lengths, upload(there, device), [per_instance[p] for p in members]))
     return Work(groups, copies * projected)
 
 

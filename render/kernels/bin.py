@@ -187,24 +187,22 @@ def deal(
 @wp.kernel
 def emit_pairs(
     records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int],
-    starts: wp.array[int], counts: wp.array[int], tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
+    starts: wp.array[int], counts: wp.array[int], room: int, tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists."""
+    """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists. What no entry is
+    written to, or `room` has no place for, stays behind every tile."""
     j = order[first + wp.tid()]
-    slot = starts[j]
-    end = slot + counts[j]
-    rows = within(span_of(records[j, Y], records[j, Y_EXT]), window.top, window.tiles_y)
-    for ty in range(rows[0], rows[1] + 1):
-        columns = within(columns_of(records, j, ty), window.left, window.tiles_x)
-        for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
-            if drawn[ty, tx] != 0:
-                tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left
-                slot_of[slot] = slot
-                owner[slot] = j
-                slot += 1
-    for spare in range(slot, end):
-        tile_keys[spare] = window.tiles_x * window.tiles_y  # behind every tile
-        slot_of[spare] = spare
-        owner[spare] = j
-    counts[j] = slot - starts[j]
+    if counts[j] > 0:
+        slot = starts[j]
+        end = slot + wp.min(counts[j], room - slot)
+        rows = within(span_of(records[j, Y], records[j, Y_EXT]), window.top, window.tiles_y)
+        for ty in range(rows[0], rows[1] + 1):
+            columns = within(columns_of(records, j, ty), window.left, window.tiles_x)
+            for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
+                if drawn[ty, tx] != 0:
+                    tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left
+                    slot_of[slot] = slot
+                    owner[slot] = j
+                    slot += 1
+        counts[j] = slot - starts[j]

@@ -184,8 +184,8 @@ def test_sorted_pairs_make_the_same_lists_as_counting():
     box = kept.scene.counts + (kept.scene.counts > 0).int() * 3  # as if the boxes around the ellipses had three tiles more
     count, pair = box.clone(), box.clone()
     told = (kept.scene.records, kept.scene.reach, depth_order(keys))
-    counted = tile_lists(*told, count, whole(settings), settings.drawn_tiles())
-    paired = tile_lists(*told, pair, whole(settings), settings.drawn_tiles(), counting=False)
+    counted = tile_lists(*told, count, whole(settings), settings.drawn_tiles(CPU))
+    paired = tile_lists(*told, pair, whole(settings), settings.drawn_tiles(CPU), counting=False)
     assert torch.equal(count, kept.scene.counts) and torch.equal(pair, kept.scene.counts)
     total = int(counted.starts[-1])
     assert total == int(kept.scene.counts.sum()) > 100
