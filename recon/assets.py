@@ -125,22 +125,20 @@ def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
     middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
     views, nearest, sides, sectors = 0, math.inf, [0.0, 0.0], dict.fromkeys(SECTORS, 0)
     for name, camera in scene.rig.items():
-        for t in scene.frame_times(name).tolist():
-            if not (box.covers(t) and scene.ego.covers(t)):
-                continue
-            cam_from_box = inverse(scene.ego.at(t) @ camera.body_from_cam) @ box.at(t)
-            x, y, z, _ = (cam_from_box @ middle).tolist()
-            if z < 0.5:
-                continue
-            u, v = camera.lens.project(torch.tensor([x, y, z], dtype=torch.float64)).tolist()
-            if 0 <= u < camera.width and 0 <= v < camera.height:
-                away = math.hypot(x, y, z)
-                nearest = min(nearest, away)
-                if away <= FARTHEST:
-                    views += 1
-                    ahead, beside = inverse(cam_from_box)[:2, 3].tolist()
-                    sectors[SECTORS[round(math.atan2(beside, ahead) / (2 * math.pi) * len(SECTORS)) % len(SECTORS)]] += 1
-                    sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / away**3
+        times = scene.frame_times(name)
+        times = times[torch.tensor([box.covers(t) and scene.ego.covers(t) for t in times.tolist()], dtype=torch.bool)]
+        cam_from_box = inverse(scene.ego.at_each(times) @ camera.body_from_cam) @ box.at_each(times)
+        at = (cam_from_box @ middle)[:, :3]
+        at, cam_from_box = at[at[:, 2] >= 0.5], cam_from_box[at[:, 2] >= 0.5]
+        pixels = camera.lens.project(at)
+        inside = ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
+        away, eyes = at[inside].norm(dim=1), inverse(cam_from_box[inside])[:, :2, 3]
+        nearest = min(nearest, float(away.min())) if len(away) else nearest
+        close = away <= FARTHEST
+        views += int(close.sum())
+        for (ahead, beside), metres in zip(eyes[close].tolist(), away[close].tolist(), strict=True):
+            sectors[SECTORS[round(math.atan2(beside, ahead) / (2 * math.pi) * len(SECTORS)) % len(SECTORS)]] += 1
+            sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / metres**3
     return Sight(views, nearest, sides[0], sides[1], sectors)
 
 

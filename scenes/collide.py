@@ -30,21 +30,40 @@ def collisions(scene: Scene, actor: Actor) -> list[str]:
     times = [t for t in range(first, last + 1, STEP_US) if actor.trajectory.covers(t)]
     found = []
     for other in scene.actors:
-        if other.track == actor.track:
+        if other.track == actor.track or not _meet(actor, other):
             continue
         hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
         if hit is not None:
             found.append(f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment")
     still = len(actor.trajectory) == 1
-    splats = scene.background.gaussians
-    solid = splats.means[torch.sigmoid(splats.logit_opacities) > SOLID]
-    for t in times[:1] if still else times:
+    times = times[:1] if still else times
+    solid = _along(scene, actor, times)
+    for t in times:
         count = _inside(solid, inverse(actor.trajectory.at(t)) @ scene.background.world_from_local, actor.asset.size)
         if count >= FEWEST:
             when = "" if still else f" {(t - first) / 1e6:.1f}s after the drive's first moment"
             found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
             break
     return found
+
+
+def _meet(a: Actor, b: Actor) -> bool:
+    """Whether two actors' paths come near enough in space, at whatever times, for their boxes to touch."""
+    room = float(a.asset.size.norm() + b.asset.size.norm())
+    paths = [x.trajectory.world_from_body[:, :2, 3] for x in (a, b)]
+    low, high = torch.stack([p.amin(0) for p in paths]), torch.stack([p.amax(0) for p in paths])
+    return bool((low.amax(0) < high.amin(0) + room).all())
+
+
+def _along(scene: Scene, actor: Actor, times: list[int]) -> torch.Tensor:
+    """Means `[M, 3]` of the background's solid splats within the box that holds all of an actor's boxes at these times."""
+    splats, local_from_world = scene.background.gaussians, inverse(scene.background.world_from_local)
+    if not times:
+        return splats.means[:0]
+    middles = torch.stack([(local_from_world @ actor.trajectory.at(t))[:3, 3] for t in times]).to(splats.means)
+    room = float(actor.asset.size.norm())
+    near = ((splats.means > middles.amin(0) - room) & (splats.means < middles.amax(0) + room)).all(1).nonzero()[:, 0]
+    return splats.means[near[torch.sigmoid(splats.logit_opacities[near]) > SOLID]]
 
 
 def boxes_touch(a: Actor, b: Actor, time_us: int) -> bool:
