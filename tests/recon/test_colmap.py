@@ -8,7 +8,7 @@ import torch
 from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 
 from recon import open_log, reconstruct
-from recon.build import PER_PHOTO, fit_config, fit_size
+from recon.build import MOST, PER_PHOTO, fit_config, fit_size
 from recon.fit import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
@@ -203,8 +203,16 @@ def test_photos_are_not_learnt_by_heart(workspace, drive):
     log = open_log(workspace)
     config = fit_config(log, ["camera"])
     assert (config.steps, config.budget) == tuple(12 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
-    assert fit_config(open_log(drive), ["front_camera"]) == FitConfig()
+    drive_config = fit_config(open_log(drive), ["front_camera"])
+    assert drive_config.steps > config.steps and drive_config.sh_degree > 0
     assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
+
+
+def test_a_fit_is_longer_and_finer_the_more_pictures_it_has(drive):
+    log = open_log(drive)
+    one, (first, last) = fit_config(log, ["front_camera"]), (int(t) for t in log.camera("front_camera").times_us[[0, -1]])
+    both, half = fit_config(log, ["front_camera", "front_camera"]), fit_config(log, ["front_camera"], (first, (first + last) // 2))
+    assert half.steps < one.steps < both.steps <= MOST[0] and half.budget < one.budget < both.budget <= MOST[1]
 
 
 @pytest.fixture(scope="module")
