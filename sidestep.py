@@ -47,7 +47,7 @@ from scenes.options import (
 from scenes.placement import Placement
 
 if TYPE_CHECKING:
-    from render.record import Finish
+    from render.record import Stages
 
 Outputs = Annotated[tuple[str, ...], written(lambda text: check_outputs(names(text)), "NAME,NAME", "none")]
 
@@ -151,7 +151,7 @@ class Render:
                 warnings.append(f"{placement.asset} is never in view of {self.camera}: X is metres forward, Y metres to the left")
         warn(warnings)
         width, height = self.size or (None, None)
-        finish: Finish | None = None
+        stages: Stages = {}
         needs: tuple[str, ...] = ()
         scene = scene.to(self.device)
         facts: dict[str, object] = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
@@ -160,11 +160,11 @@ class Render:
             from render.album import references_of
 
             references = references_of(self.scene, scene)
-            finish, needs = enhancement(self.weights, self.device, references)
+            stages, needs = enhancement(self.weights, self.device, references)
             facts["photos"] = len(references.shots) if references else 0
         record(
             scene, self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
-            not self.no_shadows, finish, needs, facts, warnings,
+            not self.no_shadows, stages, needs, facts, warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")

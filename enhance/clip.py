@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from enhance.enhancer import Enhancer
 from enhance.step import Steps
 from render.frame_types import Frame
+from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
 from scenes.opening import warn
@@ -35,16 +37,15 @@ def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
         yield replace(frame, rgb=better)
 
 
-def enhancement(
-    weights: str, device: str = "cpu", references: References | None = None
-) -> tuple[Callable[[Iterable[Frame]], Iterator[Frame]], tuple[str, ...]]:
-    """What turns a stream of rendered frames into a stream of enhanced ones, and the outputs that it reads. references: of the scene, if it
-    has photos."""
+def enhancement(weights: str, device: str = "cpu", references: References | None = None) -> tuple[Stages, tuple[str, ...]]:
+    """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads. references: of the
+    scene, if it has photos."""
     enhancer = load_saying(weights, device)
     outputs = tuple(name for name in enhancer.reads if name != "reference")
+    stages: dict[str, Callable] = {"enhance": partial(enhance_frames, enhancer=enhancer)}
     if references is None or "reference" not in enhancer.reads:
-        return lambda frames: enhance_frames(frames, enhancer), outputs
-    return lambda frames: enhance_frames(references.along(frames), enhancer), (*outputs, *NEEDED)
+        return stages, outputs
+    return {"references": references.along, **stages}, (*outputs, *NEEDED)
 
 
 def enhance_video(

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import torch
 
-from enhance.objects import COEFFICIENTS, Box, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
-from enhance.shade import NONE, optical_depth, read_ground, shaded
+from enhance.objects import COEFFICIENTS, Box, Evidence, ObjectNet, along, boxes, changed, evidence, spots, whole_of
+from enhance.shade import NONE, optical_depths, read_ground, shaded
 
 STEADY = 8
 """Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
@@ -32,28 +32,17 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there and the shadows that they
     lacked, and their corrections, to be passed with the next frame. Pixels that are neither an object's nor shaded stay as they are."""
     found = boxes(instance)
-    masks = {i: instance[box.outer_rows, box.outer_columns] == i for i, box in found.items()}
-    grounds = {i: (instance <= 0)[box.outer_rows, box.outer_columns] for i, box in found.items()}
-    after = _looked_at(net, rgb, found, masks, grounds, before)
-    out = rgb.clone() if found else rgb
-    for i, box in found.items():
-        coefficients = after[i][0][None]
-        _shade(out, box, grounds[i], coefficients[:, COEFFICIENTS:])
-        places, (y, x) = box.places(masks[i])
-        given = rgb[:, y, x].T
-        change = changed(given[None], places[None, :, 0], coefficients[:, :COEFFICIENTS])[0]
-        if change.square().mean() > SLIGHT**2:
-            out[:, y, x] = (given + change).T.clamp(0, 1)
+    if not found:
+        return rgb, {}
+    after = _looked_at(net, rgb, instance, found, before)
+    out = rgb.clone()
+    _shade(out, instance, found, after)
+    _recolour(out, instance, found, after)
     return out, after
 
 
 def _looked_at(
-    net: ObjectNet,
-    rgb: torch.Tensor,
-    found: dict[int, Box],
-    masks: dict[int, torch.Tensor],
-    grounds: dict[int, torch.Tensor],
-    before: Corrections,
+    net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], before: Corrections
 ) -> dict[int, tuple[torch.Tensor, int]]:
     """Objects' corrections after this frame: those that are due are looked at anew."""
     counts = {i: before[i][1] if i in before else 0 for i in found}
@@ -62,10 +51,12 @@ def _looked_at(
     if due:
         whole, read, around = whole_of(rgb), [], []
         for i in due:
-            at = spots(masks[i], found[i], float(masks[i].sum()) / rgb[0].numel())
+            box = found[i]
+            mask = instance[box.outer_rows, box.outer_columns] == i
+            at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
             y, x = at.yx.unbind(1)
-            read.append(evidence(rgb[:, found[i].outer_rows, found[i].outer_columns][:, y, x].T, at, whole))
-            places, (y, x) = found[i].places(grounds[i])
+            read.append(evidence(rgb[:, box.outer_rows, box.outer_columns][:, y, x].T, at, whole))
+            places, (y, x) = box.ground(instance[box.outer_rows, box.outer_columns] <= 0)
             around.append(read_ground(rgb[:, y, x].T, places))
         both = torch.cat([net(Evidence.stacked(read)), net.shade(torch.stack(around))], 1)
         new = dict(zip(due, both, strict=True))
@@ -78,12 +69,24 @@ def _looked_at(
     return after
 
 
-def _shade(out: torch.Tensor, box: Box, ground: torch.Tensor, depths: torch.Tensor) -> None:
-    """Darken, in the picture `out` `[3, H, W]`, the `ground` `[h, w]` of a box's outer part."""
-    if depths.max() < DEEP:
-        return
-    places, (y, x) = box.places(ground)
-    depth = optical_depth(places[None], depths)[0]
-    dark = depth > NONE
-    y, x = y[dark], x[dark]
-    out[:, y, x] = shaded(out[:, y, x].T, depth[dark] - NONE).T
+def _shade(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
+    """Darken, in the picture `out` `[3, H, W]`, the ground around the objects that lack a shadow."""
+    total = torch.zeros_like(out[0])
+    for i, box in found.items():
+        depths = after[i][0][COEFFICIENTS:]
+        if depths.max() < DEEP:
+            continue
+        lines = along(box.outer_rows, box.rows, out.device), along(box.outer_columns, box.columns, out.device)
+        total[box.outer_rows, box.outer_columns] += (optical_depths(*lines, depths) - NONE).clamp_min(0)
+    y, x = ((total > 0) & (instance <= 0)).nonzero().unbind(1)
+    out[:, y, x] = shaded(out[:, y, x].T, total[y, x]).T
+
+
+def _recolour(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
+    """Change the colours of all objects in the picture `out` `[3, H, W]`, where that is not slight."""
+    for i, box in found.items():
+        part, mask = out[:, box.rows, box.columns], instance[box.rows, box.columns] == i
+        given, height = part.permute(1, 2, 0), along(box.rows, box.rows, out.device)
+        change = changed(given, height[:, None].expand(mask.shape), after[i][0][None, :COEFFICIENTS])
+        if (change.square().mean(-1) * mask).sum() > SLIGHT**2 * mask.sum():
+            part.copy_(torch.where(mask, (given + change).clamp(0, 1).permute(2, 0, 1), part))

@@ -68,13 +68,14 @@ def demonstrate(data: Path, folder: Path, weights: str = "builtin") -> None:
     shown = _rows(len(times))
     before: dict[int, torch.Tensor] = {}
     after: dict[int, torch.Tensor] = {}
-    enhance, needs = enhancement(weights)
+    stages, needs = enhancement(weights)
+    enhance = stages["enhance"]
 
-    def finish(frames: Iterator[Frame]) -> Iterator[Frame]:
+    def noted(frames: Iterator[Frame]) -> Iterator[Frame]:
         return _noting(enhance(_noting(frames, shown, before)), shown, after)
 
     facts = {"scene": str(data / "drive002"), "enhanced": weights}
-    record(scene, CAMERA, folder / "out.mp4", SHIFT, times, WIDTH, HEIGHT, finish=finish, finish_needs=needs, facts=facts)
+    record(scene, CAMERA, folder / "out.mp4", SHIFT, times, WIDTH, HEIGHT, stages={**stages, "enhance": noted}, needs=needs, facts=facts)
 
     rows = []
     for i in shown:

@@ -11,9 +11,10 @@ def shrink_flow(flow: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
 
     A cell without any known pixel stays unknown (NaN).
     """
-    known = torch.isfinite(flow).all(1, keepdim=True)
+    total = flow[:, :1] + flow[:, 1:]
+    known = (total - total == 0).float()
     size = (size[0], size[1])
-    share = F.adaptive_avg_pool2d(known.float(), size)
-    mean = F.adaptive_avg_pool2d(torch.where(known, flow, 0).float(), size) / share
+    share = F.adaptive_avg_pool2d(known, size)
+    mean = F.adaptive_avg_pool2d(torch.nan_to_num(flow.float(), 0, 0, 0) * known, size) / share
     scale = mean.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])[:, None, None]
     return torch.where(share > 0, mean * scale, torch.nan)

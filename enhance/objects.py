@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.colour import LUMA
-from enhance.shade import ShadeNet
+from enhance.shade import DOWN, SEEN, ShadeNet, at_most
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
 """How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
@@ -70,14 +70,31 @@ class Box:
     def places(self, where: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
         """Of the N pixels that are True in bool `[h, w]` of the outer part: places `[N, 2]` down and across the box, -1..1 within it; and
         their rows and columns in the frame."""
-        y, x = where.nonzero().unbind(1)
+        return self._at(*where.nonzero().unbind(1))
+
+    def ground(self, free: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        """The same of those that `read_ground` would read, at most SEEN."""
+        above = int((along(self.outer_rows, self.rows, free.device) <= DOWN[0]).sum())
+        found = free[above:].nonzero()
+        y, x = found[at_most(SEEN, len(found), free.device)].unbind(1)
+        return self._at(y + above, x)
+
+    def _at(self, y: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
         y, x = y + self.outer_rows.start, x + self.outer_columns.start
         return self.placed(y, x), (y, x)
 
     def placed(self, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         """Places `[N, 2]` in the box of rows and columns of the frame."""
-        sides = ((y, self.rows), (x, self.columns))
-        return torch.stack([(at + 0.5 - s.start) / (s.stop - s.start) * 2 - 1 for at, s in sides], -1)
+        return torch.stack([_share(y, self.rows), _share(x, self.columns)], -1)
+
+
+def along(part: slice, side: slice, device: torch.device) -> torch.Tensor:
+    """Places `[n]` of the pixels of `part` along a side of a box: -1 where that begins, 1 where it ends."""
+    return _share(torch.arange(part.start, part.stop, device=device), side)
+
+
+def _share(at: torch.Tensor, side: slice) -> torch.Tensor:
+    return (at + 0.5 - side.start) / (side.stop - side.start) * 2 - 1
 
 
 def boxes(instance: torch.Tensor) -> dict[int, Box]:
@@ -182,11 +199,22 @@ class _Round(nn.Module):
         self.mix = nn.MultiheadAttention(width, heads, batch_first=True)
         self.think = nn.Sequential(nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
 
-    def forward(self, x: torch.Tensor, tokens: torch.Tensor, unknown: torch.Tensor) -> torch.Tensor:
-        x = x + self.read(self.asked(x), tokens, tokens, key_padding_mask=unknown, need_weights=False)[0]
+    def forward(self, x: torch.Tensor, tokens: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+        x = x + _attended(self.read, self.asked(x), tokens, known)
         q = self.mixed(x)
-        x = x + self.mix(q, q, q, need_weights=False)[0]
+        x = x + _attended(self.mix, q, q)
         return x + self.think(self.thought(x))
+
+
+def _attended(layer: nn.MultiheadAttention, x: torch.Tensor, tokens: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
+    """The layer's own result for queries `[B, Q, C]` and tokens `[B, N, C]`, of which bool `[B, N]` are `known`; it would lay them out anew
+    before its products, which costs more than those."""
+    width, heads = layer.embed_dim, layer.num_heads
+    weight, bias = layer.in_proj_weight, layer.in_proj_bias
+    q = F.linear(x, weight[:width], bias[:width]).unflatten(-1, (heads, -1)).transpose(1, 2)
+    k, v = F.linear(tokens, weight[width:], bias[width:]).unflatten(-1, (2, heads, -1)).permute(2, 0, 3, 1, 4)
+    mask = None if known is None else known[:, None, None]
+    return layer.out_proj(F.scaled_dot_product_attention(q, k, v, mask).transpose(1, 2).flatten(2))
 
 
 class ObjectNet(nn.Module):
@@ -209,10 +237,10 @@ class ObjectNet(nn.Module):
     def forward(self, e: Evidence) -> torch.Tensor:
         seam = self.seam(torch.cat([e.seam.flatten(2), e.place], 2))
         tokens = torch.cat([seam, self.inside(e.inside), self.around(e.around), self.whole(e.whole)], 1)
-        unknown = F.pad(~e.known, (0, tokens.shape[1] - e.known.shape[1]), value=False)
+        known = F.pad(e.known, (0, tokens.shape[1] - e.known.shape[1]), value=True)
         x = self.questions.expand(len(tokens), -1, -1)
         for each in self.rounds:
-            x = each(x, tokens, unknown)
+            x = each(x, tokens, known)
         return self.last(self.head(x)).float()
 
 

@@ -46,7 +46,7 @@ def read_ground(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """Of sRGB `[N, 3]` of ground at `places` `[N, 2]` by an object: by knot the mean logarithm of its light against the median, its
     spread, and how much of the ground is there, `[READ]`."""
     near = (places[:, 0] > DOWN[0]).nonzero()[:, 0]
-    near = near[torch.arange(min(SEEN, len(near)), device=rgb.device) * len(near) // max(1, min(SEEN, len(near)))]
+    near = near[at_most(SEEN, len(near), rgb.device)]
     if len(near) == 0:
         return rgb.new_zeros(READ)
     light = torch.log(linear_from_srgb(rgb[near]).mean(-1) + DARKEST)
@@ -59,12 +59,24 @@ def read_ground(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return torch.cat([(mean * known).flatten(), (spread * known).flatten(), (counts / len(near) * 20).clamp_max(2).flatten()])
 
 
+def at_most(most: int, count: int, device: torch.device) -> torch.Tensor:
+    """Indices of `most` of `count`, evenly spaced; of all where they are no more."""
+    kept = min(most, count)
+    return torch.arange(kept, device=device) * count // max(1, kept)
+
+
 def optical_depth(places: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
     """At places `[B, N, 2]` (down and across the box) between the knots' `depths` `[B, KNOTS]`: `[B, N]`; of a trained network's it may
     be a little below 0."""
     down, across = (_hats(places[..., i], knots) for i, knots in enumerate((DOWN, ACROSS)))
     grid = depths.unflatten(-1, (down.shape[-1], across.shape[-1]))
     return torch.einsum("bnd,bdk,bnk->bn", down, grid, across)
+
+
+def optical_depths(y: torch.Tensor, x: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
+    """The same of one object `[KNOTS]` at all places of rows `y` `[h]` and columns `x` `[w]` of its box: `[h, w]`."""
+    down, across = _hats(y, DOWN), _hats(x, ACROSS)
+    return down @ depths.unflatten(0, (down.shape[1], across.shape[1])) @ across.T
 
 
 def shaded(rgb: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:

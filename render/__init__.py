@@ -6,8 +6,10 @@ import sys
 import types
 from typing import TYPE_CHECKING
 
-# OpenMP's idle workers would spin on the cores that Warp's threads need; it reads this once, when torch is loaded
+# OpenMP's idle workers would spin for milliseconds on the cores that Warp's threads need, and if they never spun, waking them would cost
+# as much as many an operation: they spin for some 60 microseconds, until the next one. It reads this once, when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("GOMP_SPINCOUNT", "30000")
 
 _HOME = {
     "rasterize": "rasterize",

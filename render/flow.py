@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
-from torch.nn import functional as F
 
-from render.kernels.flow import carry
-from render.launch import run, view
-from render.projection import moves, poses
+from render.kernels.flow import carry_kernel, see
+from render.kernels.lenses import LENS_FUNCTIONS
+from render.launch import run, stage, view
+from render.projection import moves, optics_of, poses
 from render.rays import camera_origins, camera_rays, readout
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -27,24 +27,21 @@ SECANTS = 6
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Each pixel's surface point in the other frame: points `[H, W, 3]` in that camera, flow `[H, W, 2]` in pixels, nan where the other
-    lens does not see, pixels `[H, W, 2]` there."""
+    """Each pixel's surface point in the other frame: flow float32 `[H, W, 2]` in pixels and pixels float64 `[H, W, 2]` there, nan where
+    the other lens does not see, and its depth there `[H, W]`, inf for the sky."""
 
-    other: Camera
-    points: torch.Tensor
     flow: torch.Tensor
     pixels: torch.Tensor
+    depth: torch.Tensor
 
     def visible(self, depth: torch.Tensor) -> torch.Tensor:
         """bool `[H, W]`: the point falls into the other image, and there `depth` `[H', W']` shows nothing nearer in all four pixels
         around it. Sky hides nothing and is hidden by all."""
-        height, width = depth.shape
-        corner = torch.floor(torch.nan_to_num(self.pixels, nan=-9.0).clamp(-9, 1e6) + 0.5).long()
-        around = F.max_pool2d(F.pad(depth[None, None], (1, 1, 1, 1), value=-torch.inf), 2, 1)[0, 0]  # of the pixels that meet in a corner
-        farthest = around[corner[..., 1].clamp(0, height), corner[..., 0].clamp(0, width)]
-        size = torch.tensor([width, height], device=depth.device)
-        inside = ((self.pixels >= 0) & (self.pixels <= size)).all(-1)
-        return inside & (farthest >= (1 - HIDES) * self.other.lens.depth(self.points))
+        seen = torch.empty(self.depth.shape, dtype=torch.bool, device=self.depth.device)
+        with stage(depth.device):
+            told = [view(self.pixels, wp.vec2d), view(self.depth, float), HIDES, view(depth.contiguous(), float), view(seen, wp.bool)]
+            run(see, seen.numel(), told, depth.device)
+        return seen
 
 
 def correspond(
@@ -61,24 +58,37 @@ def correspond(
     height, width = depth.shape
     part = (slice(corner[1], corner[1] + height), slice(corner[0], corner[0] + width))
     origins = camera_origins(camera)
-    sky = depth.isinf() | (instance < 0)
-    rays = camera_rays(camera)[part].to(device) * torch.where(sky, torch.ones_like(depth), depth)[..., None]
-    points = (origins[part] if origins.ndim == 3 else origins).to(device) + rays
-    out, pixels = _seen_in(other, points, _who(placed, instance, sky), _ways(placed, camera, there, other, part), camera.shutter)
-    flow = torch.where(other.lens.valid(out)[..., None], pixels - camera.lens.project(points), torch.nan).to(torch.float32)
-    pixels = torch.where(flow.isnan(), torch.nan, pixels)
-    return Correspondence(other, torch.where(sky[..., None], out * torch.inf, out), flow, pixels)
+    ways = _ways(placed, camera, there, other, part).to(device)
+    pixels = torch.empty(height, width, 2, dtype=torch.float64, device=device)
+    found = Correspondence(torch.empty(height, width, 2, device=device), pixels, torch.empty(height, width, device=device))
+    tensors = [
+        (camera_rays(camera), wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (depth.detach(), float),
+        (instance.to(torch.int32), int), (_places(placed, device), int), (ways, wp.mat44d), int(camera.shutter == "columns"),
+    ]  # fmt: skip
+    kept = [(t[0].to(device).contiguous(), t[1]) if isinstance(t, tuple) else t for t in tensors]
+    with stage(device):
+        told = [view(*t) if isinstance(t, tuple) else t for t in kept]
+        results = [view(found.pixels, wp.vec2d), view(found.flow, wp.vec2), view(found.depth, float)]
+        kernel, optics = carry_kernel(LENS_FUNCTIONS[other.lens.kind]), optics_of(other.lens)
+
+        def carried(share: torch.Tensor) -> torch.Tensor:
+            run(kernel, depth.numel(), [*told, view(share, wp.float64), optics, *results], device)
+            return found.pixels
+
+        _read_out(carried, other, torch.zeros_like(pixels[..., 0]), ways.shape[1] > 1)
+    return found
 
 
-def _who(placed: Sequence[Placed], instance: torch.Tensor, sky: torch.Tensor) -> torch.Tensor:
-    """int32 `[H, W]`: which of `placed` a pixel shows; behind them all, the sky."""
-    ids, order = torch.tensor([p.instance for p in placed], dtype=torch.int32, device=instance.device).sort()
-    found = order.to(torch.int32)[torch.searchsorted(ids, instance.contiguous()).clamp(max=len(ids) - 1)]
-    return found.where(~sky, len(placed))
+def _places(placed: Sequence[Placed], device: torch.device) -> torch.Tensor:
+    """int32: by instance, from -1, which of `placed` it is."""
+    places = torch.zeros(max(p.instance for p in placed) + 2, dtype=torch.int32)
+    for i, p in enumerate(placed):
+        places[p.instance + 1] = i
+    return places.to(device)
 
 
 def _ways(placed: Sequence[Placed], camera: Camera, there: Sequence[Placed], other: Camera, part: tuple[slice, slice]) -> torch.Tensor:
-    """float32 `[P + 1, C, R, 4, 4]`, composed in float64: for each of `placed`, and the sky, from this camera, as each of its R rows or
+    """float64 `[P + 1, C, R, 4, 4]`: for each of `placed`, and the sky, from this camera, as each of its R rows or
     columns in `part` is read out, to the other as coefficients of the powers of its readout's share; R and C are 1 where nothing moves."""
     sky = Placed(placed[0].gaussians, torch.eye(4, dtype=torch.float64))
     moved = {p.instance: p for p in there}
@@ -92,33 +102,27 @@ def _ways(placed: Sequence[Placed], camera: Camera, there: Sequence[Placed], oth
     local_from_cam = inverse(world_from_local) @ world_from_cam
     ways = (poses(other, then)[:, :, None] @ local_from_cam[:, None]).detach()
     ways[-1, ..., :3, 3] = 0  # it is infinitely far: only turning moves it
-    return ways.to(torch.float32)
+    return ways
 
 
-def _seen_in(other: Camera, points: torch.Tensor, who: torch.Tensor, ways: torch.Tensor, shutter: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points `[H, W, 3]` and pixels `[H, W, 2]` in `other` of this camera's points, by `ways` as of `_ways`."""
-    ways, points = ways.to(points.device).contiguous(), points.contiguous()
-    told = [view(points, wp.vec3), view(who, int), view(ways, wp.mat44), int(shutter == "columns")]
-
-    def at(share: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        carried = torch.empty_like(points)
-        run(carry, len(points), [*told, view(share.contiguous(), float), view(carried, wp.vec3)], points.device)
-        return carried, other.lens.project(carried)
-
-    before = torch.zeros_like(points[..., 0])
-    if ways.shape[1] == 1:
-        return at(before)
+def _read_out(carried: Callable[[torch.Tensor], torch.Tensor], other: Camera, share: torch.Tensor, moving: bool) -> None:
+    """Carry points to where they stand when `other` reads them out. carried: pixels `[H, W, 2]` at shares of the readout `[H, W]`, which
+    `share` is at first."""
+    at = carried(share)
+    if not moving:
+        return
     axis, extent = (0, other.width) if other.shutter == "columns" else (1, other.height)
 
     def missed(share: torch.Tensor) -> torch.Tensor:
-        return share - (at(share)[1][..., axis] / extent).clamp(0, 1)
+        return share - (carried(share)[..., axis] / extent).clamp(0, 1)
 
     # the share s of the readout with s = pixel(s) along the axis / extent, by secants; the pixel depends on it but weakly
-    share, missed_before = torch.full_like(before, 0.5), missed(before)
+    before, missed_before = share, share - (at[..., axis] / extent).clamp(0, 1)
+    share = torch.full_like(before, 0.5)
     for _ in range(SECANTS):
         now = missed(share)
         rise = (now - missed_before) / (share - before)
         # where the pixel runs with the shutter, or the last step was none, as if it stood still
         step = now / torch.where(torch.isfinite(rise) & (rise > 0.1), rise, torch.ones_like(rise))
         before, missed_before, share = share, now, (share - step).clamp(0, 1)
-    return at(share)
+    carried(share)

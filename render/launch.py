@@ -123,25 +123,30 @@ def stage(device: torch.device):
     """What is launched inside runs in order with torch: on its current CUDA stream, or on the CPU with the cores left to Warp.
 
     After every parallel operation torch's OpenMP workers spin for milliseconds on the cores that our bands need, which makes frames
-    several times slower. So torch's own small operations between launches stay on this thread. (OMP_WAIT_POLICY=passive, set before
-    torch is loaded, as the front door does, ends the spinning after the caller's operations too.)
+    several times slower. So torch's own small operations between launches stay on this thread. (What `render/__init__.py` sets before torch
+    is loaded ends the spinning after the caller's operations soon, too.)
     """
     if device.type == "cuda":
         # nothing runs on Warp's own stream that this one should wait for
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
             yield
         return
+    if _cores.staged:  # the outer stage has taken the cores
+        yield
+        return
     threads = torch.get_num_threads()
-    _cores.threads = threads
+    _cores.threads, _cores.staged = threads, True
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        _cores.staged = False
 
 
 class _Cores(threading.local):
     threads = 1
+    staged = False
 
 
 _cores = _Cores()

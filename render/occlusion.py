@@ -48,18 +48,10 @@ class Box:
 
 @dataclass(frozen=True)
 class Field:
-    """The part of the light that is blocked, `[Z, Y, X]` float32, over a box in the asset's frame."""
+    """The part of the light that is blocked, `[Z, Y, X]` float32, over a box in the asset's frame; nothing is beyond it."""
 
     blocked: torch.Tensor
     box: Box
-
-    def at(self, points: torch.Tensor) -> torch.Tensor:
-        """What is blocked `[...]` at points `[..., 3]`: trilinear, nothing beyond the box; below the ground as on it."""
-        low, high = self.box.low.to(points), self.box.high.to(points)
-        where = 2 * (points - low) / (high - low) - 1
-        where = torch.cat([where[..., :2], where[..., 2:].clamp_min(-1)], -1).reshape(1, 1, 1, -1, 3)
-        found = torch.nn.functional.grid_sample(self.blocked[None, None].to(points), where, align_corners=True, padding_mode="zeros")
-        return found.reshape(points.shape[:-1])
 
 
 def shadow_box(size: torch.Tensor, directions: torch.Tensor) -> Box:

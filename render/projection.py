@@ -132,16 +132,22 @@ def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -
         rotation, translation = poses[:, 0, :3, :3], poses[:, 0, :3, 3]
         eye = -(rotation.mT @ translation[..., None])[..., 0]
         return [view, torch.cat([rotation.flatten(1), translation, eye, instances], 1)]
-    optics = Optics()
-    optics.p = vec_params(*lens.params().tolist(), *([0.0] * (PARAMS - len(lens.params()))))
-    optics.cos_limit, optics.sin_limit = math.cos(lens.limit()), math.sin(lens.limit())
-    optics.period = float(lens.period()) if isinstance(lens, Equirectangular) else 0.0
+    optics = optics_of(lens)
     powers = torch.cat([poses[..., :3, :3].flatten(2), poses[..., :3, 3]], 2)
     powers = torch.nn.functional.pad(powers, (0, 0, 0, POWERS - powers.shape[1])).flatten(1)
     by_rows = settings.shutter != "columns"
     shutter = torch.tensor([by_rows, settings.height if by_rows else settings.width], dtype=torch.float64).expand(len(poses), 2)
     rows = [torch.cat([powers, shutter, instances, torch.full_like(instances, copy)], 1) for copy in range(copies)]
     return [view, optics, torch.cat(rows)]
+
+
+def optics_of(lens: Lens) -> Optics:
+    """A lens as kernels are told of it."""
+    optics = Optics()
+    optics.p = vec_params(*lens.params().tolist(), *([0.0] * (PARAMS - len(lens.params()))))
+    optics.cos_limit, optics.sin_limit = math.cos(lens.limit()), math.sin(lens.limit())
+    optics.period = float(lens.period()) if isinstance(lens, Equirectangular) else 0.0
+    return optics
 
 
 @lru_cache(maxsize=16)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,7 +22,7 @@ from scenes.scene import Scene
 from scenes.trajectory import Trajectory
 
 SEED = 0
-Finish = Callable[[Iterator[Frame]], Iterator[Frame]]
+Stages = Mapping[str, Callable[[Iterator[Frame]], Iterator[Frame]]]
 
 
 def record(
@@ -35,8 +35,8 @@ def record(
     height: int | None = None,
     keep: Sequence[str] = (),
     shadows: bool = True,
-    finish: Finish | None = None,
-    finish_needs: Sequence[str] = (),
+    stages: Stages | None = None,
+    needs: Sequence[str] = (),
     facts: dict | None = None,
     warnings: Sequence[str] = (),
     fps: float | None = None,
@@ -44,7 +44,8 @@ def record(
     """Render a clip to `path` (H.264) and its report to the same name with .json; return the report.
 
     keep: outputs that also go, frame by frame, into a folder of the same name: rgb as PNG, all others as .npy.
-    finish: what happens to the stream of frames before it is written, such as enhancement; finish_needs: outputs it reads.
+    stages: by name what happens to the stream of frames before it is written, such as enhancement, one after the other. needs: outputs
+    that they read.
     facts: what else the report should say. Frames are streamed, and all files appear together at the end or not at all.
     Existing files are replaced; whether they may be is the caller's question. A folder that is not one of kept frames is never
     replaced: FileExistsError.
@@ -56,10 +57,10 @@ def record(
     times = torch.tensor([c.time_us for c in cameras])
     fps = fps or frame_rate(times)
     watch = Stopwatch()
-    outputs = tuple(dict.fromkeys(("rgb", *keep, *finish_needs)))
+    outputs = tuple(dict.fromkeys(("rgb", *keep, *needs)))
     frames = watch.during("render", render_clip(scene, camera, shift, times, width, height, outputs, shadows))
-    if finish is not None:
-        frames = watch.during("enhance", finish(frames))
+    for name, work in (stages or {}).items():
+        frames = watch.during(name, work(frames))
 
     with ExitStack() as files:
         report_path = files.enter_context(atomic_file(path.with_suffix(".json")))

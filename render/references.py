@@ -15,11 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import warp as wp
 from torch.nn import functional as F
 
-from render.flow import correspond
+from render.flow import HIDES, correspond
 from render.frame import render_frame
 from render.frame_types import Frame
+from render.kernels.detail import Here, Other, add_photo, carry_over
+from render.launch import run, stage, view
 from render.rays import camera_rays
 from scenes.asset import Asset
 from scenes.camera import Camera
@@ -30,7 +33,7 @@ from scenes.scene import Scene
 READS = ("rgb", "alpha", "depth", "instance")
 """Outputs of the frames that references are found for."""
 
-PHOTOS = 3
+PHOTOS = 2
 """Photos that a view is given; a further one's score is where they fade to nothing."""
 
 NOISE = 0.2
@@ -41,6 +44,9 @@ PARALLAX = 0.15
 
 NEAR, SPEED = 0.5, 2.0
 """Metres that are near, and metres a second: a photo of another moment counts as farther by what may have moved since."""
+
+SPACING = 1.3
+"""Metres, by the same measure, between photos that are enough for a view from farther off than that: each costs a render."""
 
 FARTHEST = 200.0
 """Metres at which the sky is taken to be when photos are chosen."""
@@ -78,7 +84,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A view from which detail is moved: its camera, the detail `[1, C, H, W]`, depth `[H, W]`, inf at the sky, instances `[H, W]` by the
+    """A view from which detail is moved: its camera, the detail `[H, W, 4]`, depth `[H, W]`, inf at the sky, instances `[H, W]` by the
     frames' ids, and what was placed there by those ids."""
 
     camera: Camera
@@ -89,10 +95,10 @@ class _Seen:
 
     @classmethod
     def of(cls, frame: Frame, detail: torch.Tensor, instance: torch.Tensor, placed: list[Placed]) -> _Seen:
-        """Of a frame with its detail `[H, W, C]`."""
+        """Of a frame with its detail `[H, W, 4]`."""
         assert frame.depth is not None and frame.instance is not None
         depth = torch.where(frame.instance < 0, torch.inf, frame.depth)
-        return cls(frame.camera, detail.permute(2, 0, 1)[None], depth, instance, placed)
+        return cls(frame.camera, detail.contiguous(), depth, instance.to(torch.int32), placed)
 
 
 class References:
@@ -109,6 +115,12 @@ class References:
         self.alike: dict[tuple, list[int]] = {}
         for i, shot in enumerate(shots):
             self.alike.setdefault((shot.camera.lens.key(), shot.camera.width, shot.camera.height), []).append(i)
+        self.spare = torch.zeros(len(shots), dtype=torch.bool)
+        for indices in self.alike.values():
+            last = indices[0]
+            for i in indices[1:]:
+                self.spare[i] = self._off(shots[i].camera)[last] < SPACING
+                last = last if self.spare[i] else i
         self.kept: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
 
     @torch.no_grad()
@@ -124,32 +136,26 @@ class References:
             placed, clear = self.shown.placed(frame.camera.time_us), ~_mixed(frame)
             detail = self._detail(frame, placed, clear, predicted[i:])
             if last is not None:
-                carried, shown = _moved(frame, placed, clear, last)
-                detail = torch.lerp(detail, carried, CARRIED * shown[..., None])
+                _run_over(carry_over, frame, placed, clear, last, [CARRIED, (detail, wp.vec4)])
             last = _Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
             difference, trust = detail[..., :3], detail[..., 3].clamp(0, 1)  # where it was carried, a cubic may overshoot
-            reference = frame.rgb + difference / trust.clamp_min(1e-9)[..., None]
-            yield replace(frame, reference=reference.clamp(0, 1), trust=trust)
+            reference = torch.addcdiv(frame.rgb, difference, trust.clamp_min(1e-9)[..., None])
+            yield replace(frame, reference=reference.clamp_(0, 1), trust=trust)
 
     def _detail(self, frame: Frame, placed: list[Placed], clear: torch.Tensor, predicted: Sequence[Camera]) -> torch.Tensor:
         """What the photos add to a frame, and how far that is to be trusted, `[H, W, 4]`: the former is weighted by the latter already."""
         assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
-        total, weight, squares = torch.zeros_like(frame.rgb), torch.zeros_like(frame.depth), torch.zeros_like(frame.depth)
-        distance = frame.depth * camera_rays(frame.camera).to(frame.depth).norm(dim=-1)
+        sums, squares = frame.rgb.new_zeros(*frame.rgb.shape[:2], 4), torch.zeros_like(frame.depth)
+        rays = camera_rays(frame.camera).to(frame.depth)
         for index, share in self.chosen(frame, predicted):
-            seen = self._seen(index, frame.camera.width, frame.rgb.device)
-            difference, shown = _moved(frame, placed, clear, seen)
-            baseline = (self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm().float()
-            parallax = torch.where(frame.instance < 0, 0.0, baseline / distance)
-            sure = share * shown / (NOISE + parallax / PARALLAX)
-            total += sure[..., None] * difference
-            squares += sure * difference.square().mean(-1)
-            weight += sure
+            baseline = float((self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm())
+            told = [share, NOISE, baseline / PARALLAX, (rays, wp.vec3), (frame.depth, float), (sums, wp.vec4), (squares, float)]
+            _run_over(add_photo, frame, placed, clear, self._seen(index, frame.camera.width, frame.rgb.device), told)
+        weight = sums[..., 3]
         some = weight.clamp_min(1e-9)
-        spread = squares / some - (total / some[..., None]).square().mean(-1)
-        spread = F.max_pool2d(spread[None, None], 3, 1, 1)[0, 0]
-        agree = torch.where(frame.instance < 0, torch.exp(-spread / APART**2), 1.0)
-        return torch.cat([total, weight[..., None]], -1) * (agree / (1 + weight))[..., None]
+        spread = squares / some - (sums[..., :3] / some[..., None]).square().mean(-1)
+        agree = torch.where(frame.instance < 0, torch.exp(_largest(spread, 1) / -(APART**2)), 1.0)
+        return sums * (agree / (1 + weight))[..., None]
 
     def chosen(self, frame: Frame, predicted: Sequence[Camera] = ()) -> list[tuple[int, float]]:
         """The shots that show most of a frame from nearby, best first, and a share of 0 to 1 for each; continuous along a path; none
@@ -183,10 +189,16 @@ class References:
             inside = (torch.minimum(pixels, side - pixels) / (BORDER * side) + 0.5).clamp(0, 1).prod(-1) * lens.valid(local)
             there = lens.focal()[0] / width / lens.depth(local).clamp_min(1e-6)
             shows[indices] = (inside * (there / detail).clamp_max(1)).mean(-1)
-        off = (self.eyes - camera.world_from_cam[:3, 3]).norm(dim=-1) + SPEED * 1e-6 * (self.times - camera.time_us).abs()
         for other in predicted:
             shows[((self.eyes - other.world_from_cam[:3, 3]).norm(dim=-1) < 1e-6) & (self.times == other.time_us)] = 0
+        off = self._off(camera)
+        nearest = float(off.where(shows > 0, torch.inf).min())
+        shows[self.spare] *= min(max(3 - 2 * nearest / SPACING, 0.0), 1.0)
         return shows / (NEAR + off)
+
+    def _off(self, camera: Camera) -> torch.Tensor:
+        """float64 `[S]`: metres from a camera to each shot, and what may have moved in the time between them."""
+        return (self.eyes - camera.world_from_cam[:3, 3]).norm(dim=-1) + SPEED * 1e-6 * (self.times - camera.time_us).abs()
 
     def _seen(self, index: int, width: int, device: torch.device) -> _Seen:
         """What a shot adds to the splats, at most as wide as the frames, so that nothing is skipped between its pixels."""
@@ -200,22 +212,24 @@ class References:
             photo = torch.from_numpy(np.array(shot.read(camera.width, camera.height))).to(device).float() / 255
             placed = [replace(p, instance=int(self.ids[p.instance])) for p in self.recorded.placed(camera.time_us)]
             instance = torch.where(_mixed(frame), GONE, self.ids.to(device)[frame.instance.long()])
-            self.kept[key] = _Seen.of(frame, photo - frame.rgb.clamp(0, 1), instance, placed)
+            self.kept[key] = _Seen.of(frame, F.pad(photo - frame.rgb.clamp(0, 1), (0, 1)), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:
             self.kept.popitem(last=False)
         return self.kept[key]
 
 
-def _moved(frame: Frame, placed: list[Placed], clear: torch.Tensor, seen: _Seen) -> tuple[torch.Tensor, torch.Tensor]:
-    """A view's detail as a frame sees it `[H, W, C]`, and where, if that is `clear`, it shows the same surface `[H, W]`, 0 or 1."""
+def _run_over(kernel: wp.Kernel, frame: Frame, placed: list[Placed], clear: torch.Tensor, seen: _Seen, told: list) -> None:
+    """Launch a kernel of `kernels/detail.py` over the pixels of a frame: from the view `seen` to those that are `clear`."""
     assert frame.depth is not None and frame.instance is not None
     found = correspond(placed, frame.camera, frame.depth, frame.instance, seen.placed, seen.camera)
-    side = torch.tensor([seen.camera.width, seen.camera.height], device=found.pixels.device)
-    grid = torch.nan_to_num(found.pixels / side * 2 - 1, nan=-9.0)[None].float()
-    moved = F.grid_sample(seen.detail, grid, mode="bicubic", padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
-    who = F.grid_sample(seen.instance[None, None].float(), grid, mode="nearest", padding_mode="border", align_corners=False)[0, 0]
-    return moved, (found.visible(seen.depth) & (who == frame.instance) & clear).float()
+    other, here, instance = Other(), Here(), frame.instance.to(torch.int32).contiguous()
+    with stage(clear.device):
+        other.detail, other.depth = wp.from_torch(seen.detail, wp.vec4), wp.from_torch(seen.depth)
+        other.instance = wp.from_torch(seen.instance)
+        here.pixels, here.depths = wp.from_torch(found.pixels, wp.vec2d), wp.from_torch(found.depth)
+        here.instance, here.clear = wp.from_torch(instance), wp.from_torch(clear, wp.bool)
+        run(kernel, clear.numel(), [other, here, HIDES, *(view(*t) if isinstance(t, tuple) else t for t in told)], clear.device)
 
 
 def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:
@@ -226,5 +240,11 @@ def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:
 def _mixed(frame: Frame) -> torch.Tensor:
     """Sky, bool `[H, W]`, before which wires and twigs stand or near which anything does."""
     assert frame.alpha is not None and frame.instance is not None
-    covered = F.max_pool2d((frame.alpha > COVERED).float()[None, None], 2 * RIM + 1, 1, RIM)[0, 0] > 0
-    return covered & (frame.instance < 0)
+    return (_largest((frame.alpha > COVERED).float(), RIM) > 0) & (frame.instance < 0)
+
+
+def _largest(image: torch.Tensor, around: int) -> torch.Tensor:
+    """Of `[H, W]` the largest value up to `around` pixels away, in rows and columns: one after the other, which is far less to compare."""
+    image = image[None, None]
+    image = F.max_pool2d(image, (1, 2 * around + 1), 1, (0, around))
+    return F.max_pool2d(image, (2 * around + 1, 1), 1, (around, 0))[0, 0]

@@ -16,8 +16,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
+import warp as wp
 
 from render.frame_types import Frame
+from render.kernels.shadow import Falling, fall
+from render.launch import run, stage, view
 from render.occlusion import Box, Field, shadow_box, squares, trace_field
 from render.rays import camera_rays
 from render.tracer import Blockers
@@ -74,28 +77,34 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
 
 
 def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
-    """The frame's rgb `[H, W, 3]`, darkened by the casters; needs rgb, depth and instance. Only their windows are touched."""
+    """The frame's rgb `[H, W, 3]`, darkened by the casters; needs rgb, depth and instance. Only what is in shadow is touched."""
     assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
     rgb = frame.rgb.clone()
     for caster in casters:
-        x0, y0, x1, y1 = caster.window
-        depth = frame.depth[y0:y1, x0:x1].detach()
-        pose = caster.asset_from_cam.to(depth.device, torch.float32)
-        rays = camera_rays(frame.camera)[y0:y1, x0:x1].to(depth.device) @ pose[:3, :3].T
-        down = rays[..., 2:].clamp_max(-1e-6)  # rays that rise never meet the plane: their point lies far off, where no shadow is
-        plane = pose[:3, 3] - (pose[2, 3] / down) * rays
-        seen = pose[:3, 3] + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))[..., None] * rays
-        height = seen[..., 2]
-        # within the footprint the depth mixes the asset with the ground that shows through it
-        own = (frame.instance[y0:y1, x0:x1] == caster.instance) | ((seen[..., :2].abs() < caster.half.to(seen)).all(-1) & (height > 0.1))
-        field = caster.field()
-        blocked = field.at(torch.where((own | (height < GROUND))[..., None], plane, seen))
-        receives = torch.where(own, _smooth(1 - height / SKIRT), torch.ones_like(height)) * torch.isfinite(depth)
-        light = (1 - receives * blocked)[..., None].to(rgb)
-        # without a shadow nothing is changed, not even by rounding
-        part = rgb[y0:y1, x0:x1]
-        rgb[y0:y1, x0:x1] = torch.where(light < 1, srgb_from_linear(linear_from_srgb(part) * light), part)
+        light = _light(frame, caster)
+        y, x = (light < 1).nonzero().unbind(1)
+        light = light[y, x, None]
+        y, x = y + caster.window[1], x + caster.window[0]
+        rgb[y, x] = srgb_from_linear(linear_from_srgb(rgb[y, x]) * light)
     return rgb
+
+
+def _light(frame: Frame, caster: Caster) -> torch.Tensor:
+    """What a caster leaves of the light that falls on what each pixel of its window shows."""
+    assert frame.depth is not None and frame.instance is not None
+    x0, y0, x1, y1 = caster.window
+    field, device = caster.field(), frame.depth.device
+    told = Falling()
+    told.pose, told.instance = wp.mat44(*caster.asset_from_cam.flatten().tolist()), caster.instance
+    told.half, told.ground, told.skirt = wp.vec2(*caster.half.tolist()), GROUND, SKIRT
+    told.low, told.high = wp.vec3(*field.box.low.tolist()), wp.vec3(*field.box.high.tolist())
+    light = torch.empty(y1 - y0, x1 - x0, device=device)
+    blocked, rays = field.blocked.to(device).contiguous(), camera_rays(frame.camera).to(device)
+    depth, instance = frame.depth.detach().contiguous(), frame.instance.contiguous()
+    with stage(device):
+        seen = [view(rays, wp.vec3), view(depth, float), view(instance, int), x0, y0, view(light, float)]
+        run(fall, light.numel(), [told, view(blocked, float), *seen], device)
+    return light
 
 
 def _placed_anew(actor: Actor) -> bool:
@@ -152,11 +161,6 @@ def _shade(scene: Scene) -> Shade:
     if not _last or _last[0].scene is not scene:
         _last[:] = [Shade(scene)]
     return _last[0]
-
-
-def _smooth(u: torch.Tensor) -> torch.Tensor:
-    u = u.clamp(0, 1)
-    return u * u * (3 - 2 * u)
 
 
 def _window(asset_from_cam: torch.Tensor, box: Box, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch.nn import functional as F
 
@@ -12,15 +14,24 @@ def warp(previous: torch.Tensor, flow_prev: torch.Tensor) -> tuple[torch.Tensor,
     flow_prev  `[B, 2, H, W]`, pixels of this grid: position in the previous frame minus position in this one, x right y down;
                where it is not finite nothing is known and the result is 0 and not inside
     """
-    b, _, h, w = previous.shape
-    known = torch.isfinite(flow_prev).all(1, keepdim=True)
-    flow = torch.where(known, flow_prev, 0).float()
-    y = torch.arange(h, device=flow.device, dtype=torch.float32)[:, None] + flow[:, 1]
-    x = torch.arange(w, device=flow.device, dtype=torch.float32) + flow[:, 0]
-    grid = torch.stack([(2 * x + 1) / w - 1, (2 * y + 1) / h - 1], -1)
-    inside = known & ((x > -0.5) & (x < w - 0.5) & (y > -0.5) & (y < h - 0.5))[:, None]
+    h, w = previous.shape[-2:]
+    total = flow_prev[:, :1] + flow_prev[:, 1:]
+    known = total - total == 0
+    scale = flow_prev.new_tensor([2 / w, 2 / h], dtype=torch.float32)
+    flow = torch.nan_to_num(flow_prev, 0, 0, 0).permute(0, 2, 3, 1).float()
+    grid = torch.addcmul(_centres(h, w, flow.device), flow, scale)
+    x, y = grid[:, None].unbind(-1)
+    inside = known & (torch.maximum(x.abs(), y.abs()) < 1)
     moved = F.grid_sample(previous.float(), grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return torch.where(inside, moved, 0).to(previous.dtype), inside.to(previous.dtype)
+    inside = inside.to(moved.dtype)
+    return (moved * inside).to(previous.dtype), inside.to(previous.dtype)
+
+
+@lru_cache(maxsize=8)
+def _centres(height: int, width: int, device: torch.device) -> torch.Tensor:
+    """Pixel centres `[H, W, 2]`, x and y from -1 to 1 across the image; shared, not to be written to."""
+    y, x = ((2 * torch.arange(n, device=device, dtype=torch.float32) + 1) / n - 1 for n in (height, width))
+    return torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1)
 
 
 def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance: float = 1.0) -> torch.Tensor:

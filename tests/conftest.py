@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the front door does, before anything loads torch
+import render  # noqa: F401 - says how OpenMP's workers wait, before anything loads torch
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -1,28 +1,86 @@
-"""Points of a picture, carried to where they stand for another camera."""
+"""Where what a pixel shows stands for another camera, and what of a picture there it sees."""
+
+from functools import cache
 
 import warp as wp
 
+from render.kernels.lenses import ROUND, LensFunctions
+from render.kernels.lenses.optics import Optics
 from render.kernels.types import OPTIONS
 
 wp.set_module_options(OPTIONS)
 
 
-@wp.kernel
-def carry(
-    points: wp.array2d[wp.vec3], who: wp.array2d[int], ways: wp.array3d[wp.mat44], by_columns: int, shares: wp.array2d[float],
-    carried: wp.array2d[wp.vec3],
-    first: int,
-):  # fmt: skip
-    """ways[who, k, line]: coefficient of the k-th power of the share; the line is the pixel's row or column where each has its own."""
-    row = first + wp.tid()
-    powers = ways.shape[1]
-    for column in range(points.shape[1]):
+@cache
+def carry_kernel(lens: LensFunctions) -> wp.Kernel:
+    """The kernel that carries the surface points of a picture to where they stand for another camera, which has this lens."""
+    pixel, around = lens.pixel, lens.depth == ROUND
+
+    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
+    def carry(
+        rays: wp.array2d[wp.vec3], origins: wp.array2d[wp.vec3], left: int, top: int,
+        depth: wp.array2d[float], instance: wp.array2d[int], place: wp.array[int],
+        ways: wp.array3d[wp.mat44d], by_columns: int, shares: wp.array2d[wp.float64], optics: Optics,
+        pixels: wp.array2d[wp.vec2d], flow: wp.array2d[wp.vec2], depths: wp.array2d[float],
+        first: int,
+    ):  # fmt: skip
+        """ways[place[instance], k, line]: coefficient of the k-th power of the share; the line is the pixel's row or column where each
+        has its own. The last of the ways is the sky's, which only turns. depths: the points' own in the other camera, inf for the sky."""
+        item = first + wp.tid()
+        width = depth.shape[1]
+        row = item // width
+        column = item - row * width
+        powers = ways.shape[1]
         line = int(0)
         if ways.shape[2] > 1:
             line = wp.where(by_columns != 0, column, row)
-        i = who[row, column]
-        p = points[row, column]
+        ray = wp.vec3d(rays[top + row, left + column])
+        i = place[wp.max(instance[row, column], -1) + 1]
+        sky = instance[row, column] < 0 or depth[row, column] == wp.inf
+        if sky:
+            i = ways.shape[0] - 1
+        else:
+            ray = wp.float64(depth[row, column]) * ray
+        start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
+        p = start + ray
         v = wp.transform_point(ways[i, powers - 1, line], p)
         for k in range(1, powers):
             v = wp.transform_point(ways[i, powers - 1 - k, line], p) + shares[row, column] * v
-        carried[row, column] = v
+        distance = wp.length(v)
+        to = wp.vec2d(wp.float64(wp.nan), wp.float64(wp.nan))
+        if v[2] > optics.cos_limit * distance and wp.length_sq(ray) > wp.float64(0.0):
+            to = pixel(optics, v)
+        pixels[row, column] = to
+        here = wp.vec2d(wp.float64(left + column) + wp.float64(0.5), wp.float64(top + row) + wp.float64(0.5))
+        flow[row, column] = wp.vec2(to - here)
+        far = v[2]
+        if wp.static(around):
+            far = distance
+        depths[row, column] = wp.where(sky, wp.inf, float(far))
+
+    return carry
+
+
+@wp.func
+def shows(at: wp.vec2d, depth: float, hides: float, there: wp.array2d[float]):
+    """Whether a point at `depth` falls into the picture `there`, whose four pixels around it show nothing nearer by `hides`."""
+    far = float(-wp.inf)
+    zero = wp.float64(0.0)
+    if at[0] >= zero and at[1] >= zero and at[0] <= wp.float64(there.shape[1]) and at[1] <= wp.float64(there.shape[0]):
+        x = int(at[0] + wp.float64(0.5))
+        y = int(at[1] + wp.float64(0.5))
+        for v in range(wp.max(y - 1, 0), wp.min(y + 1, there.shape[0])):
+            for u in range(wp.max(x - 1, 0), wp.min(x + 1, there.shape[1])):
+                far = wp.max(far, there[v, u])
+    return far >= (1.0 - hides) * depth
+
+
+@wp.kernel
+def see(
+    pixels: wp.array2d[wp.vec2d], depths: wp.array2d[float], hides: float, there: wp.array2d[float], seen: wp.array2d[wp.bool], first: int
+):
+    item = first + wp.tid()
+    width = pixels.shape[1]
+    row = item // width
+    column = item - row * width
+    seen[row, column] = shows(pixels[row, column], depths[row, column], hides, there)

@@ -2,7 +2,7 @@
 
     python -m tests.bench.enhance [--size 640x360] [--size 1024x576] [--repeat 9] [--clock cpu] [--plot enhance.png]
 
-The last of six frames of the bundled drive, shot two metres to the left with two inserted cars. The error is to the frame that the same
+The last of twelve frames of the bundled drive, shot two metres to the left with two inserted cars. The error is to the frame that the same
 weights give in float32, with all tiles and all of the history, in levels of 255.
 """
 
@@ -28,7 +28,8 @@ from scenes.placement import parse_placement
 from tests.bench.measure import CLOCKS, in_turns
 from tests.bench.plot import Chart, save
 
-FRAMES = 6
+FRAMES = 12
+"""By the last of them all objects have been looked at as often as they are at first."""
 SHARES = (0.5, 0.75)
 READS = tuple(name for name in Enhancer.reads if name != "reference")
 

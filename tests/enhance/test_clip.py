@@ -60,9 +60,10 @@ def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
 def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
     save_net(Net(SMALL), tmp_path / "untrained.safetensors", {})
     bright = [Shot(street.camera("front_camera", int(t)), lambda w, h: np.full((h, w, 3), 255, np.uint8)) for t in times(street)]
-    finish, reads = enhancement(str(tmp_path / "untrained.safetensors"), references=References(bright, street))
+    stages, reads = enhancement(str(tmp_path / "untrained.safetensors"), references=References(bright, street))
     frames = list(render_clip(street, "front_camera", 0.5, times(street)[:3], outputs=reads))
-    for before, after in zip(frames, finish(iter(frames)), strict=True):
+    for before, after in zip(frames, stages["enhance"](stages["references"](iter(frames))), strict=True):
         assert after.rgb.mean() > before.rgb.mean() + 0.2
     without, fewer = enhancement(str(tmp_path / "untrained.safetensors"))
-    assert set(fewer) < set(reads) and torch.equal(next(without(iter(frames))).rgb, frames[0].rgb.clamp(0, 1))
+    assert list(without) == ["enhance"]
+    assert set(fewer) < set(reads) and torch.equal(next(without["enhance"](iter(frames))).rgb, frames[0].rgb.clamp(0, 1))

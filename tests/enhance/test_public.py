@@ -400,8 +400,8 @@ def test_a_huge_model_says_so_before_it_begins(harmonizer, monkeypatch, capsys):
 def test_nothing_is_rendered_for_a_model_that_looks_at_pictures_only(harmonizer):
     from enhance.clip import enhancement
 
-    finish, outputs = enhancement(str(harmonizer), references=object())  # photos that it would not look at are not looked up
-    assert outputs == () and Enhancer.load("builtin").reads == ("flow_prev", "instance", "reference")
+    stages, outputs = enhancement(str(harmonizer), references=object())  # photos that it would not look at are not looked up
+    assert list(stages) == ["enhance"] and outputs == () and Enhancer.load("builtin").reads == ("flow_prev", "instance", "reference")
 
 
 def test_a_clip_is_enhanced_by_any_of_them(harmonizer, tmp_path):

@@ -18,11 +18,14 @@ from render.compositing import draw, draw_backward
 from render.frame_types import RenderConfig
 from render.frames import canonical_frames
 from render.kernels import bin as bin_kernels
+from render.kernels import flow as flow_kernels
 from render.kernels import project as project_kernels
 from render.kernels import settled as settled_kernels
+from render.kernels import shadow as shadow_kernels
 from render.kernels import trace as trace_kernels
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.composite_cuda_order import order_blocks, order_blocks_gradient
+from render.kernels.flow import carry_kernel
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.project_lens import lens_kernels
 from render.kernels.ray_rows import GROUP
@@ -48,6 +51,9 @@ KERNELS = {
     "bin": lambda: bin_kernels.emit_pairs,
     "descent": lambda: descent_kernels.descend,
     "develop": lambda: develop_kernels.develop_backward,
+    "carry": lambda: carry_kernel(LENS_FUNCTIONS["fisheye"]),
+    "see": lambda: flow_kernels.see,
+    "shadow": lambda: shadow_kernels.fall,
     "sight": lambda: sight_kernels.mark,
     "settled": lambda: settled_kernels.settle,
     "composite": lambda: composite_blocks(EVERYTHING, False, False, TILE),

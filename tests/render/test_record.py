@@ -60,10 +60,10 @@ def test_frames_are_finished_on_their_way(street, tmp_path):
 
     times = street.frame_times("front_camera")[:2]
     record(street, "front_camera", tmp_path / "a.mp4", times_us=times)
-    report = record(street, "front_camera", tmp_path / "b.mp4", times_us=times, finish=invert, finish_needs=("alpha",))
+    report = record(street, "front_camera", tmp_path / "b.mp4", times_us=times, stages={"invert": invert}, needs=("alpha",))
     a, b = (next(iter(read_video(tmp_path / name))) for name in ("a.mp4", "b.mp4"))
     assert (a + b - 1).abs().mean() < 0.03
-    assert "enhance" in report["ms_per_frame"]
+    assert {"render", "invert", "write"} == set(report["ms_per_frame"])
 
 
 def test_a_failure_on_the_way_leaves_nothing(street, tmp_path):
@@ -72,7 +72,7 @@ def test_a_failure_on_the_way_leaves_nothing(street, tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        record(street, "front_camera", tmp_path / "out.mp4", keep=("depth",), finish=fail)
+        record(street, "front_camera", tmp_path / "out.mp4", keep=("depth",), stages={"fail": fail})
     assert os.listdir(tmp_path) == []
 
 
