@@ -7,7 +7,7 @@ import warp as wp
 
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.composite_cuda_order import MOST_SPLATS, order_blocks, order_blocks_gradient
-from render.kernels.ray_rows import FRAME
+from render.kernels.frames import FRAME
 from render.kernels.types import TILE, Window
 from render.launch import run_blocks, view
 from render.order import TileLists

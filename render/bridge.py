@@ -9,6 +9,7 @@ import warp as wp
 
 from render.compositing import Picture, draw, draw_backward
 from render.kernels.bin import REACH_INTS
+from render.kernels.frames import FRAME, make_frames
 from render.kernels.types import ITEM, MEDIAN, RECORD, WHO
 from render.launch import run_each, stage, upload, view
 from render.order import depth_order
@@ -35,6 +36,11 @@ def _threads(device: torch.device) -> int:
     return ITEM if device.type == "cuda" else 1
 
 
+def _copied(per_splat: torch.Tensor, copies: int) -> torch.Tensor:
+    """`[N, C]` for records of as many copies."""
+    return per_splat.contiguous() if copies == 1 else per_splat.repeat(copies, 1)
+
+
 def prepare(settings: Settings, seen, poses: torch.Tensor, lens: torch.Tensor, fields) -> tuple[Work, list, torch.Tensor]:
     """What the host finds out before the device begins: arguments as of `Rasterize`; the work, and what its kernels are told: of all poses
     together, and of each as rows, still on the host."""
@@ -53,7 +59,15 @@ def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, featur
     out = [view(records, float), view(reach, int), view(keys, int), view(counts, int)]
     jobs = [(len(g.items) * _threads(device), [*_arrays(g.fields), *_told(told, rows, g.items), *out]) for g in todo.groups]
     run_each(ways.forward, jobs, device)
-    per_record, frames = (None if t is None else t.contiguous().repeat(ways.copies, 1) for t in (features, frames))
+    per_record, frames = (None if t is None else _copied(t, ways.copies) for t in (features, frames))
+    if frames is None and settings.by_rays:
+        frames = torch.empty(todo.records, FRAME, dtype=torch.float64, device=device)
+        looks = upload(torch.tensor(settings.looks * ways.copies, dtype=torch.int32), device)
+        told_of_frames = [view(looks, int), view(counts, int), view(frames, wp.float64)]
+        jobs = [
+            (n, [*_arrays(g.fields)[:3], *_told([], rows, g.items), *told_of_frames]) for (n, _), g in zip(jobs, todo.groups, strict=True)
+        ]
+        run_each(make_frames, jobs, device)
     scene = Projected(records, reach, counts, depth_order(keys), per_record, frames, rays)
     return scene, draw(settings, scene)
 
@@ -72,9 +86,9 @@ class Rasterize(torch.autograd.Function):
     """The kernels behind `rasterize`, which calls this inside a `stage`.
 
     (settings, items seen of each instance as `work` takes them, poses [P, C, 4, 4] f64 as `projection.poses`, lens parameters f64,
-    features [N, C] of all splats or None, canonical frames [N, FRAME] and rays [H, W, 3] or None where pixels do not look along their own
-    rays, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w, sums of w features [C, H, W], median depth (0 where there
-    is none), instance.
+    features [N, C] of all splats or None, canonical frames [N, FRAME] where these have gradients, rays [G, C, H, W] where pixels look
+    along their own, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w, sums of w features [C, H, W], median depth (0
+    where there is none), instance.
 
     The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
     """

@@ -75,7 +75,8 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     device = scene.records.device
     sums = Sums(scene.counts) if len(parts) > 1 else None
     g_features = None if scene.features is None else torch.zeros_like(scene.features)
-    g_frames = None if scene.frames is None else torch.zeros_like(scene.frames, dtype=torch.float32)
+    by_frames = scene.frames is not None and settings.model.response == "ray"  # an order has no gradient
+    g_frames = torch.zeros_like(scene.frames, dtype=torch.float32) if by_frames else None  # type: ignore[arg-type]
     g_rays = None if scene.rays is None else torch.zeros_like(scene.rays)
     wanted = [g if g.ndim == 3 else g[None] for g in gradients if g is not None]
     if settings.mask is not None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
@@ -40,11 +39,6 @@ def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> lis
 
 def _of_items(clusters: torch.Tensor, splats: int) -> torch.Tensor:
     return clusters.repeat_interleave(CLUSTER // ITEM)[: -(-splats // ITEM)]
-
-
-def those_in_sight(placed: Sequence[Placed], seen: Sequence[torch.Tensor | None]) -> list[Placed]:
-    """Copies of `placed` without what is not seen."""
-    return [replace(p, gaussians=p.gaussians.select(splats_in_sight([p], [s]))) for p, s in zip(placed, seen, strict=True)]
 
 
 def splats_in_sight(placed: Sequence[Placed], seen: Sequence[torch.Tensor | None]) -> torch.Tensor:

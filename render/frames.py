@@ -1,17 +1,11 @@
-"""Splats in the canonical frame where each is the unit Gaussian: what a ray needs to know of them."""
+"""Splats in the canonical frame where each is the unit Gaussian: what a ray needs to know of them, with gradients."""
 
 from __future__ import annotations
 
 import torch
 
-from render.kernels.ray_rows import FRAME
+from render.kernels.frames import FARTHEST, FRAME, THINNEST
 from scenes.gaussians import Gaussians
-
-THINNEST = -100.0
-"""ln metres: an axis is taken to be no shorter, so that squares of squares stay within float64."""
-
-FARTHEST = 1e60
-"""In a splat's own scales: one whose centre is further from the eye, or not a number, is met by no ray."""
 
 
 def canonical_frames(gaussians: Gaussians, cam_from_local: torch.Tensor, group: int = 0) -> torch.Tensor:

@@ -126,7 +126,7 @@ def projection(lens: type[Lens], rolling: bool) -> Projection:
 
 def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -> list:
     """What the kernels of `projection` are told of the camera and, as rows, of all instances with `poses` `[P, C, 4, 4]`."""
-    view = _view(replace(settings, mask=None, instances=(), room=None), lens)  # a key that is kept must not keep a mask
+    view = _view(replace(settings, mask=None, instances=(), looks=(), room=None), lens)  # a key that is kept must not keep a mask
     instances = torch.tensor(settings.instances, dtype=torch.float64)[:, None]
     if isinstance(lens, Pinhole) and not settings.rolling:
         rotation, translation = poses[:, 0, :3, :3], poses[:, 0, :3, 3]

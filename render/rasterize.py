@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import overload
 
@@ -11,7 +11,7 @@ import torch
 from render.bands import without_zero_bands
 from render.bridge import Rasterize
 from render.channels import Features, channel_fields, unit
-from render.cull import differentiated, in_sight, splats_in_sight, those_in_sight
+from render.cull import differentiated, in_sight, splats_in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
 from render.frames import canonical_frames
@@ -122,9 +122,12 @@ def _draw(
     )
     frames = rays = None
     if settings.by_rays:
-        if seen is not None:  # what each splat has for this is dear, and not made for those that nobody sees
-            placed, seen = those_in_sight(placed, seen), None
-        frames, rays = _along_rays(placed, camera, settings)
+        # all gradients of response "ray" go by these; an order has none
+        along = model.response == "ray" and seen is None
+        with torch.set_grad_enabled(along and torch.is_grad_enabled()):
+            rays, looks = exact_rays(camera, placed, settings.rolling)
+            rays, settings = on_device(rays, placed[0].gaussians.device), replace(settings, looks=tuple(looks))
+            frames = torch.cat([canonical_frames(*one) for one in _in_camera(placed, camera, looks)]) if along else None
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
     lens = camera.lens.params()
     drawn = Rasterize.apply(settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
@@ -162,14 +165,10 @@ def picture_of(settings: Settings, background, rgb, alpha, z, weights, sums, med
     return frame
 
 
-def _along_rays(placed: list[Placed], camera: Camera, settings: Settings) -> tuple[torch.Tensor, torch.Tensor]:
-    """The splats' canonical frames and the camera's rays, which hold all gradients of response "ray"; an order has none."""
-    with torch.set_grad_enabled(torch.is_grad_enabled() and settings.model.response == "ray"):
-        rays, groups = exact_rays(camera, placed, settings.rolling)
-        rays = on_device(rays, placed[0].gaussians.device)
-        cam_from_world = inverse(camera.world_from_cam)
-        there = [(p.gaussians, cam_from_world @ p.world_from_local, group) for p, group in zip(placed, groups, strict=True)]
-        return torch.cat([canonical_frames(*one) for one in there]), rays
+def _in_camera(placed: list[Placed], camera: Camera, looks: list[int]) -> Iterator[tuple[Gaussians, torch.Tensor, int]]:
+    cam_from_world = inverse(camera.world_from_cam)
+    for p, group in zip(placed, looks, strict=True):
+        yield p.gaussians, cam_from_world @ p.world_from_local, group
 
 
 def as_placed(splats) -> list[Placed]:

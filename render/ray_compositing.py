@@ -7,7 +7,8 @@ import warp as wp
 
 from render.kept import kept_beside
 from render.kernels.composite_rays import SUMS, composite_rays, composite_rays_gradient
-from render.kernels.ray_rows import FRAME, LISTS, lanes64
+from render.kernels.frames import FRAME
+from render.kernels.ray_rows import LISTS, lanes64
 from render.kernels.settled import settle
 from render.kernels.types import TILE, Window, lanes
 from render.launch import BANDS, run, view

@@ -19,7 +19,8 @@ class Settings:
     """Image size, model, config, what is wanted, each instance's id, lens type, and what the shutter does.
 
     crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask bool `[H, W]` of the whole
-    image: which pixels are drawn. gradients: whether any may be asked for, of anything. room: for tile lists whose length is not asked for.
+    image: which pixels are drawn. gradients: whether any may be asked for, of anything. looks: of each instance, which of the rays look
+    at it. room: for tile lists whose length is not asked for.
     """
 
     width: int
@@ -34,6 +35,7 @@ class Settings:
     crop: tuple[int, int, int, int] | None = None
     mask: torch.Tensor | None = None
     gradients: bool = True
+    looks: tuple[int, ...] = ()
     room: Room | None = None
 
     @property

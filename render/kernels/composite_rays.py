@@ -10,11 +10,10 @@ from functools import cache
 
 import warp as wp
 
+from render.kernels.frames import CENTRE, GROUP
 from render.kernels.lanewise import below
 from render.kernels.ray_rows import (
     ALPHA,
-    CENTRE,
-    GROUP,
     NONE,
     PICKED,
     SHADE,

@@ -8,7 +8,8 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.ray_rows import CENTRE, GROUP, LEAST, MOVED
+from render.kernels.frames import CENTRE, GROUP, MOVED
+from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     BLUE,
     G_BLUE,

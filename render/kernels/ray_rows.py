@@ -14,6 +14,7 @@ from functools import cache
 
 import warp as wp
 
+from render.kernels.frames import GROUP, MOVED
 from render.kernels.lanewise import below, cut
 from render.kernels.rows import exp_of, row_range
 from render.kernels.types import OPACITY, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
@@ -25,9 +26,6 @@ ALPHA, WEIGHT, PICKED, SHADE, THROUGH = (wp.constant(i) for i in range(5))
 the order: the light that reaches it."""
 LISTS = 5
 
-FRAME = 16
-"""Numbers of a splat's canonical frame: A row major, p, A p, and which rays look at it."""
-CENTRE, MOVED, GROUP = wp.constant(9), wp.constant(12), wp.constant(15)
 NONE = wp.constant(wp.float64(0.0))
 LEAST = wp.constant(wp.float64(1.0e-200))
 KEYS = wp.constant(wp.float64(2251799813685248.0))

@@ -13,8 +13,9 @@ from dataclasses import replace
 import torch
 
 from render import rasterize
-from render.cull import bounds, in_sight, those_in_sight
+from render.cull import bounds, in_sight, splats_in_sight
 from scenes.camera import Camera
+from scenes.gaussians import Placed
 from scenes.poses import pose_from
 from tests.bench.measure import timed
 from tests.bench.presets import street, uniform
@@ -24,6 +25,11 @@ def rig_of(camera: Camera, count: int) -> list[Camera]:
     """Cameras that look all around from one place."""
     turns = [pose_from([math.cos(math.pi * i / count), 0.0, math.sin(math.pi * i / count), 0.0], [0.0, 0.0, 0.0]) for i in range(count)]
     return [replace(camera, world_from_cam=camera.world_from_cam @ turn) for turn in turns]
+
+
+def those_in_sight(placed: list[Placed], seen: list[torch.Tensor | None]) -> list[Placed]:
+    """Copies of `placed` without what is not seen."""
+    return [replace(p, gaussians=p.gaussians.select(splats_in_sight([p], [s]))) for p, s in zip(placed, seen, strict=True)]
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from recon import open_log, reconstruct
 from recon.fit import FitConfig
 from render import RenderConfig, rasterize
 from render.budget import split
-from render.cull import in_sight, those_in_sight
+from render.cull import in_sight
 from render.frames import canonical_frames
 from render.kernels.types import Wanted
 from render.rays import exact_rays
@@ -19,6 +19,7 @@ from render.settings import Settings
 from scenes import Camera, Pinhole, Placed, SplatModel
 from scenes.poses import matrix_from_quat, translation
 from tests import oracle
+from tests.bench.culling import those_in_sight
 from tests.bench.presets import Missing, Preset, drive, presets, random_splats, uniform
 from tests.render.test_cuda import keep_forward
 from tests.render.test_lenses import LENSES, around, camera_of

@@ -7,11 +7,15 @@ import pytest
 import torch
 
 from render import RenderConfig, rasterize
+from render.frames import canonical_frames
+from render.kernels.types import Wanted
+from render.settings import Settings
 from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.lenses import Fisheye
-from scenes.poses import translation
+from scenes.poses import pose_from, translation
 from tests import oracle
 from tests.bench.presets import random_splats
+from tests.render.test_cuda import keep_forward
 from tests.render.test_lenses import LENSES, around, camera_of
 from tests.render.test_outputs import leaves
 from tests.render.test_rasterize import CAMERA, EXACT, assert_gradient, largest, two_instances
@@ -207,6 +211,22 @@ def test_extreme_splats_leave_image_and_gradients_finite(change, way):
     assert frame.rgb.isfinite().all() and frame.alpha.isfinite().all()
     frame.rgb.sum().backward()
     assert all(t.grad.isfinite().all() for t in g.tensors().values())
+
+
+def test_frames_made_for_an_order_are_those_that_gradients_go_by():
+    """By the kernel and by torch, of needles, of quaternions of any length, and of splats so thin that they are nowhere."""
+    g, pose = random_splats(60, 6), pose_from([0.9, 0.1, -0.2, 0.3], [0.1, 0.2, 5.0])
+    log_scales, quats = g.log_scales.clone(), 3 * g.quats
+    log_scales[:20, 1] = -12.0
+    log_scales[3, 0], log_scales[4], quats[5] = -250.0, float("-inf"), 0.0
+    g = replace(g, log_scales=log_scales, quats=quats)
+    settings = Settings(70, 50, SplatModel(), RenderConfig(order="pixel"), Wanted(), (0,), looks=(2,))
+    kept, _ = keep_forward(settings, g, pose, Pinhole(60.0, 62.0, 34.0, 22.0), rays=torch.ones(3, 3, 50, 70, dtype=torch.float64))
+    drawn = kept.scene.counts > 0
+    expected = canonical_frames(g, pose, 2)
+    assert drawn[:6].sum() > 3 and drawn.sum() > 40
+    off = (kept.scene.frames - expected)[drawn].abs()
+    assert (off <= 1e-12 * expected[drawn].abs().amax(1, keepdim=True)).all()
 
 
 def test_an_order_that_does_not_exist_is_refused():
