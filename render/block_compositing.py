@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from render.kernels.canonical import FRAME
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.composite_cuda_order import MOST_SPLATS, order_blocks, order_blocks_gradient
-from render.kernels.frames import FRAME
 from render.kernels.types import TILE, Window
 from render.launch import run_blocks, view
 from render.order import TileLists

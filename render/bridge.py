@@ -9,7 +9,7 @@ import warp as wp
 
 from render.compositing import Picture, draw, draw_backward
 from render.kernels.bin import REACH_INTS
-from render.kernels.frames import FRAME, make_frames
+from render.kernels.canonical import FRAME, make_frames
 from render.kernels.types import ITEM, MEDIAN, RECORD, WHO
 from render.launch import run_each, stage, upload, view
 from render.order import depth_order

@@ -10,11 +10,11 @@ import torch
 
 from render.bands import without_zero_bands
 from render.bridge import Rasterize
+from render.canonical import canonical_frames
 from render.channels import Features, channel_fields, unit
 from render.cull import differentiated, in_sight, splats_in_sight
 from render.flow import correspond
 from render.frame_types import Frame, RenderConfig
-from render.frames import canonical_frames
 from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs

@@ -6,8 +6,8 @@ import torch
 import warp as wp
 
 from render.kept import kept_beside
+from render.kernels.canonical import FRAME
 from render.kernels.composite_rays import SUMS, composite_rays, composite_rays_gradient
-from render.kernels.frames import FRAME
 from render.kernels.ray_rows import LISTS, lanes64
 from render.kernels.settled import settle
 from render.kernels.types import TILE, Window, lanes

@@ -19,7 +19,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import below, cut, greater, largest, least, lesser
-from render.kernels.rows import ROLLED, exp_of, rows_met
+from render.kernels.rows import ROLLED, corner_of, exp_of, rows_met
 from render.kernels.types import BLUE, GREEN, INSTANCE, MEDIAN, OPACITY, RED, S_MAX, TILE, WHO, K, Wanted, Window, Z, lanes
 
 BATCH = wp.constant(24)  # entries between looks for dark lanes: as many as a float's bits
@@ -52,11 +52,7 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
         column = columns[0]
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % window.tiles_x
-            ty = tile // window.tiles_x
-            row0 = ty * TILE
-            x0 = float((window.left + tx) * TILE) + 0.5
-            y0 = float((window.top + ty) * TILE) + 0.5
+            tx, row0, x0, y0 = corner_of(window, tile)
             start = tile_starts[tile]
             stop = tile_starts[tile + 1]
             for r in range(TILE):

@@ -11,7 +11,7 @@ import warp as wp
 
 from render.kernels.composite import BATCH, HELD, vec_rows
 from render.kernels.lanewise import before, cut, least, total, total_at
-from render.kernels.rows import ROLLED, exp_of, rows_met
+from render.kernels.rows import ROLLED, corner_of, exp_of, rows_met
 from render.kernels.types import (
     BLUE,
     G_BLUE,
@@ -79,11 +79,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
         one = lanes(1.0)
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
-            tx = tile % window.tiles_x
-            ty = tile // window.tiles_x
-            row0 = ty * TILE
-            x0 = float((window.left + tx) * TILE) + 0.5
-            y0 = float((window.top + ty) * TILE) + 0.5
+            tx, row0, x0, y0 = corner_of(window, tile)
             start = tile_starts[tile]
             stop = start
             row_last = vec_rows(start)

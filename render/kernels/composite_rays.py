@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.frames import CENTRE, GROUP
+from render.kernels.canonical import CENTRE, GROUP
 from render.kernels.lanewise import below
 from render.kernels.ray_rows import (
     ALPHA,
@@ -27,7 +27,7 @@ from render.kernels.ray_rows import (
     reach_of,
     square,
 )
-from render.kernels.rows import ROLLED
+from render.kernels.rows import ROLLED, corner_of
 from render.kernels.types import (
     BLUE,
     G_BLUE,
@@ -104,10 +104,7 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
             if elsewhere[tile] == 0:
-                tx = tile % window.tiles_x
-                row0 = (tile // window.tiles_x) * TILE
-                x0 = float((window.left + tx) * TILE) + 0.5
-                y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
+                tx, row0, x0, y0 = corner_of(window, tile)
                 start = tile_starts[tile]
                 stop = tile_starts[tile + 1]
                 reach_of(records, ids, start, stop, x0, y0, band, reach)
@@ -215,10 +212,7 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
         tiles = window.tiles_x * window.tiles_y
         for tile in range(band * tiles // bands, (band + 1) * tiles // bands):
             if elsewhere[tile] == 0:
-                tx = tile % window.tiles_x
-                row0 = (tile // window.tiles_x) * TILE
-                x0 = float((window.left + tx) * TILE) + 0.5
-                y0 = float((window.top + tile // window.tiles_x) * TILE) + 0.5
+                tx, row0, x0, y0 = corner_of(window, tile)
                 start = tile_starts[tile]
                 stop = tile_starts[tile + 1]
                 reach_of(records, ids, start, stop, x0, y0, band, reach)

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.frames import CENTRE, GROUP, MOVED
+from render.kernels.canonical import CENTRE, GROUP, MOVED
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     BLUE,

@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.frames import GROUP, MOVED
+from render.kernels.canonical import GROUP, MOVED
 from render.kernels.lanewise import below, cut
 from render.kernels.rows import exp_of, row_range
 from render.kernels.types import OPACITY, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes

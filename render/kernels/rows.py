@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import cut, greater, greatest, lesser
-from render.kernels.types import OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, X, Y, lanes
+from render.kernels.types import OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, Window, X, Y, lanes
 
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
@@ -41,6 +41,14 @@ def exp_of(squarings: int):
         return p
 
     return exp_minus
+
+
+@wp.func
+def corner_of(window: Window, tile: int):
+    """Where a window's tile begins: its column of tiles and its first row in the planes, and the first pixel's centre in the image."""
+    tx = tile % window.tiles_x
+    ty = tile // window.tiles_x
+    return tx, ty * TILE, float((window.left + tx) * TILE) + 0.5, float((window.top + ty) * TILE) + 0.5
 
 
 @wp.func

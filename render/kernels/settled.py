@@ -7,7 +7,7 @@ to float64's rounding, without looking at a pixel. Splats that face the camera, 
 
 import warp as wp
 
-from render.kernels.frames import GROUP, MOVED
+from render.kernels.canonical import GROUP, MOVED
 from render.kernels.types import OPTIONS, Window
 
 wp.set_module_options(OPTIONS)

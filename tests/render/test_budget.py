@@ -11,8 +11,8 @@ from recon import open_log, reconstruct
 from recon.fit import FitConfig
 from render import RenderConfig, rasterize
 from render.budget import split
+from render.canonical import canonical_frames
 from render.cull import in_sight
-from render.frames import canonical_frames
 from render.kernels.types import Wanted
 from render.rays import exact_rays
 from render.settings import Settings

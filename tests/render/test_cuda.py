@@ -13,21 +13,21 @@ from recon.kernels import sight as sight_kernels
 from render import block_compositing, rasterize
 from render.block_compositing import draw_blocks, draw_blocks_backward
 from render.bridge import Rasterize
+from render.canonical import canonical_frames
 from render.chunks import window
 from render.compositing import draw, draw_backward
 from render.frame_types import RenderConfig
-from render.frames import canonical_frames
 from render.kernels import bin as bin_kernels
+from render.kernels import canonical as canonical_kernels
 from render.kernels import flow as flow_kernels
-from render.kernels import frames as frames_kernels
 from render.kernels import project as project_kernels
 from render.kernels import settled as settled_kernels
 from render.kernels import shadow as shadow_kernels
 from render.kernels import trace as trace_kernels
+from render.kernels.canonical import GROUP
 from render.kernels.composite_cuda import composite_blocks, composite_blocks_gradient
 from render.kernels.composite_cuda_order import order_blocks, order_blocks_gradient
 from render.kernels.flow import carry_kernel
-from render.kernels.frames import GROUP
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.project_lens import lens_kernels
 from render.kernels.types import GRADIENTS, TILE, Wanted
@@ -56,7 +56,7 @@ KERNELS = {
     "see": lambda: flow_kernels.see,
     "shadow": lambda: shadow_kernels.fall,
     "sight": lambda: sight_kernels.mark,
-    "frames": lambda: frames_kernels.make_frames,
+    "frames": lambda: canonical_kernels.make_frames,
     "settled": lambda: settled_kernels.settle,
     "composite": lambda: composite_blocks(EVERYTHING, False, False, TILE),
     "composite backward": lambda: composite_blocks_gradient(EVERYTHING, False, False, TILE),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from render import RenderConfig, rasterize
-from render.frames import canonical_frames
+from render.canonical import canonical_frames
 from render.kernels.types import Wanted
 from render.settings import Settings
 from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel

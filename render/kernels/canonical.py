@@ -1,5 +1,7 @@
-"""Splats in the canonical frames where each is the unit Gaussian (`ray_rows.py`), for those that are drawn; `render/frames.py` has the same
-in torch, where gradients are wanted."""
+"""Splats in the canonical frames where each is the unit Gaussian (`ray_rows.py`), for those that are drawn.
+
+`render/canonical.py` makes the same in torch, where gradients are wanted.
+"""
 
 import warp as wp
 

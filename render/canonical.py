@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from render.kernels.frames import FARTHEST, FRAME, THINNEST
+from render.kernels.canonical import FARTHEST, FRAME, THINNEST
 from scenes.gaussians import Gaussians
 
 
