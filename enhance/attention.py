@@ -6,6 +6,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.precision import lower
+
 
 class Modulation(nn.Module):
     """Normalise, scale and shift tokens `[..., C]`, and gate a branch: adaptive layer norm at one fixed condition.
@@ -54,7 +56,8 @@ class TemporalAttention(nn.Module):
 
     def forward(self, x: torch.Tensor, history: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
         b, h, w, c = x.shape
-        seen = torch.cat([x[:, None], history], 1)
+        x = lower(x)  # as its layers would, each for itself
+        seen = torch.cat([x[:, None], history.to(x.dtype)], 1)
         m, d = seen.shape[1], c // self.heads
         k, v = self.key_value(seen).reshape(b, m, h, w, 2, self.heads, d).unbind(4)
         q = self.query(x).reshape(b, 1, h, w, self.heads, d)

@@ -22,6 +22,14 @@ def zero(layer: nn.Conv2d) -> None:
         nn.init.zeros_(parameter)
 
 
+def on_blocks(layer: nn.Conv2d, image: torch.Tensor, side: int) -> torch.Tensor:
+    """The 3 x 3 convolution `layer` of an image's blocks of `side` x `side` pixels (`F.pixel_unshuffle`), as one of the image itself with a
+    stride: laying out the blocks would take longer than convolving them."""
+    channels = image.shape[1]
+    weight = layer.weight.unflatten(1, (channels, side, side)).permute(0, 1, 4, 2, 5, 3).reshape(-1, channels, 3 * side, 3 * side)
+    return F.conv2d(image.contiguous(memory_format=torch.channels_last), weight, layer.bias, stride=side, padding=side)
+
+
 class Residual(nn.Module):
     """x + conv(silu(conv(silu(x)))): two 3 x 3 convolutions, the second zero at first, so a new block is the identity."""
 
@@ -48,8 +56,7 @@ class Encoder(nn.Module):
 
     def features(self, rgb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Features at a quarter `[B, 48, H/4, W/4]` and an eighth `[B, 96, H/8, W/8]` of the size, and the latents."""
-        blocks = F.pixel_unshuffle(lower(rgb * 2 - 1), 4).contiguous(memory_format=torch.channels_last)
-        quarter = self.quarter(self.stem(blocks))
+        quarter = self.quarter(on_blocks(self.stem, lower(rgb * 2 - 1), 4))
         eighth = self.eighth(self.down(F.silu(quarter)))
         return quarter, eighth, self.head(eighth)
 

@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.attention import SpatialBlock
-from enhance.autoencoder import Residual, zero
+from enhance.autoencoder import Residual, on_blocks, zero
 
 LONG = 160
 """Pixels of the thinned picture's longer side."""
@@ -51,8 +51,7 @@ class ColourNet(nn.Module):
         zero(self.head)
 
     def forward(self, rgb: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        x = F.pixel_unshuffle(torch.cat([rgb * 2 - 1, mask], 1), 2).contiguous(memory_format=torch.channels_last)
-        fine = self.fine(self.stem(x))
+        fine = self.fine(on_blocks(self.stem, torch.cat([rgb * 2 - 1, mask], 1), 2))
         middle = self.middle(self.down(F.silu(fine)))
         x = self.coarse(self.further(F.silu(middle))).permute(0, 2, 3, 1)
         for block in self.blocks:

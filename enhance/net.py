@@ -22,7 +22,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.attention import Block
-from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, zero
+from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, on_blocks, zero
 from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
 from enhance.objects import ObjectNet
 from enhance.past import Past
@@ -78,7 +78,7 @@ class Stem(nn.Module):
         self.token = nn.Conv2d(c.eighth, c.width, 2, stride=2)
 
     def forward(self, frame: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        half = F.silu(self.fine(F.pixel_unshuffle(frame, 2).contiguous(memory_format=torch.channels_last)))
+        half = F.silu(on_blocks(self.fine, frame, 2))
         quarter = self.quarter_block(self.quarter(half))
         eighth = self.eighth_block(self.eighth(F.silu(quarter)))
         return half, quarter, eighth, self.token(F.silu(eighth))
@@ -255,4 +255,4 @@ class Net(nn.Module):
         if k == 0:
             return past.latents.new_zeros(b, 0, h, w, self.config.width), past.valid.new_zeros(b, 0, h, w, dtype=torch.bool)
         tokens = self.embed(past.latents.flatten(0, 1)).permute(0, 2, 3, 1).reshape(b, k, h, w, -1) + self.age[:k, None, None]
-        return tokens, F.max_pool2d(1 - past.valid.flatten(0, 1).float(), PATCH).reshape(b, k, h, w) < 0.5
+        return lower(tokens), F.max_pool2d(1 - past.valid.flatten(0, 1).float(), PATCH).reshape(b, k, h, w) < 0.5
