@@ -1,4 +1,4 @@
-"""Does a long rollout drift? A video is enhanced forwards and backwards until 500 frames are done, each with what the last ones left."""
+"""Does a long rollout drift? Frames are enhanced forwards and backwards until 500 are done, each with what the last ones left."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from enhance.metrics import sharpness
 from enhance.step import Steps
+from render.frame_types import Frame
 from render.video import read_video
 
 FRAMES = 500
@@ -19,7 +20,7 @@ PART = 50
 """Frames that are compared: the first, and the same pictures when they come for the last time."""
 
 KEPT = 60
-"""Frames of the video that are held in memory."""
+"""Frames that are held in memory."""
 
 WIDTH = 640
 
@@ -34,15 +35,16 @@ class Drift:
     sharpness: float
 
 
-def drift(enhancer: Steps, video: str | Path, frames: int = FRAMES) -> Drift:
-    """Of a rollout over `frames` frames of a video, as plain RGB. ValueError where the video has fewer than two."""
-    pictures = [_shrunk(rgb) for rgb, _ in zip(read_video(video), range(KEPT), strict=False)]
+def drift(enhancer: Steps, pictures: Sequence[Frame | torch.Tensor], frames: int = FRAMES) -> Drift:
+    """Of a rollout over `frames` frames: as `of_video` has them, or told their objects. ValueError where there are fewer than two."""
     if len(pictures) < 2:
-        raise ValueError(f"{video} has fewer than two frames; give a longer video")
+        raise ValueError(f"a rollout takes two frames at least, got {len(pictures)}; give a longer video")
     found, memory = [], None
-    everywhere = torch.ones(pictures[0].shape[:2], dtype=torch.bool)
-    for rgb in _back_and_forth(pictures, frames):
-        better, memory = enhancer.step(rgb, memory)
+    for frame in _back_and_forth(pictures, frames):
+        rgb = frame.rgb if isinstance(frame, Frame) else frame
+        assert rgb is not None
+        everywhere = torch.ones(rgb.shape[:2], dtype=torch.bool)
+        better, memory = enhancer.step(frame, memory)
         before, after = rgb.mean((0, 1)), better.mean((0, 1))
         colour = (after / after.mean()) / (before / before.mean())
         sharp = sharpness(better, everywhere) / max(sharpness(rgb, everywhere), 1e-9)
@@ -55,7 +57,12 @@ def drift(enhancer: Steps, video: str | Path, frames: int = FRAMES) -> Drift:
     return Drift(float(change[0]), float(change[1:4].max()), float(change[4]))
 
 
-def _back_and_forth(pictures: Sequence[torch.Tensor], frames: int) -> Iterator[torch.Tensor]:
+def of_video(video: str | Path) -> list[torch.Tensor]:
+    """Its first frames, as plain RGB."""
+    return [_shrunk(rgb) for rgb, _ in zip(read_video(video), range(KEPT), strict=False)]
+
+
+def _back_and_forth(pictures: Sequence[Frame | torch.Tensor], frames: int) -> Iterator[Frame | torch.Tensor]:
     n = len(pictures)
     for i in range(frames):
         j = i % (2 * n - 2)
@@ -69,5 +76,5 @@ def _shrunk(rgb: torch.Tensor) -> torch.Tensor:
     return F.interpolate(rgb.permute(2, 0, 1)[None], (round(h * WIDTH / w), WIDTH), mode="area")[0].permute(1, 2, 0).contiguous()
 
 
-def drift_text(d: Drift) -> str:
-    return f"drift over the rollout: brightness {d.brightness:.2f} %, colour {d.colour:.2f} %, sharpness {d.sharpness:.2f} %"
+def drift_text(what: str, d: Drift) -> str:
+    return f"drift over {FRAMES} frames of {what}: brightness {d.brightness:.2f} %, colour {d.colour:.2f} %, sharpness {d.sharpness:.2f} %"

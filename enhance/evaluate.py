@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from enhance.drift import drift, drift_text
+from enhance.drift import KEPT, drift, drift_text, of_video
 from enhance.enhancer import Enhancer
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
@@ -178,6 +178,13 @@ def _frame(window: Window, t: int, told: bool, referenced: bool) -> Frame:
     return replace(frame, reference=window.reference[t].permute(1, 2, 0), trust=window.trust[t, 0])
 
 
+def _told(shards: Sequence[Shard]) -> list[Frame]:
+    """The first frames of one camera's clips, told their objects; without flow, which is only known one way."""
+    mine = [s for s in shards if s.meta.get("camera") == shards[0].meta.get("camera")]
+    frames = (_frame(shard.window(t, 1), 0, told=True, referenced=False) for shard in mine for t in range(shard.frames))
+    return [frame for frame, _ in zip(frames, range(KEPT), strict=False)]
+
+
 def table(rows: Sequence[Row]) -> str:
     """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips."""
     measures = ["PSNR in the region", "gain, dB (95 %)", "PSNR of the frame", "SSIM region / frame", "features", "warp error", "sharpness"]
@@ -210,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--beside", default=[], action="append", help="a public model's checkpoint as a further row; may be repeated")
     parser.add_argument("--limit", type=int, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
-    parser.add_argument("--rollout", type=Path, help="a video that is enhanced back and forth for 500 frames: what drifts?")
+    parser.add_argument("--rollout", type=Path, help="a video; it and told clean frames of the pairs, back and forth for 500: what drifts?")
     options = parser.parse_args(arguments)
     try:
         pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights)
@@ -218,7 +225,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
         if options.rollout:
-            print(drift_text(drift(enhancer, options.rollout)))
+            print(drift_text(options.rollout.name, drift(enhancer, of_video(options.rollout))))
+            print(drift_text("clean frames told their objects", drift(enhancer, _told(pairs.of("clean", options.split)))))
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

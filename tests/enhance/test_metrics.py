@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_net import SMALL, stirred
 
-from enhance.drift import drift
+from enhance.drift import drift, of_video
 from enhance.enhancer import Enhancer
 from enhance.metrics import feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.net import Net
@@ -70,7 +70,7 @@ def test_the_identity_does_not_drift_and_a_stirred_network_may(tmp_path):
     with VideoWriter(tmp_path / "v.mp4", 10, 48, 32) as video:
         for i in range(5):
             video.write(picture(i, 32, 48))
-    still = drift(Enhancer(Net(SMALL)), tmp_path / "v.mp4", frames=20)
+    still = drift(Enhancer(Net(SMALL)), of_video(tmp_path / "v.mp4"), frames=20)
     assert max(still.brightness, still.colour, still.sharpness) < 1e-6
-    other = drift(Enhancer(stirred()), tmp_path / "v.mp4", frames=20)
+    other = drift(Enhancer(stirred()), of_video(tmp_path / "v.mp4"), frames=20)
     assert np.isfinite([other.brightness, other.colour, other.sharpness]).all()

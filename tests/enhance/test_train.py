@@ -10,7 +10,7 @@ import torch
 from small_net import SMALL
 
 from enhance.enhancer import Enhancer
-from enhance.evaluate import METHODS, PHOTOS, evaluate, table
+from enhance.evaluate import METHODS, PHOTOS, _told, evaluate, table
 from enhance.net import Net
 from enhance.run import TrainConfig
 from enhance.shards import PairSet, to_bytes, write_shard
@@ -142,6 +142,11 @@ def test_a_broken_checkpoint_is_refused_by_name(pairs, trained, tmp_path, spoil)
     (tmp_path / "checkpoint.pt").write_bytes(spoil((trained / "checkpoint.pt").read_bytes()))
     with pytest.raises(ValueError, match="checkpoint.pt is not a checkpoint of this training"):
         train(pairs, tmp_path, steps=3, config=QUICK, net=SMALL, resume=True)
+
+
+def test_a_rollout_of_clean_pairs_is_told_its_objects(pairs):
+    frames = _told(pairs.of("clean", "held out"))
+    assert len(frames) == 3 and all(f.instance.max() == 0 and f.flow_prev is None for f in frames)
 
 
 def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
