@@ -9,7 +9,8 @@ Two splats change places where truth does, since their places along a ray are fo
 
 Proven, for every scene:
 
-- Termination at transmittance e/8: all that lies behind changes the pixel by less than that light, so by e/8 at most.
+- Termination at transmittance e/8: all that lies behind changes the pixel by less than that light, so by e/8 at most. What lies behind is
+  left out of the sort where so little passes the entries that are nearer than all of it (`lit` in `kernels/ray_rows.py`).
 - Clamp at 1 - e/16: the first clamped splat lets e/16 too much through, the next e/16 of that, and so on: below e/15 together.
 - exp by its polynomial (`kernels/rows.py`): off by 8e-7 of an opacity at most, at any argument (`tests/bench/accuracy.py`).
 - Tiles in which no two splats can change places are drawn in the tile's order, by its faster kernel: interval arithmetic over the tile's
