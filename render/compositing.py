@@ -42,6 +42,11 @@ class Slots:
     rays: torch.Tensor | None
 
 
+def by_blocks(device: torch.device) -> bool:
+    """Whether blocks of threads composite there, or lanes."""
+    return device.type == "cuda"
+
+
 def draw(settings: Settings, scene: Projected) -> Picture:
     """The picture, or the crop of it that is wanted."""
     x, y, width, height = settings.part
@@ -89,7 +94,7 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
         channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
         grads = _of_part(settings, part, wanted)
         frame_slots = None
-        if device.type == "cuda":
+        if by_blocks(device):
             frame_slots = draw_blocks_backward(settings, part, lists, scene, grads, slots, channel_slots, g_rays)
         elif g_rays is not None:
             settled, *ends = part.ends
@@ -160,7 +165,7 @@ def _composite(settings: Settings, w: Window, lists: TileLists, scene: Projected
     device = scene.records.device
     planes = _planes(w, settings.wanted.first_channel + scene.channels, device)
     picks = _planes(w, 2 if settings.wanted.picks else 0, device)
-    if device.type == "cuda":
+    if by_blocks(device):
         return planes, picks, draw_blocks(settings, w, lists, scene, planes, picks)
     if settings.by_rays:
         settled = settled_tiles(settings, w, lists, scene)
