@@ -231,7 +231,8 @@ def test_blocks_of_a_tiles_threads_draw_what_lanes_draw(way, monkeypatch):
     here, g_here = drawn(way, "cpu")
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     monkeypatch.setattr(compositing, "by_blocks", lambda device: True)
-    there, g_there = drawn(way, "cpu")
+    (there, g_there), (_, again) = drawn(way, "cpu"), drawn(way, "cpu")
+    assert all(torch.equal(a, b) for a, b in zip(g_there, again, strict=True)), "not the same bits twice"
     assert (here.rgb - there.rgb).abs().max() < 1e-3 and (here.rgb - there.rgb).abs().mean() < 1e-5
     for a, b in zip(g_here, g_there, strict=True):
         assert (a - b).abs().max() < 1e-3 * a.abs().max()
