@@ -149,7 +149,7 @@ def _measure(found: dict[str, list[float]], better: torch.Tensor, window: Window
     large = int(region.sum()) >= SMALLEST
     if large:
         found["region"].append(psnr(better, target, region))
-    if t % EVERY != EVERY - 1:
+    if t % EVERY != min(EVERY, len(window.input)) - 1:
         return
     found["ssim"].append(ssim(better, target))
     if not large:
