@@ -112,6 +112,7 @@ class References:
         self.ids = torch.tensor([0, *ids, -1])  # the last is the sky's, -1
         self.eyes = torch.tensor([s.camera.world_from_cam[:3, 3].tolist() for s in shots], dtype=torch.float64).reshape(-1, 3)
         self.times = torch.tensor([s.camera.time_us for s in shots])
+        self.back = [inverse(s.camera.world_from_cam) for s in shots]
         self.alike: dict[tuple, list[int]] = {}
         for i, shot in enumerate(shots):
             self.alike.setdefault((shot.camera.lens.key(), shot.camera.width, shot.camera.height), []).append(i)
@@ -181,7 +182,7 @@ class References:
         shows = torch.zeros(len(self.shots), dtype=torch.float64)
         for (_, width, height), indices in self.alike.items():
             lens = self.shots[indices[0]].camera.lens
-            back = torch.stack([inverse(self.shots[i].camera.world_from_cam) for i in indices])
+            back = torch.stack([self.back[i] for i in indices])
             local = points @ back[:, :3, :3].transpose(1, 2) + back[:, None, :3, 3]
             pixels = lens.project(local)
             side = torch.tensor([width, height])
