@@ -221,7 +221,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights)
-        beside = {f"{one.about.get('model', 'weights')} ({Path(path).name})": one for path in options.beside if (one := Enhancer.load(path))}
+        others = {Path(path).name: Enhancer.load(path) for path in options.beside}
+        beside = {f"{one.about.get('model', 'weights')} ({name})": one for name, one in others.items()}
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
         if options.rollout:
