@@ -14,6 +14,8 @@ STEADY = 8
 
 SLIGHT = 4 / 255
 """Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong."""
+FILLS = 0.8
+"""Share of the frame from which an object keeps its colours: objects that large were never seen in training."""
 DEEP = 0.3
 """Optical depth that a missing shadow has somewhere; an object that lacks less has its shadow."""
 
@@ -31,7 +33,7 @@ def corrected(net: ObjectNet, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Ten
 def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
     """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there and the shadows that they
     lacked, and their corrections, to be passed with the next frame. Pixels that are neither an object's nor shaded stay as they are."""
-    found = boxes(instance)
+    found = {i: box for i, box in boxes(instance).items() if not _fills(instance, i, box)}
     if not found:
         return rgb, {}
     after = _looked_at(net, rgb, instance, found, before)
@@ -39,6 +41,12 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     _shade(out, instance, found, after)
     _recolour(out, instance, found, after)
     return out, after
+
+
+def _fills(instance: torch.Tensor, i: int, box: Box) -> bool:
+    """Whether an object leaves so little around it that nothing tells its colours."""
+    part = instance[box.rows, box.columns]
+    return part.numel() > FILLS * instance.numel() and int((part == i).sum()) > FILLS * instance.numel()
 
 
 def _looked_at(

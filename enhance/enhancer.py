@@ -14,7 +14,7 @@ from enhance.past import Past
 from enhance.precision import channels_last, has_bfloat16
 from enhance.step import Steps, checked
 from enhance.tiles import Tiles
-from enhance.weights_file import BUILTIN, is_net, load_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, is_net, load_net
 from render.frame_types import Frame
 
 LONGEST = 4
@@ -51,9 +51,11 @@ class Enhancer:
         device: str | torch.device = "cpu",
         bfloat16: bool | None = None,
         history: int | None = None,
+        repair: bool | None = None,
     ):
         """bfloat16: whether to compute in it; where that is fast, if None. history: how many frames are looked back to, at most the
-        network's own number, if None."""
+        network's own number, if None. repair: whether the network repairs frames; where its training found that worth it, if None.
+        Without, altered colours are undone and told objects corrected all the same, and references laid in."""
         self.device = torch.device(device)
         self.net = channels_last(net.eval().requires_grad_(False).to(self.device))
         self.about = about or {}
@@ -61,6 +63,10 @@ class Enhancer:
         self.history = net.config.history if history is None else history
         if not 0 <= self.history <= net.config.history:
             raise ValueError(f"history must be 0 to {net.config.history}, as the network was trained, got {history}")
+        gains = self.about.get(REPAIR_GAIN, (WORTH, WORTH))
+        self.repairs = tuple(gain >= WORTH if repair is None else repair for gain in gains)
+        if not self.repairs[1]:
+            self.reads = ("instance", "reference")
 
     @classmethod
     def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Steps:
@@ -86,8 +92,9 @@ class Enhancer:
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Pixels whose gate and trust are 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1);
-        a frame that needs nothing costs nothing. Raises ValueError for values that are not finite.
+        Where repairing was not found worth it (`repair`), nothing is done beside colours, told objects and references. Pixels whose gate
+        and trust are 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame that needs
+        nothing costs nothing. Raises ValueError for values that are not finite.
         """
         given = checked(frame)
         height, width = given.rgb.shape[:2]
@@ -107,11 +114,17 @@ class Enhancer:
         if given.instance is not None:
             planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), given.instance, memory.objects if memory else {})
             rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
+        told = given.instance is not None
+        if told and not self.repairs[1]:
+            return rgb.contiguous(), Memory(None, (height, width), given.flow is not None, objects=corrections)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if given.instance is None else _pad(given.instance.to(self.device, torch.float32)[None, None], value=0)
         past = None if memory is None else self._brought(memory, flow, padded)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            if tiles.everything():
+            if not self.repairs[told]:
+                better, after = self.net.recolour(padded, past)
+                better = better.where(_pad(tiles.pixels().to(better)[None, None], value=0) > 0, padded)
+            elif tiles.everything():
                 out = self.net(padded, mask, past)
                 better, after = out.rgb, out.past
             else:
@@ -134,9 +147,10 @@ class Enhancer:
         if memory is None:
             return Memory(None, size, flow is not None)
         since = memory.since if flow is None else (*memory.since, flow)
+        flowing = memory.flow or flow is not None
         if memory.past is None or len(since) > LONGEST:
-            return Memory(None, size, memory.flow or flow is not None)
-        return Memory(memory.past, size, memory.flow or flow is not None, since)
+            return Memory(None, size, flowing, objects=memory.objects)
+        return Memory(memory.past, size, flowing, since, memory.objects)
 
 
 def _pad(image: torch.Tensor, **how) -> torch.Tensor:

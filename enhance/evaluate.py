@@ -35,8 +35,8 @@ SMALLEST = 200
 
 TOLD = "ours + instances"
 METHODS = ("identity", "ours", TOLD)
-PHOTOS = ("references alone", "ours + references")
-"""Where a rendered scene has photos: what those say of the frame, and that enhanced."""
+PHOTOS = ("references alone", "ours + instances + references")
+"""Where a rendered scene has photos: what those say of the frame, and that enhanced as `render --enhance` does."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def evaluate(
     beside: Mapping[str, Steps] | None = None,
 ) -> list[Row]:
     """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of rendered
-    kinds for what photos say, and the enhancer told that; then for those `beside` it by name, told the instances too.
+    kinds for what photos say, and the enhancer told that and the instances; then for those `beside` it by name, told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
@@ -123,7 +123,7 @@ def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, f
         previous: torch.Tensor | None = None
         memory = None
         for t in range(shard.frames):
-            frame = _frame(window, t, told=method not in (*METHODS, *PHOTOS) or method == TOLD, referenced=method in PHOTOS)
+            frame = _frame(window, t, told=method not in METHODS or method == TOLD, referenced=method in PHOTOS)
             start = time.perf_counter()
             if method == "identity":
                 better = window.input[t].permute(1, 2, 0)

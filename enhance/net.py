@@ -226,6 +226,15 @@ class Net(nn.Module):
         return better, base, logits, ungated, enhanced
 
     @torch.no_grad()
+    def recolour(self, rgb: torch.Tensor, past: Past | None) -> tuple[torch.Tensor, Past]:
+        """A frame `[1, 3, H, W]` of which nothing is told, with altered colours undone and nothing else done to it, and its past."""
+        past, told = past or Past.none(rgb), told_of(rgb, None)
+        fields, count = self.look(rgb, told, past)
+        better = recoloured(rgb, told, fields, self.shut_colour)
+        none = rgb.new_zeros(1, LATENT, rgb.shape[-2] // STRIDE, rgb.shape[-1] // STRIDE)
+        return better, past.followed(better, none, fields, count, 0)
+
+    @torch.no_grad()
     def parts(self, rgb: torch.Tensor, mask: torch.Tensor | None, past: Past | None, tiles: Tiles) -> tuple[torch.Tensor, Past]:
         """One frame `[1, 3, H, W]`, worked on in the windows around `tiles` only: the picture and its past. Other tiles stay exactly as
         they are, and nothing of them is remembered but the picture."""

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.calibrate import calibrate_colour, calibrate_gate
+from enhance.calibrate import calibrate_colour, calibrate_gate, repair_gain
 from enhance.colour import altered_logits, colour_change
 from enhance.corrections import corrected
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
@@ -29,7 +29,7 @@ from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig
 from enhance.samples import Photos, Sample, Sampler
 from enhance.shade import optical_depth, shaded
 from enhance.shards import PairSet
-from enhance.weights_file import BUILTIN, load_net, save_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
 from scenes.names import unknown
 
 NEAR_ENOUGH = 3e-4
@@ -118,11 +118,12 @@ def train(
     run.save(checkpoint)
     weights = out / "enhancer.safetensors"
     shards = pair_set.of(split="train") if pair_set else []
+    gains = repair_gain(run.average, [s for s in shards if s.meta["kind"] != "clean"])
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
     data |= {"further": origin} if origin is not None else {}
     made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
-    save_net(run.average, weights, {**(about or {}), **made})
+    save_net(run.average, weights, {**(about or {}), **made, REPAIR_GAIN: gains})
     return weights
 
 

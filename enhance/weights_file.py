@@ -14,6 +14,12 @@ from scenes.atomic import atomic_file
 BUILTIN = Path(__file__).parent / "weights" / "builtin.safetensors"
 FORMAT = "sidestep-enhancer-1"
 
+WORTH = 0.2
+"""Gain in dB on the pairs that it was trained on from which a network repairs frames at all: a tenth or two are lost on new places."""
+
+REPAIR_GAIN = "repair gain, dB"
+"""Under what name the header says that gain (`enhance.calibrate.repair_gain`): untold, and told where objects are."""
+
 
 def save_net(net: Net, path: str | Path, about: dict) -> None:
     """Write `net` to `path`; `about` is json-like: data, licence, attribution, seed, steps, minutes, command."""

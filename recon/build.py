@@ -33,7 +33,7 @@ PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""
 HELD_OUT = 8
 
-SHARED, PER_PICTURE = (880, 40_000), (13, 750)
+SHARED, PER_PICTURE = (1_840, 112_000), (9, 450)
 """Steps that a fit takes and splats that it may have: for what a drive's pictures share, and for each of them besides. The 240 of three
 cameras of drive 002 get the 4,000 steps and 220,000 splats that were found right for them."""
 

@@ -3,7 +3,8 @@
     python -m tests.bench.enhance [--size 640x360] [--size 1024x576] [--repeat 9] [--clock cpu] [--plot enhance.png]
 
 The last of twelve frames of the bundled drive, shot two metres to the left with two inserted cars. The error is to the frame that the same
-weights give in float32, with all tiles and all of the history, in levels of 255.
+weights give in float32, with all tiles and all of the history, in levels of 255. All rows but "as loaded" have the network repair the
+frame, whatever its weights say of that.
 """
 
 from __future__ import annotations
@@ -95,13 +96,14 @@ def _shrunk(frame: Frame, share: float) -> Frame:
 
 def works(frames: list[Frame], weights: str) -> dict[tuple[str, str], Callable[[], torch.Tensor]]:
     """What is compared, by knob and setting; the first is the reference."""
-    exact = Enhancer.load(weights, bfloat16=False)
-    usual = Enhancer.load(weights)
+    exact = Enhancer.load(weights, bfloat16=False, repair=True)
+    usual = Enhancer.load(weights, repair=True)
     made = {("precision", "float32"): stepping(exact, frames, without_need)}
     if has_bfloat16(usual.device):
         made["precision", "bfloat16"] = stepping(usual, frames, without_need)
     for k in range(usual.history, -1, -1):
-        made["history", f"{k} frames"] = stepping(Enhancer.load(weights, history=k), frames, without_need)
+        made["history", f"{k} frames"] = stepping(Enhancer.load(weights, history=k, repair=True), frames, without_need)
+    made["network", "as loaded"] = stepping(Enhancer.load(weights), frames, without_need)
     tiles: dict[str, Callable[[Frame], Frame]] = {"all": without_need, "need, as rendered": lambda f: f, "actors": inserted_only}
     for name, given in (tiles | {"none": nothing}).items():
         made["tiles", name] = stepping(usual, frames, given)

@@ -1,9 +1,13 @@
 """How sure the network must be is the least that keeps clean pictures clean."""
 
+from types import SimpleNamespace
+
 import torch
+from small_net import SMALL, stirred
 
 from enhance import calibrate
-from enhance.calibrate import CLEAN_DB, LEAST, SHUTS
+from enhance.calibrate import CLEAN_DB, LEAST, SHUTS, repair_gain
+from enhance.net import Net
 
 
 def chosen(monkeypatch, error, pictures=2):
@@ -27,3 +31,20 @@ def test_where_nothing_is_clean_enough_the_surest_is_chosen(monkeypatch):
 
 def test_without_clean_pictures_nothing_is_chosen(monkeypatch):
     assert chosen(monkeypatch, lambda shut, told: 0.0, pictures=0) == [-1.0, -1.0]
+
+
+def shard(given, target):
+    """A clip of one frame `[3, H, W]`, without objects."""
+    window = SimpleNamespace(input=given[None], target=target[None], instance=torch.zeros(1, 1, *given.shape[1:]))
+    return SimpleNamespace(frames=1, height=given.shape[1], width=given.shape[2], window=lambda *_: window)
+
+
+def test_repairing_gains_where_it_leads_to_the_target_and_loses_where_it_leads_away():
+    net, given = stirred(), 0.2 + 0.6 * torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(0))
+    net.shut.fill_(0.1)
+    untold = net(given[None]).rgb[0].clamp(0, 1).detach()
+    half_way = given + (untold - given) / 2
+    assert (untold - given).abs().max() > 1e-3
+    assert repair_gain(net, [shard(given, untold)])[0] > 20 and repair_gain(net, [shard(given, given - (untold - given))])[0] < -3
+    assert abs(repair_gain(net, [shard(given, half_way)])[0]) < 0.5
+    assert repair_gain(Net(SMALL), [shard(given, untold)]) == [0.0, 0.0] == repair_gain(net, [])

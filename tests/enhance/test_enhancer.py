@@ -6,7 +6,7 @@ from small_net import SMALL, stirred
 
 from enhance.enhancer import Enhancer
 from enhance.net import Net
-from enhance.weights_file import BUILTIN, load_net, save_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -152,6 +152,48 @@ def test_the_shipped_weights_fit_and_leave_a_grey_frame_grey():
     assert "attribution" in enhancer.about
     grey = torch.full((64, 96, 3), 0.5)
     assert (enhancer.step(grey)[0] - grey).abs().max() < 0.1
+
+
+def resting(net, monkeypatch):
+    """An enhancer whose training found that repairing gains too little; it fails where the network repairs all the same."""
+    monkeypatch.setattr(net, "repair", lambda *_: pytest.fail("it repaired"))
+    return Enhancer(net, {REPAIR_GAIN: [WORTH - 0.01, WORTH - 0.01]})
+
+
+def test_what_gained_too_little_in_training_is_left_out(enhancer, monkeypatch):
+    assert enhancer.repairs == (True, True) and "flow_prev" in enhancer.reads
+    rests = resting(stirred(), monkeypatch)
+    assert rests.repairs == (False, False) and rests.reads == ("instance", "reference")
+    assert Enhancer(stirred(), {REPAIR_GAIN: [0.0, WORTH]}).repairs == (False, True)
+    assert Enhancer(stirred(), {REPAIR_GAIN: [0.0, 0.0]}, repair=True).repairs == (True, True)
+
+
+def test_without_repair_untold_colours_are_undone_and_remembered(monkeypatch):
+    net, rgb = stirred(), picture(64, 96)
+    with torch.no_grad():
+        net.shut_colour.zero_()
+        net.colour.head.bias[:3] = 0.1
+        net.colour.head.bias[-1] = 5.0  # sure that all of it is altered
+    rests = resting(net, monkeypatch)
+    better, memory = rests.step(rgb)
+    assert (better - rgb).mean() > 0.05 and memory.past.latents.shape[1] == 0
+    _, memory = rests.step(better, memory)
+    assert memory.past.count.max() == 2
+    need = torch.ones(64, 96)
+    need[:32] = 0
+    part, _ = rests.step(frame(rgb, need=need))
+    assert torch.equal(part[:32], rgb[:32]) and torch.allclose(part[32:], better[32:], atol=1e-6)
+
+
+def test_without_repair_nothing_but_told_objects_is_touched(monkeypatch):
+    rests, rgb, instance = resting(stirred(), monkeypatch), picture(64, 96), torch.zeros(64, 96, dtype=torch.int32)
+    better, memory = rests.step(frame(rgb, instance=instance))
+    assert torch.equal(better, rgb) and memory.past is None
+    instance[20:50, 30:60] = 1
+    better, memory = rests.step(frame(rgb, instance=instance), memory)
+    assert list(memory.objects) == [1] and torch.equal(better[:10], rgb[:10])
+    _, after = rests.step(frame(rgb, instance=instance, need=torch.zeros(64, 96)), memory)
+    assert list(after.objects) == [1]  # a frame that needed nothing forgets nothing
 
 
 def striped(seed, h=64, w=96):

@@ -156,3 +156,10 @@ def test_it_learns_an_exposure_from_the_seam():
         loss.backward()
         optimiser.step()
     assert loss < 0.3 * (given - target).abs().mean()
+
+
+def test_an_object_that_fills_the_frame_keeps_its_colours():
+    rgb, instance = torch.rand(3, 64, 96), torch.ones(64, 96, dtype=torch.int32)
+    assert torch.equal(correct(stirred(), rgb, instance, {})[0], rgb)
+    instance[:, 60:] = 0
+    assert not torch.equal(correct(stirred(), rgb, instance, {})[0], rgb)

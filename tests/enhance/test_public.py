@@ -401,7 +401,7 @@ def test_nothing_is_rendered_for_a_model_that_looks_at_pictures_only(harmonizer)
     from enhance.clip import enhancement
 
     stages, outputs = enhancement(str(harmonizer), references=object())  # photos that it would not look at are not looked up
-    assert list(stages) == ["enhance"] and outputs == () and Enhancer.load("builtin").reads == ("flow_prev", "instance", "reference")
+    assert list(stages) == ["enhance"] and outputs == () and "instance" in Enhancer.load("builtin").reads
 
 
 def test_a_clip_is_enhanced_by_any_of_them(harmonizer, tmp_path):
