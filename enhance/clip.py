@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from enhance.enhancer import Enhancer
 from enhance.step import Steps
 from render.frame_types import Frame
@@ -57,8 +59,8 @@ def enhance_video(
     """Enhance any video that FFmpeg decodes, of any size, in constant memory; returns the number of frames.
 
     The result is H.264 at the source's rate without its sound. A side that is odd gains one repeated row or column, which
-    H.264's 4:2:0 needs. `progress` is called with frames done and frames in all, where the file says. Raises FileNotFoundError,
-    and ValueError where the source cannot be decoded; nothing is left under `out` then.
+    H.264's 4:2:0 needs. `progress` is called with frames done and frames in all, where the file says. It warns where no frame was
+    changed. Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     from render.video import VideoWriter, read_video
 
@@ -66,12 +68,15 @@ def enhance_video(
     if Path(out).exists() and Path(out).samefile(source):
         raise ValueError(f"{out} is the clip itself; write the enhanced one elsewhere")
     enhancer = enhancer or Enhancer.load()
-    memory, done = None, 0
+    memory, done, changed = None, 0, False
     with VideoWriter(out, video.fps, video.width, video.height) as writer:
         for rgb in video:
             better, memory = enhancer.step(rgb, memory)
+            changed = changed or not torch.equal(better, rgb.to(better).clamp(0, 1))
             writer.write(better)
             done += 1
             if progress is not None:
                 progress(done, video.count)
+    if not changed:
+        warn([f"nothing in {source} was sure to be wrong, so no frame was changed; render --enhance tells objects and has photos to go by"])
     return done

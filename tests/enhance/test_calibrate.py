@@ -15,7 +15,7 @@ def chosen(monkeypatch, error, pictures=2):
     rgb = torch.full((1, 3, 16, 16), 0.5)
     monkeypatch.setattr(calibrate, "_pictures", lambda clean, knowing: [(rgb, torch.full((1, 2, 16, 16), float(knowing)))] * pictures)
     pair = torch.tensor([-1.0, -1.0])
-    calibrate._choose(pair, [], lambda rgb, told: lambda shut: rgb + error(shut, bool(told.max() > 0)))
+    calibrate._choose(pair, [], lambda rgb, told: lambda shut: rgb + error(shut, bool(told.max() > 0)), LEAST)
     return pair.tolist()
 
 

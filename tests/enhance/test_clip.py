@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_net import SMALL
+from small_net import SMALL, stirred
 
 from enhance.clip import enhance_video, enhancement
 from enhance.enhancer import Enhancer
@@ -67,3 +67,11 @@ def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
     without, fewer = enhancement(str(tmp_path / "untrained.safetensors"))
     assert list(without) == ["enhance"]
     assert set(fewer) < set(reads) and torch.equal(next(without["enhance"](iter(frames))).rgb, frames[0].rgb.clamp(0, 1))
+
+
+def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
+    write(tmp_path / "in.mp4")
+    enhance_video(tmp_path / "in.mp4", tmp_path / "same.mp4", Enhancer(Net(SMALL)))
+    assert "no frame was changed" in capsys.readouterr().err
+    enhance_video(tmp_path / "in.mp4", tmp_path / "other.mp4", Enhancer(stirred()))
+    assert "no frame was changed" not in capsys.readouterr().err
