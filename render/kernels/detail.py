@@ -3,7 +3,7 @@
 import warp as wp
 
 from render.kernels.flow import shows
-from render.kernels.types import OPTIONS
+from render.kernels.types import OPTIONS, pixel_of
 
 wp.set_module_options(OPTIONS)
 
@@ -73,10 +73,7 @@ def looked_up(other: Other, here: Here, row: int, column: int, hides: float):
 @wp.kernel
 def carry_over(other: Other, here: Here, hides: float, keep: float, detail: wp.array2d[wp.vec4], first: int):
     """Of the detail of the view before, `keep` is kept, where it is known."""
-    item = first + wp.tid()
-    width = detail.shape[1]
-    row = item // width
-    column = item - row * width
+    row, column = pixel_of(first + wp.tid(), detail.shape[1])
     found, known = looked_up(other, here, row, column, hides)
     if known > 0.0:
         detail[row, column] = wp.lerp(detail[row, column], found, keep)
@@ -90,10 +87,7 @@ def add_photo(
 ):  # fmt: skip
     """A photo's detail, by how sure it is: sums of that, with the sum of the weights in w, and of its mean square. parallax: what it
     adds to the noise, times the distance."""
-    item = first + wp.tid()
-    width = depth.shape[1]
-    row = item // width
-    column = item - row * width
+    row, column = pixel_of(first + wp.tid(), depth.shape[1])
     found, known = looked_up(other, here, row, column, hides)
     if known > 0.0:
         noisy = noise

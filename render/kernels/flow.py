@@ -6,7 +6,7 @@ import warp as wp
 
 from render.kernels.lenses import ROUND, LensFunctions
 from render.kernels.lenses.optics import Optics
-from render.kernels.types import OPTIONS
+from render.kernels.types import OPTIONS, pixel_of
 
 wp.set_module_options(OPTIONS)
 
@@ -26,10 +26,7 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
     ):  # fmt: skip
         """ways[place[instance], k, line]: coefficient of the k-th power of the share; the line is the pixel's row or column where each
         has its own. The last of the ways is the sky's, which only turns. depths: the points' own in the other camera, inf for the sky."""
-        item = first + wp.tid()
-        width = depth.shape[1]
-        row = item // width
-        column = item - row * width
+        row, column = pixel_of(first + wp.tid(), depth.shape[1])
         powers = ways.shape[1]
         line = int(0)
         if ways.shape[2] > 1:
@@ -79,8 +76,6 @@ def shows(at: wp.vec2d, depth: float, hides: float, there: wp.array2d[float]):
 def see(
     pixels: wp.array2d[wp.vec2d], depths: wp.array2d[float], hides: float, there: wp.array2d[float], seen: wp.array2d[wp.bool], first: int
 ):
-    item = first + wp.tid()
-    width = pixels.shape[1]
-    row = item // width
-    column = item - row * width
+    """Which points show there: `shows`."""
+    row, column = pixel_of(first + wp.tid(), pixels.shape[1])
     seen[row, column] = shows(pixels[row, column], depths[row, column], hides, there)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from render.kernels.types import OPTIONS
+from render.kernels.types import OPTIONS, pixel_of
 
 wp.set_module_options(OPTIONS)
 
@@ -45,10 +45,7 @@ def fall(
     first: int,
 ):  # fmt: skip
     """light: of a window whose first pixel is at left, top; 1 where no shadow falls."""
-    item = first + wp.tid()
-    width = light.shape[1]
-    v = item // width
-    u = item - v * width
+    v, u = pixel_of(first + wp.tid(), light.shape[1])
     row = top + v
     column = left + u
     light[v, u] = 1.0

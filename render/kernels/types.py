@@ -120,6 +120,13 @@ class Pose:
 
 
 @wp.func
+def pixel_of(item: int, width: int):
+    """Row and column of a picture's item-th pixel."""
+    row = item // width
+    return row, item - row * width
+
+
+@wp.func
 def matrix_at(rows: wp.array2d[wp.float64], d: int, at: int):
     return wp.mat33d(
         rows[d, at], rows[d, at + 1], rows[d, at + 2],
