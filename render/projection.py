@@ -155,7 +155,7 @@ def _view(settings: Settings, lens: Lens) -> View:
     """The same for all instances of a frame and all frames of a camera, so kept: nobody writes to it."""
     v = View()
     if isinstance(lens, Pinhole):
-        v.fx, v.fy, *_ = params = lens.params().tolist()
+        params = lens.params().tolist()
         v.lens = wp.vec4d(*params)
     if isinstance(lens, Pinhole | OpenCV):
         left, right, top, bottom = view_box(lens, settings.width, settings.height)

@@ -5,6 +5,7 @@
 
 import warp as wp
 
+from render.kernels.fields import rotation
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, matrix_at, vector_at
 
 wp.set_module_options(OPTIONS)
@@ -21,7 +22,6 @@ FARTHEST = 1e60
 
 LONGEST_AXIS = wp.constant(wp.float64(-THINNEST))
 NOWHERE = wp.constant(wp.float64(FARTHEST))
-LEAST_LENGTH = wp.constant(wp.float64(1.0e-30))
 
 
 @wp.kernel
@@ -38,22 +38,11 @@ def make_frames(
     turn = matrix_at(poses, draw, 0)
     shift = vector_at(poses, draw, 9)
     one = wp.float64(1.0)
-    two = wp.float64(2.0)
     for k in range(part % threads, items[item, COUNT], threads):
         i = items[item, FIRST] + k
         j = items[item, BASE] + k
         if counts[j] > 0:
-            q = wp.vec4d(quats[i])
-            q = q / wp.max(wp.length(q), LEAST_LENGTH)
-            w = q[0]
-            x = q[1]
-            y = q[2]
-            z = q[3]
-            axes = turn * wp.mat33d(
-                one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
-                two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
-                two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
-            )  # fmt: skip
+            axes = turn * rotation(quats[i])
             p = turn * wp.vec3d(means[i]) + shift
             within = bool(True)
             for a in range(3):

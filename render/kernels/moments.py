@@ -14,73 +14,73 @@ All continuous where it can be seen.
 
 import warp as wp
 
-from render.kernels.types import NEAREST, ROOT3, View
+from render.kernels.types import HALF, ONE, ROOT3, TWO, View
 
-SIXTH_OF_ROOT3 = wp.constant(3.0**0.5 / 6.0)
+SIXTH_OF_ROOT3 = wp.constant(wp.float64(3.0**0.5 / 6.0))
 
-vec_axis = wp.types.vector(length=8, dtype=wp.float32)
+vec_axis = wp.types.vector(length=8, dtype=wp.float64)
 
 
 @wp.struct
 class Axis:
     """One principal axis of a splat in the camera and on the image."""
 
-    offset: wp.vec3
-    e: wp.vec2
-    w: float
-    b: float
-    near_z: float  # of the sigma point at -sqrt(3), after the clamp
-    far_z: float
+    offset: wp.vec3d
+    e: wp.vec2d
+    w: wp.float64
+    b: wp.float64
+    near_z: wp.float64  # of the sigma point at -sqrt(3), after the clamp
+    far_z: wp.float64
 
 
 @wp.struct
 class Footprint:
     """The 2D Gaussian before dilation; det0 is the determinant of its covariance."""
 
-    along: wp.vec2  # where the centre's ray meets the plane z = 1
-    n: wp.vec2  # where the Jacobian is taken there
+    along: wp.vec2d  # where the centre's ray meets the plane z = 1
+    n: wp.vec2d  # where the Jacobian is taken there
     u: Axis
     v: Axis
     w: Axis
-    mu: wp.vec2
-    xx: float
-    xy: float
-    yy: float
-    det0: float
+    mu: wp.vec2d
+    xx: wp.float64
+    xy: wp.float64
+    yy: wp.float64
+    det0: wp.float64
 
 
 @wp.func
-def cross2(a: wp.vec2, b: wp.vec2):
+def cross2(a: wp.vec2d, b: wp.vec2d):
     return a[0] * b[1] - a[1] * b[0]
 
 
 @wp.func
-def project_axis(offset: wp.vec3, n: wp.vec2, z: float, view: View):
+def project_axis(offset: wp.vec3d, n: wp.vec2d, z: wp.float64, view: View):
     a = Axis()
     a.offset = offset
-    a.e = wp.vec2(view.fx * (offset[0] - n[0] * offset[2]), view.fy * (offset[1] - n[1] * offset[2]))
+    a.e = wp.vec2d(view.lens[0] * (offset[0] - n[0] * offset[2]), view.lens[1] * (offset[1] - n[1] * offset[2]))
     if view.unscented == 0:
-        a.w = 1.0 / (z * z)
-        a.b = 0.0
+        a.w = ONE / (z * z)
+        a.b = wp.float64(0.0)
     else:
-        a.far_z = wp.max(z + ROOT3 * offset[2], NEAREST * z)
-        a.near_z = wp.max(z - ROOT3 * offset[2], NEAREST * z)
-        both = 1.0 / (a.near_z * a.far_z)  # one division for all: they are what takes the time here
-        a.w = 0.5 * (a.near_z * a.near_z + a.far_z * a.far_z) * both * both
+        a.far_z = wp.max(z + ROOT3 * offset[2], HALF * z)
+        a.near_z = wp.max(z - ROOT3 * offset[2], HALF * z)
+        both = ONE / (a.near_z * a.far_z)  # one division for all: they are what takes the time here
+        a.w = HALF * (a.near_z * a.near_z + a.far_z * a.far_z) * both * both
         a.b = SIXTH_OF_ROOT3 * (a.near_z - a.far_z) * both
     return a
 
 
 @wp.func
-def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
+def footprint(t: wp.vec3d, axes: wp.mat33d, scale: wp.vec3d, view: View):
     """axes: the splat's principal directions in the camera, as columns; scale in metres."""
     f = Footprint()
     z = t[2]
-    f.along = wp.vec2(t[0] / z, t[1] / z)
-    f.n = wp.vec2(wp.clamp(f.along[0], view.clamp_left, view.clamp_right), wp.clamp(f.along[1], view.clamp_top, view.clamp_bottom))
-    f.u = project_axis(scale[0] * wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
-    f.v = project_axis(scale[1] * wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
-    f.w = project_axis(scale[2] * wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)
+    f.along = wp.vec2d(t[0] / z, t[1] / z)
+    f.n = wp.vec2d(wp.clamp(f.along[0], view.clamp_left, view.clamp_right), wp.clamp(f.along[1], view.clamp_top, view.clamp_bottom))
+    f.u = project_axis(scale[0] * wp.vec3d(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
+    f.v = project_axis(scale[1] * wp.vec3d(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
+    f.w = project_axis(scale[2] * wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)
     f.mu = f.u.b * f.u.e + f.v.b * f.v.e + f.w.b * f.w.e
     f.xx = f.u.w * f.u.e[0] * f.u.e[0] + f.v.w * f.v.e[0] * f.v.e[0] + f.w.w * f.w.e[0] * f.w.e[0] + f.mu[0] * f.mu[0]
     f.xy = f.u.w * f.u.e[0] * f.u.e[1] + f.v.w * f.v.e[0] * f.v.e[1] + f.w.w * f.w.e[0] * f.w.e[1] + f.mu[0] * f.mu[1]
@@ -97,45 +97,45 @@ def footprint(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
 
 
 @wp.func
-def cross_gradient(b: wp.vec2, g: float):
+def cross_gradient(b: wp.vec2d, g: wp.float64):
     """g times d cross2(a, b) / d a; by b it is minus the same with a in place of b."""
-    return wp.vec2(g * b[1], -g * b[0])
+    return wp.vec2d(g * b[1], -g * b[0])
 
 
 @wp.func
-def quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
+def quadratic(xx: wp.float64, xy: wp.float64, yy: wp.float64, v: wp.vec2d):
     return xx * v[0] * v[0] + xy * v[0] * v[1] + yy * v[1] * v[1]
 
 
 @wp.func
-def gradient_of_quadratic(xx: float, xy: float, yy: float, v: wp.vec2):
-    return wp.vec2(2.0 * xx * v[0] + xy * v[1], xy * v[0] + 2.0 * yy * v[1])
+def gradient_of_quadratic(xx: wp.float64, xy: wp.float64, yy: wp.float64, v: wp.vec2d):
+    return wp.vec2d(TWO * xx * v[0] + xy * v[1], xy * v[0] + TWO * yy * v[1])
 
 
 @wp.func
-def axis_backward(a: Axis, g_e: wp.vec2, g_w: float, g_b: float, n: wp.vec2, z: float, view: View):
+def axis_backward(a: Axis, g_e: wp.vec2d, g_w: wp.float64, g_b: wp.float64, n: wp.vec2d, z: wp.float64, view: View):
     """d loss / d (offset, n, z, f) packed as a vector of 8."""
-    g_z = float(0.0)
-    g_oz = float(0.0)
+    g_z = wp.float64(0.0)
+    g_oz = wp.float64(0.0)
     if view.unscented == 0:
-        g_z = -2.0 * a.w / z * g_w
+        g_z = -TWO * a.w / z * g_w
     else:
         r_far = ROOT3 / a.far_z
         r_near = ROOT3 / a.near_z
-        g_far = -(g_w * r_far / 3.0 + g_b / 6.0) * r_far / a.far_z
-        g_near = -(g_w * r_near / 3.0 - g_b / 6.0) * r_near / a.near_z
-        if z + ROOT3 * a.offset[2] >= NEAREST * z:
+        g_far = -(g_w * r_far / wp.float64(3.0) + g_b / wp.float64(6.0)) * r_far / a.far_z
+        g_near = -(g_w * r_near / wp.float64(3.0) - g_b / wp.float64(6.0)) * r_near / a.near_z
+        if z + ROOT3 * a.offset[2] >= HALF * z:
             g_z += g_far
             g_oz += ROOT3 * g_far
         else:
-            g_z += NEAREST * g_far
-        if z - ROOT3 * a.offset[2] >= NEAREST * z:
+            g_z += HALF * g_far
+        if z - ROOT3 * a.offset[2] >= HALF * z:
             g_z += g_near
             g_oz -= ROOT3 * g_near
         else:
-            g_z += NEAREST * g_near
-    gx = view.fx * g_e[0]
-    gy = view.fy * g_e[1]
+            g_z += HALF * g_near
+    gx = view.lens[0] * g_e[0]
+    gy = view.lens[1] * g_e[1]
     g_oz -= gx * n[0] + gy * n[1]
     return vec_axis(
         gx, gy, g_oz, -gx * a.offset[2], -gy * a.offset[2], g_z,

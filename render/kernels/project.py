@@ -7,14 +7,24 @@ lies wholly beyond one side of the view.
 import warp as wp
 
 from render.kernels.fields import exp_scale, rotation, rotation_backward, sigmoid
-from render.kernels.moments import Footprint, axis_backward, cross2, cross_gradient, footprint, gradient_of_quadratic, quadratic
+from render.kernels.moments import (
+    Axis,
+    Footprint,
+    axis_backward,
+    cross2,
+    cross_gradient,
+    footprint,
+    gradient_of_quadratic,
+    quadratic,
+    vec_axis,
+)
 from render.kernels.ray_bound import pinhole_bound
 from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, write_splat
-from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, OPTIONS, REACH, UNIFORM_GRADIENTS, View, pose_of
+from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
 
-vec_uniform = wp.types.vector(length=UNIFORM_GRADIENTS, dtype=wp.float32)
+vec_uniform = wp.types.vector(length=UNIFORM_GRADIENTS, dtype=wp.float64)
 
 
 @wp.func
@@ -34,8 +44,8 @@ def in_view(t: wp.vec3, axes: wp.mat33, scale: wp.vec3, view: View):
 @wp.func
 def ellipse(t: wp.vec3d, f: Footprint, view: View):
     e = Ellipse()
-    e.x = view.lens[0] * (t[0] / t[2]) + view.lens[2] + wp.float64(f.mu[0])
-    e.y = view.lens[1] * (t[1] / t[2]) + view.lens[3] + wp.float64(f.mu[1])
+    e.x = view.lens[0] * (t[0] / t[2]) + view.lens[2] + f.mu[0]
+    e.y = view.lens[1] * (t[1] / t[2]) + view.lens[3] + f.mu[1]
     e.xx = f.xx
     e.xy = f.xy
     e.yy = f.yy
@@ -59,18 +69,24 @@ def project(
         i = items[item, FIRST] + k
         j = items[item, BASE] + k
         cull(depth_keys, counts, j)
-        exact = pose.exact * wp.vec3d(means[i]) + pose.translation
+        exact = pose.rotation * wp.vec3d(means[i]) + pose.translation
         t = wp.vec3(exact)
         opacity = sigmoid(logit_opacities[i])
         if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.least_opacity:
             axes = pose.rotation * rotation(quats[i])
             scale = exp_scale(log_scales[i])
-            if in_view(t, axes, scale, view):
-                e = ellipse(exact, footprint(t, axes, scale, view), view)
+            if in_view(t, wp.mat33(axes), scale, view):
+                e = ellipse(exact, footprint(exact, axes, wp.vec3d(scale), view), view)
                 shows = fade(e, opacity, view)
                 if view.along_rays != 0 and shows[1] > 0.0:
-                    e = pinhole_bound(exact, wp.mat33d(axes * wp.diag(scale)), shows[1], view)
+                    e = pinhole_bound(exact, axes * wp.diag(wp.vec3d(scale)), shows[1], view)
                 write_splat(e, shows, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
+
+
+@wp.func
+def by_offset(g: vec_axis, a: Axis):
+    """d loss / d log scale of an axis: its offset grows with the scale."""
+    return g[0] * a.offset[0] + g[1] * a.offset[1] + g[2] * a.offset[2]
 
 
 @wp.kernel
@@ -94,13 +110,12 @@ def project_backward(
         if counts[j] == 0:
             no_gradient(i, g_means, g_quats, g_log_scales, g_logit_opacities, g_sh)
         else:
-            exact = pose.exact * wp.vec3d(means[i]) + pose.translation
-            t = wp.vec3(exact)
+            t = pose.rotation * wp.vec3d(means[i]) + pose.translation
             z = t[2]
             r_splat = rotation(quats[i])
-            scale = exp_scale(log_scales[i])
+            scale = wp.vec3d(exp_scale(log_scales[i]))
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            g = gather(ellipse(exact, f, view), sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
+            g = gather(ellipse(t, f, view), sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
             g_logit_opacities[i] = g.logit
 
             uv = cross2(f.u.e, f.v.e)
@@ -112,13 +127,13 @@ def project_backward(
             g_wu = g.det0 * (f.v.w * uv * uv + f.w.w * uw * uw + um * um) + quadratic(g.xx, g.xy, g.yy, f.u.e)
             g_wv = g.det0 * (f.u.w * uv * uv + f.w.w * vw * vw + vm * vm) + quadratic(g.xx, g.xy, g.yy, f.v.e)
             g_ww = g.det0 * (f.u.w * uw * uw + f.v.w * vw * vw + wm * wm) + quadratic(g.xx, g.xy, g.yy, f.w.e)
-            g_uv = 2.0 * g.det0 * f.u.w * f.v.w * uv
-            g_uw = 2.0 * g.det0 * f.u.w * f.w.w * uw
-            g_vw = 2.0 * g.det0 * f.v.w * f.w.w * vw
-            g_um = 2.0 * g.det0 * f.u.w * um
-            g_vm = 2.0 * g.det0 * f.v.w * vm
-            g_wm = 2.0 * g.det0 * f.w.w * wm
-            g_xy_px = wp.vec2(g.x, g.y)
+            g_uv = TWO * g.det0 * f.u.w * f.v.w * uv
+            g_uw = TWO * g.det0 * f.u.w * f.w.w * uw
+            g_vw = TWO * g.det0 * f.v.w * f.w.w * vw
+            g_um = TWO * g.det0 * f.u.w * um
+            g_vm = TWO * g.det0 * f.v.w * vm
+            g_wm = TWO * g.det0 * f.w.w * wm
+            g_xy_px = wp.vec2d(g.x, g.y)
             g_mu = g_xy_px + gradient_of_quadratic(g.xx, g.xy, g.yy, f.mu)
             g_mu -= cross_gradient(f.u.e, g_um) + cross_gradient(f.v.e, g_vm) + cross_gradient(f.w.e, g_wm)
             g_eu = f.u.w * gradient_of_quadratic(g.xx, g.xy, g.yy, f.u.e) + f.u.b * g_mu
@@ -134,32 +149,28 @@ def project_backward(
             # the centre: pixel = f n + c + mu, with n not clamped; the Jacobian's n is clamped under EWA
             nx = f.along[0]
             ny = f.along[1]
-            g_nx = view.fx * g_xy_px[0]
-            g_ny = view.fy * g_xy_px[1]
+            g_nx = view.lens[0] * g_xy_px[0]
+            g_ny = view.lens[1] * g_xy_px[1]
             if nx == f.n[0]:
                 g_nx += a_u[3] + a_v[3] + a_w[3]
             if ny == f.n[1]:
                 g_ny += a_u[4] + a_v[4] + a_w[4]
-            g_t = wp.vec3(g_nx / z, g_ny / z, a_u[5] + a_v[5] + a_w[5] + g.depth - (g_nx * nx + g_ny * ny) / z)
+            g_t = wp.vec3d(g_nx / z, g_ny / z, a_u[5] + a_v[5] + a_w[5] + g.depth - (g_nx * nx + g_ny * ny) / z)
 
-            g_axes = wp.mat33(
+            g_axes = wp.mat33d(
                 scale[0] * a_u[0], scale[1] * a_v[0], scale[2] * a_w[0],
                 scale[0] * a_u[1], scale[1] * a_v[1], scale[2] * a_w[1],
                 scale[0] * a_u[2], scale[1] * a_v[2], scale[2] * a_w[2],
             )  # fmt: skip
-            g_log_scales[i] = wp.vec3(
-                a_u[0] * f.u.offset[0] + a_u[1] * f.u.offset[1] + a_u[2] * f.u.offset[2],
-                a_v[0] * f.v.offset[0] + a_v[1] * f.v.offset[1] + a_v[2] * f.v.offset[2],
-                a_w[0] * f.w.offset[0] + a_w[1] * f.w.offset[1] + a_w[2] * f.w.offset[2],
-            )
+            g_log_scales[i] = wp.vec3(wp.vec3d(by_offset(a_u, f.u), by_offset(a_v, f.v), by_offset(a_w, f.w)))
             g_quats[i] = rotation_backward(quats[i], wp.transpose(pose.rotation) * g_axes)
 
             sight = means[i] - pose.eye
-            g_sight = colour_backward(sh, i, sight, g.rgb, g_sh)
-            g_means[i] = wp.transpose(pose.rotation) * g_t + g_sight
+            g_sight = wp.vec3d(colour_backward(sh, i, sight, g.rgb, g_sh))
+            g_means[i] = wp.vec3(wp.transpose(pose.rotation) * g_t + g_sight)
 
             # eye = -R' t, so its gradient (-g_sight) reaches rotation and translation as well
-            g_rotation = wp.outer(g_t, means[i]) + g_axes * wp.transpose(r_splat) + wp.outer(wp.vec3(pose.translation), g_sight)
+            g_rotation = wp.outer(g_t, wp.vec3d(means[i])) + g_axes * wp.transpose(r_splat) + wp.outer(pose.translation, g_sight)
             g_translation = g_t + pose.rotation * g_sight
             for c in range(9):
                 uniform[c] = uniform[c] + g_rotation[c // 3, c % 3]
@@ -170,4 +181,4 @@ def project_backward(
             uniform[14] = uniform[14] + g_xy_px[0]
             uniform[15] = uniform[15] + g_xy_px[1]
     for c in range(UNIFORM_GRADIENTS):
-        g_uniform[part, c] = uniform[c]
+        g_uniform[part, c] = float(uniform[c])

@@ -15,9 +15,9 @@ from render.kernels.motion import motion_of, rotation_at, rotation_rate, transla
 from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
 from render.kernels.sight import column, sight_functions
-from render.kernels.sigma import ROOT3, ROOT6, covariance_backward, reach, reach_backward
+from render.kernels.sigma import ROOT6, covariance_backward, reach, reach_backward
 from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
-from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, View
+from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, ROOT3, View
 
 ROLLED = OPTIONS | {"max_unroll": 0}
 POSE = 12
@@ -58,7 +58,7 @@ def pulled_backward(t: wp.vec3d, aim: wp.vec3d, g: wp.vec3d):
 
 @wp.func
 def scaled_axes(quat: wp.vec4, log_scale: wp.vec3):
-    return wp.mat33d(rotation(quat) * wp.diag(exp_scale(log_scale)))
+    return rotation(quat) * wp.diag(wp.vec3d(exp_scale(log_scale)))
 
 
 @cache
@@ -141,8 +141,8 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 e = ellipse(optics, motion, q)
                 g = gather(e, sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
                 g_logit_opacities[i] = g.logit
-                g_mean_px = wp.vec2d(wp.float64(g.x), wp.float64(g.y))
-                g_v = covariance_backward(q.v, wp.float64(g.xx), wp.float64(g.xy), wp.float64(g.yy), wp.float64(g.det0))
+                g_mean_px = wp.vec2d(g.x, g.y)
+                g_v = covariance_backward(q.v, g.xx, g.xy, g.yy, g.det0)
                 shift = c.aim - c.t
 
                 g_x = wp.vec3d()
@@ -232,9 +232,9 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if wp.static(planar):
                     g_t = pulled_backward(c.t, c.aim, g_aim) - g_shift
                 if wp.static(around):
-                    g_t += (wp.float64(g.depth) / c.depth) * c.t
+                    g_t += (g.depth / c.depth) * c.t
                 else:
-                    g_t += wp.vec3d(none, none, wp.float64(g.depth))
+                    g_t += wp.vec3d(none, none, g.depth)
                 sight = wp.vec3(wp.transpose(c.rotation) * c.t)
                 g_sight = wp.vec3d(colour_backward(sh, i, sight, g.rgb, g_sh))
                 g_t += c.rotation * g_sight
@@ -262,11 +262,10 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
 
                 g_means[i] = wp.vec3(g_x)
                 r_splat = rotation(quats[i])
-                scale = exp_scale(log_scales[i])
-                g_local_axes = wp.mat33(g_axes)
-                g_quats[i] = rotation_backward(quats[i], g_local_axes * wp.diag(scale))
-                by_scale = wp.transpose(r_splat) * g_local_axes
-                g_log_scales[i] = wp.vec3(scale[0] * by_scale[0, 0], scale[1] * by_scale[1, 1], scale[2] * by_scale[2, 2])
+                scale = wp.vec3d(exp_scale(log_scales[i]))
+                g_quats[i] = rotation_backward(quats[i], g_axes * wp.diag(scale))
+                by_scale = wp.transpose(r_splat) * g_axes
+                g_log_scales[i] = wp.vec3(wp.vec3d(scale[0] * by_scale[0, 0], scale[1] * by_scale[1, 1], scale[2] * by_scale[2, 2]))
         write_pose(g_uniform, part, 0, g_r0, g_t0)
         if wp.static(rolling):
             write_pose(g_uniform, part, 1, g_r1, g_t1)

@@ -45,7 +45,7 @@ def everywhere(s_max: float, view: View):
     e.x = (wp.float64(view.tile_left) + half * wp.float64(view.tiles_x)) * TILE_SIZE
     e.y = (wp.float64(view.tile_top) + half * wp.float64(view.tiles_y)) * TILE_SIZE
     side = wp.float64(view.tiles_x + view.tiles_y) * TILE_SIZE
-    e.xx = float(half * side * side / wp.float64(s_max))
+    e.xx = half * side * side / wp.float64(s_max)
     e.yy = e.xx
     e.det0 = e.xx * e.yy
     e.seen = ANYWHERE
@@ -57,10 +57,10 @@ def ellipse_of(x: wp.float64, y: wp.float64, xx: wp.float64, xy: wp.float64, yy:
     e = Ellipse()
     e.x = x
     e.y = y
-    e.xx = float(xx)
-    e.xy = float(xy)
-    e.yy = float(yy)
-    e.det0 = float(wp.max(xx * yy - xy * xy, wp.float64(0.0)))
+    e.xx = xx
+    e.xy = xy
+    e.yy = yy
+    e.det0 = wp.max(xx * yy - xy * xy, wp.float64(0.0))
     e.seen = float(seen)
     return e
 

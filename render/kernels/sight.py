@@ -20,9 +20,9 @@ import warp as wp
 from render.kernels.lenses import PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import Optics
 from render.kernels.motion import Motion, rotation_at, rotation_rate, translation_at, translation_rate
-from render.kernels.sigma import ROOT3, ROOT6, determinant, inside, mat72d, reach
+from render.kernels.sigma import ROOT6, determinant, inside, mat72d, reach
 from render.kernels.splat import Ellipse
-from render.kernels.types import FARTHEST, View
+from render.kernels.types import FARTHEST, ROOT3, View
 
 STILL = wp.constant(wp.float64(1.0e-7))
 STEPS = wp.constant(50)
@@ -213,10 +213,10 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         x = q.centre[0] + q.v[6, 0]
         e.x = x + turns(o, m, x) * o.period
         e.y = q.centre[1] + q.v[6, 1]
-        e.xx = float(xx)
-        e.xy = float(xy)
-        e.yy = float(yy)
-        e.det0 = float(determinant(q.v))
+        e.xx = xx
+        e.xy = xy
+        e.yy = yy
+        e.det0 = determinant(q.v)
         return e
 
     return SightFunctions(readout, placed, pixel_backward, nearest, sighted, spread, turns, ellipse)

@@ -10,8 +10,8 @@ import warp as wp
 
 from render.kernels.lenses import PLANAR, ROUND
 from render.kernels.lenses.optics import Optics
+from render.kernels.types import ROOT3
 
-ROOT3 = wp.constant(wp.float64(1.7320508075688772))
 ROOT6 = wp.constant(wp.float64(2.449489742783178))
 LEAST = wp.constant(wp.float64(1.0e-6))
 FULL, AT_HALF_DEPTH, AT_EDGE = (wp.constant(i) for i in range(3))

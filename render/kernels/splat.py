@@ -22,6 +22,7 @@ from render.kernels.types import (
     G_Z,
     GRADIENTS,
     GREEN,
+    HALF,
     INSTANCE,
     OPACITY,
     RED,
@@ -41,9 +42,11 @@ from render.kernels.types import (
     Z,
 )
 
-LARGEST = wp.constant(1.0e16)  # px^2, of a variance: beyond it floats lose the rest
+LARGEST = wp.constant(wp.float64(1.0e16))  # px^2, of a variance: beyond it floats lose the rest
 
-vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
+vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float64)
+
+LEAST = wp.constant(wp.float64(1.0e-30))
 
 
 @wp.struct
@@ -52,10 +55,10 @@ class Ellipse:
 
     x: wp.float64
     y: wp.float64
-    xx: float
-    xy: float
-    yy: float
-    det0: float
+    xx: wp.float64
+    xy: wp.float64
+    yy: wp.float64
+    det0: wp.float64
     seen: float  # along rays, how far from x, in pixels
 
 
@@ -63,23 +66,29 @@ class Ellipse:
 class EllipseGradient:
     """d loss / d Ellipse and what else a record carries."""
 
-    x: float
-    y: float
-    xx: float
-    xy: float
-    yy: float
-    det0: float
-    depth: float
+    x: wp.float64
+    y: wp.float64
+    xx: wp.float64
+    xy: wp.float64
+    yy: wp.float64
+    det0: wp.float64
+    depth: wp.float64
     logit: float
     rgb: wp.vec3
+
+
+@wp.func
+def dilated(e: Ellipse, view: View):
+    """Both variances and the determinant, dilated."""
+    dilation = wp.float64(view.dilation)
+    return wp.vec3d(e.xx + dilation, e.yy + dilation, e.det0 + dilation * (e.xx + e.yy + dilation))
 
 
 @wp.func
 def fade(e: Ellipse, opacity: float, view: View):
     """Opacity, compensated for dilation where that is wanted, and the exponent up to which the splat shows; 0 where it does not."""
     if view.antialias != 0:
-        det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
-        opacity = opacity * wp.sqrt(e.det0 / wp.max(det, TINY))
+        opacity = opacity * wp.sqrt(float(e.det0 / wp.max(dilated(e, view)[2], LEAST)))
     s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
     if opacity <= view.least_opacity or not (e.xx < LARGEST and e.yy < LARGEST):
         s_max = 0.0
@@ -95,16 +104,15 @@ def write_splat(
 
     shows: as of `fade`. sight: from the eye to the splat in its local frame, of any length.
     """
-    xx = e.xx + view.dilation
-    yy = e.yy + view.dilation
-    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
+    wide = dilated(e, view)
+    xx = wide[0]
+    yy = wide[1]
+    det = wide[2]
     s_max = shows[1]
     # written so that a NaN anywhere culls the splat instead of spreading
-    if s_max > 0.0 and det > TINY and xx > TINY and yy > TINY and xx < LARGEST and yy < LARGEST:
-        h = 0.5 / yy
-        k = wp.sqrt(0.5 * yy / det)
-        x_ext = wp.sqrt(2.0 * s_max * xx)
-        y_ext = wp.sqrt(2.0 * s_max * yy)
+    if s_max > 0.0 and det > LEAST and xx > LEAST and yy > LEAST and xx < LARGEST and yy < LARGEST:
+        x_ext = wp.sqrt(2.0 * s_max * float(xx))
+        y_ext = wp.sqrt(2.0 * s_max * float(yy))
         x = float(e.x)
         y = float(e.y)
         records[j, X] = x
@@ -113,15 +121,15 @@ def write_splat(
         records[j, Y_REST] = float(e.y - wp.float64(y))
         if view.along_rays != 0:
             records[j, X_REST] = e.seen
-        records[j, K] = k
-        records[j, M] = e.xy / yy
-        records[j, H] = h
+        records[j, K] = float(wp.sqrt(HALF * yy / det))
+        records[j, M] = float(e.xy / yy)
+        records[j, H] = float(HALF / yy)
         records[j, OPACITY] = shows[0]
         records[j, S_MAX] = s_max
         records[j, Z] = depth
         records[j, INSTANCE] = instance
         records[j, Y_EXT] = y_ext
-        records[j, Y_AT_EXT] = e.xy / xx * x_ext
+        records[j, Y_AT_EXT] = float(e.xy / xx) * x_ext
         all_rows = span_of(y, ROOM * y_ext + SLACK)
         all_columns = span_of(x, ROOM * x_ext + SLACK)
         rows = within(all_rows, view.tile_top, view.tiles_y)
@@ -151,15 +159,17 @@ def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: in
     g = vec_gradients()
     for slot in range(start, start + count):
         for c in range(GRADIENTS):
-            g[c] = g[c] + slots[slot, c]
-    yy = e.yy + view.dilation
-    det = e.det0 + view.dilation * (e.xx + e.yy + view.dilation)
-    k = wp.sqrt(0.5 * yy / det)
+            g[c] = g[c] + wp.float64(slots[slot, c])
+    dilation = wp.float64(view.dilation)
+    wide = dilated(e, view)
+    yy = wide[1]
+    det = wide[2]
+    k = wp.sqrt(HALF * yy / det)
     m = e.xy / yy
-    h = 0.5 / yy
+    h = HALF / yy
 
     out = EllipseGradient()
-    g_det = -0.5 * g[G_K] * k / det  # det = det0 + dilation (xx0 + yy0 + dilation)
+    g_det = -HALF * g[G_K] * k / det  # det = det0 + dilation (xx0 + yy0 + dilation)
     g_trace = g_det
     out.det0 = g_det
     out.xy = g[G_M] / yy
@@ -167,17 +177,17 @@ def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: in
     if view.antialias != 0:
         # opacity sqrt(det0 / det): its two derivatives by det0 nearly cancel for large splats, so they are taken together
         ratio = wp.sqrt(e.det0 / det)
-        g_ratio = 0.5 * g_o * o * ratio / det
+        g_ratio = HALF * g_o * wp.float64(o) * ratio / det
         g_trace -= g_ratio
-        out.det0 += g_ratio * view.dilation * (e.xx + e.yy + view.dilation) / wp.max(e.det0, TINY)
+        out.det0 += g_ratio * dilation * (e.xx + e.yy + dilation) / wp.max(e.det0, LEAST)
         g_o = g_o * ratio
-    out.logit = g_o * o * (1.0 - o)
-    out.xx = g_trace * view.dilation
-    out.yy = (0.5 * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * view.dilation
+    out.logit = float(g_o) * o * (1.0 - o)
+    out.xx = g_trace * dilation
+    out.yy = (HALF * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * dilation
     out.x = g[G_X]
     out.y = g[G_Y]
     out.depth = g[G_Z]
-    out.rgb = wp.vec3(g[G_RED], g[G_GREEN], g[G_BLUE])
+    out.rgb = wp.vec3(wp.vec3d(g[G_RED], g[G_GREEN], g[G_BLUE]))
     return out
 
 
