@@ -126,7 +126,7 @@ def test_gradients_agree_with_the_oracle(make, model):
 
 @pytest.mark.parametrize("seed", range(100, 114))
 def test_gradients_of_needles_agree_with_the_oracle(seed):
-    """Their ends move by their length times what their axes are off: with axes in float32 one tensor in ten of these was off."""
+    """Their ends move by their length times what their axes are off: with axes in float32 one tensor in a hundred was off."""
     for model in (MODELS[0], MODELS[2]):
         for name, mine, reference in gradients_of_both(needles_and_pancakes(seed), model):
             assert_gradient(name, mine, reference)

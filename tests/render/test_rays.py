@@ -53,9 +53,9 @@ def test_forward_agrees_with_the_oracle(way):
     assert (frame.instance != instance)[sure & ((alpha - 0.5).abs() > 1e-4)].float().mean() < 0.002
 
 
-def assert_gradients(placed: list[Placed], camera: Camera, model: SplatModel, order: str) -> set[str]:
-    """Of every field, feature, pose, end pose and lens parameter, as the oracle has them, of a random loss on rgb, alpha, depth, features
-    and normals; returns their names."""
+def gradients_of_both(placed: list[Placed], camera: Camera, model: SplatModel, order: str):
+    """(name, ours, the oracle's) for every field, feature, pose, end pose and lens parameter, of a random loss on rgb, alpha, depth and
+    features."""
     dice = torch.Generator().manual_seed(5)
     features = [torch.randn(len(p.gaussians), 2, generator=dice) for p in placed]
     leaf = lambda t: None if t is None else t.clone().requires_grad_()  # noqa: E731
@@ -87,18 +87,25 @@ def assert_gradients(placed: list[Placed], camera: Camera, model: SplatModel, or
     config = replace(EXACT, order=order)
     frame = rasterize(mine, my_camera, ("rgb", "alpha", "depth", "features"), model=model, config=config, features=my_features)
     loss(frame.rgb, frame.alpha, frame.depth, frame.features).backward()
-    both = {"camera pose": (my_camera.world_from_cam, start), "camera end pose": (my_camera.world_from_cam_end, end)}
-    names = [f.name for f in fields(camera.lens)]
+    poses = {"camera pose": (my_camera.world_from_cam, start), "camera end pose": (my_camera.world_from_cam_end, end)}
     for i, (p, (of, pose, _)) in enumerate(zip(mine, truth, strict=True)):
         for name, tensor in [*p.gaussians.tensors().items(), ("features", my_features[i])]:
-            assert_gradient(f"{name} of {i}", tensor.grad, of[name].grad)
-        both |= {f"pose of {i}": (p.world_from_local, pose), f"end pose of {i}": (p.world_from_local_end, ends[i])}
-    both = {name: pair for name, pair in both.items() if pair[0] is not None}
-    for name, pair in both.items():
-        assert_gradient(name, *(tangent(pose) for pose in pair))
-    for name, a, b in zip(names, my_lens.grad, lens.grad, strict=True):
-        assert_gradient(f"lens {name}", a, b)
-    return {*both, *names}
+            yield f"{name} of {i}", tensor.grad, of[name].grad
+        poses |= {f"pose of {i}": (p.world_from_local, pose), f"end pose of {i}": (p.world_from_local_end, ends[i])}
+    for name, (ours, theirs) in poses.items():
+        if ours is not None:
+            yield name, tangent(ours), tangent(theirs)
+    for name, a, b in zip([f.name for f in fields(camera.lens)], my_lens.grad, lens.grad, strict=True):
+        yield name, a, b
+
+
+def assert_gradients(placed: list[Placed], camera: Camera, model: SplatModel, order: str) -> set[str]:
+    """All of `gradients_of_both` within the tolerance; returns their names."""
+    seen = set()
+    for name, mine, reference in gradients_of_both(placed, camera, model, order):
+        assert_gradient(name, mine, reference)
+        seen.add(name)
+    return seen
 
 
 @pytest.mark.parametrize("way", WAYS)
