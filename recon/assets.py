@@ -14,7 +14,7 @@ import torch
 
 from recon.cleaning import cleaned
 from render import Frame, rasterize
-from scenes.asset import Asset
+from scenes.asset import Actor, Asset
 from scenes.camera import Camera
 from scenes.databank import Databank
 from scenes.files import load
@@ -85,7 +85,7 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     for actor in scene.actors:
         if actor.asset.meta.get("inserted"):
             continue  # it came from a databank
-        cut = cleaned(within_box(actor.asset.gaussians, actor.asset.size), actor.asset.size)
+        cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
         sight = seen(scene, actor.trajectory, actor.asset.size)
         middle = actor.trajectory.world_from_body[len(actor.trajectory) // 2]
         yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True} | _ground(scene, middle), sight)
@@ -99,6 +99,15 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
         sight = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), size)
         asset = Asset(cut, size, entry["label"], scene.model)
         yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight)
+
+
+def at_rest(actor: Actor) -> Gaussians:
+    """An actor's splats in the one posture of those that were seen that moves them least: the mean of a walk is no posture."""
+    splats, deformation = actor.asset.gaussians, actor.deformation
+    if deformation is None or not len(splats):
+        return splats
+    postures = [deformation.at(int(t)).at(splats.means) for t in deformation.times_us]
+    return replace(splats, means=splats.means + min(postures, key=lambda moved: float(moved.square().sum())))
 
 
 def _ground(scene: Scene, pose: torch.Tensor) -> dict:

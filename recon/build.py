@@ -14,12 +14,15 @@ from recon.album import keep_album
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
 from recon.fit import Fit, FitConfig, run
 from recon.frames import Frames, load_frames
+from recon.limbs import Limbs
 from recon.log import Log, Track
 from recon.model import MODEL, Knots
 from recon.motion import Motion
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.start import Start, prepare
+from recon.strides import stride_of
+from recon.tracks import LIMBED
 from render.progress import Progress
 from scenes.asset import Actor, Asset
 from scenes.camera import RigCamera
@@ -184,7 +187,11 @@ def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
     boxes = [t.size for t in start.tracks]
     trained = torch.tensor([v.time_us for v in frames.of(0)])
     motion = Motion(frames, start.rig, Knots(start.ego, trained), actors, boxes)
-    return Fit(frames, motion, start.splats, start.sky, start.exposures, config)
+    limbed = [(i + 1, t) for i, t in enumerate(start.tracks) if t.label in LIMBED and "limbs" in config.refine]
+    strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
+    times = [v.time_us for v in frames.views]
+    limbs = Limbs(strides, start.tracks, (min(times), max(times)))
+    return Fit(frames, motion, start.splats, start.sky, start.exposures, limbs, config)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
@@ -200,7 +207,9 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
         trajectory = fit.motion.trajectory(i)
         meta = {**share, "track": track.name}
-        actors.append(Actor(Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta), trajectory, track.name))
+        deformation = fit.limbs.of[i + 1].deformation() if i + 1 in fit.limbs.of else None
+        asset = Asset(gaussians, torch.from_numpy(track.size), track.label, MODEL, meta)
+        actors.append(Actor(asset, trajectory, track.name, deformation))
     parked = [
         {"track": t.name, "label": t.label, "size": t.size.tolist(), "world_from_box": middle_pose(t).tolist()}
         for t in log.tracks

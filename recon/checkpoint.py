@@ -18,7 +18,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 4
+VERSION = 5
 
 
 def checkpoint_path(output: Path) -> Path:

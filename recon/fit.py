@@ -17,12 +17,14 @@ from recon.develop import developed
 from recon.frames import Frames, View
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
+from recon.limbs import Limbs
 from recon.losses import PictureLoss
 from recon.model import Splats, draw, placed_groups
 from recon.motion import REFINED, Moment, Motion
 from recon.sight import Eye, in_sight
 from render.rays import world_directions
 from scenes.camera import Camera
+from scenes.gaussians import Placed
 from scenes.poses import inverse
 
 
@@ -42,8 +44,9 @@ class FitConfig:
     """Steps between densifications."""
     grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
-    refine: tuple[str, ...] = (*REFINED, "exposures")
-    """What is corrected besides the splats and the sky: poses and clocks by kind, and the cameras' exposures against the first's."""
+    refine: tuple[str, ...] = (*REFINED, "exposures", "limbs")
+    """What is corrected besides the splats and the sky: poses and clocks by kind, the cameras' exposures against the first's, and how the
+    limbs of people and animals stand."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
     dissimilarity: float = 0.2
@@ -87,9 +90,10 @@ class Fit:
         splats: Splats,
         sky: torch.Tensor,
         exposures: torch.Tensor,
+        limbs: Limbs,
         config: FitConfig,
     ):
-        self.frames, self.motion, self.config = frames, motion, config
+        self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
         self.splats, self.sky, self.exposures = splats, sky, exposures
         self.step_count = 0
         self.training = frames.training()
@@ -143,7 +147,8 @@ class Fit:
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if aside is not None:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
-        (loss + haze + self.motion.unrest() + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        unrest = self.motion.unrest() + self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
+        (loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self._follow()
         self.step_count += 1
@@ -167,10 +172,15 @@ class Fit:
 
     def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment]) -> tuple[torch.Tensor, torch.Tensor]:
         """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes."""
-        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        placed = self._placed(shown, view, camera)
         rgb, alpha = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha")
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha
+
+    def _placed(self, shown: Splats, view: View, camera: Camera) -> list[Placed]:
+        """The splats in sight where they are at a view's moment."""
+        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        return self.limbs.bent(placed, view.time_us)
 
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
@@ -186,7 +196,7 @@ class Fit:
 
     def _gaps(self, shown: Splats, view: View, camera: Camera) -> torch.Tensor:
         """Mean of 1 - alpha below the horizon as a camera sees a view's moment."""
-        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        placed = self._placed(shown, view, camera)
         (alpha,) = draw(placed, camera, "alpha")
         return ((1 - alpha) * (world_directions(camera)[..., 2] < HORIZON)).mean()
 
@@ -225,6 +235,7 @@ class Fit:
             self.pose_adam.step()
         for optimiser in (self.rest_adam, self.pose_adam):
             optimiser.zero_grad(set_to_none=True)
+        self.limbs.follow(self.progress)
 
     # ---- growth
 
@@ -250,6 +261,7 @@ class Fit:
             "sky": self.sky.detach(),
             "exposures": self.exposures.detach(),
             "motion": self.motion.tensors(),
+            "limbs": self.limbs.tensors(),
             "adam": [o.state_dict() for o in (self.rest_adam, self.pose_adam)],
             "generator": self.generator.get_state(),
             "step": self.step_count,
@@ -262,6 +274,7 @@ class Fit:
         self.growth, self.descent = Growth(**state["growth"]), Descent(**state["descent"])
         self.sky, self.exposures = state["sky"], state["exposures"]
         self.motion.restore(state["motion"])
+        self.limbs.restore(state["limbs"])
         self._optimise()
         for optimiser, saved in zip((self.rest_adam, self.pose_adam), state["adam"], strict=True):
             optimiser.load_state_dict(saved)

@@ -13,6 +13,9 @@ from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
 KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": "cyc", "cyclist": "cyc"}
+LIMBED = frozenset({*KINDS, "personal-mobility-device", "wheeled-device", "stroller", "animal", "animals-other", "dog"})
+"""Classes whose bodies bend as they go, by all readers' names."""
+
 VEHICLES = {
     "car", "pickup", "truck", "bus", "van", "vehicle", "construction-vehicle", "emergency-vehicle", "trailer", "pedicab", "train", "tram",
 }  # fmt: skip

@@ -50,20 +50,24 @@ def correspond(
 ) -> Correspondence:  # fmt: skip
     """Where the surface points of `depth` and `instance` `[h, w]` stand in `other`. corner: x, y of the first pixel in `camera`'s image.
 
-    A point lies at the pixel's depth and moves rigidly with its instance. Where nothing is drawn (instance -1) the pixel is
-    sky and moves by the cameras' rotation only: its point is infinitely far. While a shutter moves, a pixel's point is that of the moment
-    at which the pixel is read out, and stands in `other` where it is when the row or column in which it appears is read out there.
+    A point lies at the pixel's depth and moves with its instance, by what its lattices say where that deforms. Where nothing is drawn
+    (instance -1) the pixel is sky and moves by the cameras' rotation only: its point is infinitely far. While a shutter moves, a pixel's
+    point is that of the moment at which the pixel is read out, and stands in `other` where it is when the row or column in which it appears
+    is read out there; what deforms is taken as in the middle of either readout.
     """
     device = depth.device
     height, width = depth.shape
     part = (slice(corner[1], corner[1] + height), slice(corner[0], corner[0] + width))
     origins = camera_origins(camera)
     ways = _ways(placed, camera, there, other, part).to(device)
+    rays = camera_rays(camera)
+    bends = _bends(placed, camera, depth, instance, there, rays[part], origins if origins.ndim == 1 else origins[part])
     pixels = torch.empty(height, width, 2, dtype=torch.float64, device=device)
     found = Correspondence(torch.empty(height, width, 2, device=device), pixels, torch.empty(height, width, device=device))
     tensors = [
-        (camera_rays(camera), wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (depth.detach(), float),
-        (instance.to(torch.int32), int), (_places(placed, device), int), (ways, wp.mat44d), int(camera.shutter == "columns"),
+        (rays, wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (bends, wp.vec3),
+        (depth.detach(), float), (instance.to(torch.int32), int), (_places(placed, device), int), (ways, wp.mat44d),
+        int(camera.shutter == "columns"),
     ]  # fmt: skip
     kept = [(t[0].to(device).contiguous(), t[1]) if isinstance(t, tuple) else t for t in tensors]
     with stage(device):
@@ -103,6 +107,29 @@ def _ways(placed: Sequence[Placed], camera: Camera, there: Sequence[Placed], oth
     ways = (poses(other, then)[:, :, None] @ local_from_cam[:, None]).detach()
     ways[-1, ..., :3, 3] = 0  # it is infinitely far: only turning moves it
     return ways
+
+
+def _bends(
+    placed: Sequence[Placed], camera: Camera, depth: torch.Tensor, instance: torch.Tensor, there: Sequence[Placed], rays: torch.Tensor,
+    origins: torch.Tensor,
+) -> torch.Tensor:  # fmt: skip
+    """How far each pixel's point moves within its instance from here to there, in this camera's frame as its first row is read; float32
+    `[h, w, 3]`, `[1, 1, 3]` where nothing deforms."""
+    moved = {p.instance: p.lattice for p in there}
+    bent = [(p, moved[p.instance]) for p in placed if p.instance in moved and not (p.lattice is None and moved[p.instance] is None)]
+    if not bent:
+        return torch.zeros(1, 1, 3)
+    out = torch.zeros(*depth.shape, 3, device=depth.device)
+    for p, then in bent:
+        mine = (instance == p.instance) & torch.isfinite(depth)
+        here = mine.to(rays.device)
+        points = depth[mine][:, None] * rays[here].to(depth) + (origins if origins.ndim == 1 else origins[here]).to(depth)
+        turn = (inverse(p.world_from_local.detach()) @ camera.world_from_cam.detach()).to(depth)
+        now = points @ turn[:3, :3].T + turn[:3, 3]
+        before = now if p.lattice is None else p.lattice.origin(now)
+        after = before if then is None else before + then.at(before)
+        out[mine] = (after - now).detach() @ turn[:3, :3]
+    return out
 
 
 def _read_out(carried: Callable[[torch.Tensor], torch.Tensor], other: Camera, share: torch.Tensor, moving: bool) -> None:

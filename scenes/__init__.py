@@ -35,6 +35,8 @@ _HOME = {
     "Trajectory": "trajectory",
     "Asset": "asset",
     "Actor": "asset",
+    "Deformation": "deformation",
+    "Lattice": "deformation",
     "Sky": "sky",
     "Ground": "ground",
     "Scene": "scene",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from scenes.checks import check_tensor
+from scenes.deformation import Deformation
 from scenes.gaussians import Gaussians, SplatModel
 from scenes.trajectory import Trajectory
 
@@ -30,8 +31,10 @@ class Asset:
 
 @dataclass(frozen=True)
 class Actor:
-    """An asset on a trajectory of its own frame; `track` names it in the log and in the scene."""
+    """An asset on a trajectory of its own frame; `track` names it in the log and in the scene. deformation: how it bends on the way, in
+    that frame; rigid where None."""
 
     asset: Asset
     trajectory: Trajectory
     track: str
+    deformation: Deformation | None = None

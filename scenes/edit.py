@@ -43,12 +43,15 @@ class Edit:
 
     def apply(self, actor: Actor, scene: Scene) -> Actor:
         """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were."""
-        asset, path = self.replace.get(actor.track, actor.asset), actor.trajectory
+        asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
         if actor.track in self.shift:
             path = shifted(path, self.shift[actor.track], scene)
         if actor.track in self.retime:
             path = replace(path, times_us=path.times_us + self.retime[actor.track])
-        return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path)
+            deformation = deformation and deformation.later(self.retime[actor.track])
+        if actor.track in self.replace:
+            deformation = None  # another body bends elsewhere
+        return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 
 
 def check_edit(edit: Edit, scene: Scene) -> None:

@@ -43,6 +43,9 @@ def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: b
 
         for name, gaussians in splats_of(thing):
             gaussians.validate(name)
+        for actor in thing.actors:
+            if actor.deformation is not None:
+                actor.deformation.validate(f"actor {actor.track}")
         save_scene(path, thing, overwrite, half)
         return
     form = named(path)

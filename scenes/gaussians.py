@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 
 from scenes.checks import check_tensor
+from scenes.deformation import Lattice
 from scenes.poses import as_pose
 
 SH_COUNTS = (1, 4, 9, 16)
@@ -149,12 +150,14 @@ def _not_finite(field: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Placed:
-    """Gaussians at a pose: `world_from_local` float64 `[4, 4]`; an end pose where it moves during the shutter."""
+    """Gaussians at a pose: `world_from_local` float64 `[4, 4]`; an end pose where it moves during the shutter. lattice: what has moved
+    the splats already within their frame, for who follows a surface to where it is at another time."""
 
     gaussians: Gaussians
     world_from_local: torch.Tensor
     world_from_local_end: torch.Tensor | None = None
     instance: int = 0
+    lattice: Lattice | None = None
 
     def __post_init__(self):
         for name in ("world_from_local", "world_from_local_end"):

@@ -104,6 +104,7 @@ def _about_scene(scene: Scene) -> dict:
             "size": [round(v, 3) for v in a.asset.size.tolist()],
             "splats": len(a.asset.gaussians),
             "poses": len(a.trajectory),
+            **({} if a.deformation is None else {"modes": len(a.deformation.modes)}),
             "seconds": [_seconds(t, times[0]) for t in a.trajectory.times_us[[0, -1]]],
             "inserted": bool(a.asset.meta.get("inserted", False)),
             "edited": bool(a.asset.meta.get("edited", False)),

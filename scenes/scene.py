@@ -8,6 +8,7 @@ import torch
 
 from scenes.asset import Actor
 from scenes.camera import Camera, RigCamera
+from scenes.deformation import Lattice
 from scenes.gaussians import Placed, SplatModel
 from scenes.ground import Ground
 from scenes.names import unknown
@@ -40,7 +41,11 @@ class Scene:
     def to(self, device) -> Scene:
         """The same scene with its splats on a device; poses, lenses, sky and ground stay where they are."""
         background = replace(self.background, gaussians=self.background.gaussians.to(device))
-        actors = tuple(replace(a, asset=replace(a.asset, gaussians=a.asset.gaussians.to(device))) for a in self.actors)
+        actors = tuple(
+            replace(a, asset=replace(a.asset, gaussians=a.asset.gaussians.to(device)), deformation=d and d.to(device))
+            for a in self.actors
+            for d in [a.deformation]
+        )
         return replace(self, background=background, actors=actors)
 
     def rig_camera(self, name: str) -> RigCamera:
@@ -60,13 +65,21 @@ class Scene:
 
     def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:
         """Background and the actors that exist at a time, each at its pose and under its instance id; with the pose to which it
-        moves while an image is read out, where that takes `readout_us`."""
+        moves while an image is read out, where that takes `readout_us`. What deforms stands as in the middle of it."""
         here = [(i, a) for i, a in enumerate(self.actors) if a.trajectory.covers(time_us)]
         poses = all_at([a.trajectory for _, a in here], time_us)
         actors = [
             Placed(a.asset.gaussians, pose, _end(a, time_us, readout_us), instance=i + 1) for (i, a), pose in zip(here, poses, strict=True)
         ]
-        return [self.background, *actors]
+        middle = time_us + readout_us // 2
+        bent = [p if a.deformation is None else bend(p, a.deformation.at(middle)) for (_, a), p in zip(here, actors, strict=True)]
+        return [self.background, *bent]
+
+
+def bend(placed: Placed, lattice: Lattice) -> Placed:
+    """What is placed with its splats moved by a lattice; how they are turned and shaped stays."""
+    splats = placed.gaussians
+    return replace(placed, gaussians=replace(splats, means=splats.means + lattice.at(splats.means)), lattice=lattice)
 
 
 def _end(actor: Actor, time_us: int, readout_us: int) -> torch.Tensor | None:

@@ -19,6 +19,7 @@ from scenes.edit import Edit, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
 from scenes.usd import new_stage, open_stage, own_data, set_own_data, valid_names
+from scenes.usd_deformation import author_weights, block_deformation
 from scenes.usd_root import add_sublayer, drop_sublayer
 from scenes.usd_scene import author_actor, author_path, read_edits, read_metadata
 from scenes.usd_splats import only_splats, save_asset, to_json
@@ -81,7 +82,10 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
             set_own_data(prim, edited=name)
             if actor.track in edit.shift or actor.track in edit.retime:
                 author_path(prim, actor.trajectory, origin)
+            if actor.deformation is not None and actor.track in edit.retime:
+                author_weights(prim, actor.deformation, origin)
             if actor.track in edit.replace:
+                block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
         if hidden.any():
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usdc"]

@@ -3,7 +3,8 @@
 scene.usda        the order in which the layers below count, nothing else (scenes/usd_root.py)
 recorded.usda     Z up, metres, one time code a microsecond counted from the first body pose; lays out /World
 background.usdc   the background's splats, a payload of /World/Background
-actors/*.usdc     one asset each, referenced by /World/Actors/<track>, whose translate and orient samples are its trajectory
+actors/*.usdc     one asset each, referenced by /World/Actors/<track>, whose translate and orient samples are its trajectory, and
+                  which carries its deformation, if it has one (scenes/usd_deformation.py)
 edits/*.usda      sublayers that add, change and remove actors without touching the rest (scenes/usd_edit.py)
 ground.usdc       the height field as a mesh, referenced by /World/Ground; a guide: not rendered
 sky_linear.hdr    the texture of /World/Lights/Sky
@@ -34,6 +35,7 @@ from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
 from scenes.usd import array, author_pose, local_pose, new_stage, open_stage, own_data, set_own_data, valid_names, world_poses
+from scenes.usd_deformation import author_deformation, read_deformation
 from scenes.usd_root import RECORDED, write_root
 from scenes.usd_splats import Clean, only_splats, read_asset, read_splats, save_asset, save_gaussians, to_json
 
@@ -145,11 +147,14 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
 
 
 def author_actor(stage: Usd.Stage, name: str, actor: Actor, asset_file: str, origin: int, **data) -> None:
-    """Define /World/Actors/<name>: a reference to an asset file, moving along the actor's trajectory while it covers the time."""
+    """Define /World/Actors/<name>: a reference to an asset file, moving along the actor's trajectory while it covers the time, and
+    deforming as it does."""
     prim = UsdGeom.Xform.Define(stage, f"/World/Actors/{name}").GetPrim()
     prim.GetReferences().AddReference(asset_file)
     set_own_data(prim, track=actor.track, **data)
     author_path(prim, actor.trajectory, origin)
+    if actor.deformation is not None:
+        author_deformation(prim, actor.deformation, origin)
 
 
 def author_path(prim: Usd.Prim, path: Trajectory, origin: int) -> None:
@@ -253,7 +258,7 @@ def _load_actor(prim: Usd.Prim, path: Path, origin: int, clean: Clean) -> Actor:
         asset = replace(asset, meta={**asset.meta, "inserted": True, "edit": data.get("edit", "")})
     if data.get("edited"):
         asset = replace(asset, meta={**asset.meta, "edited": data["edited"]})
-    return Actor(asset, _trajectory(prim, origin), data.get("track", prim.GetName()))
+    return Actor(asset, _trajectory(prim, origin), data.get("track", prim.GetName()), read_deformation(prim, origin))
 
 
 def _trajectory(prim: Usd.Prim, origin: int) -> Trajectory:

@@ -19,13 +19,14 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def carry(
         rays: wp.array2d[wp.vec3], origins: wp.array2d[wp.vec3], left: int, top: int,
-        depth: wp.array2d[float], instance: wp.array2d[int], place: wp.array[int],
+        bends: wp.array2d[wp.vec3], depth: wp.array2d[float], instance: wp.array2d[int], place: wp.array[int],
         ways: wp.array3d[wp.mat44d], by_columns: int, shares: wp.array2d[wp.float64], optics: Optics,
         pixels: wp.array2d[wp.vec2d], flow: wp.array2d[wp.vec2], depths: wp.array2d[float],
         first: int,
     ):  # fmt: skip
-        """ways[place[instance], k, line]: coefficient of the k-th power of the share; the line is the pixel's row or column where each
-        has its own. The last of the ways is the sky's, which only turns. depths: the points' own in the other camera, inf for the sky."""
+        """bends: how far a point moves within its instance, seen from here. ways[place[instance], k, line]: coefficient of the k-th power
+        of the share; the line is the pixel's row or column where each has its own. The last of the ways is the sky's, which only turns.
+        depths: the points' own in the other camera, inf for the sky."""
         row, column = pixel_of(first + wp.tid(), depth.shape[1])
         powers = ways.shape[1]
         line = int(0)
@@ -39,7 +40,8 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
         else:
             ray = wp.float64(depth[row, column]) * ray
         start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
-        p = start + ray
+        bend = bends[wp.min(row, bends.shape[0] - 1), wp.min(column, bends.shape[1] - 1)]
+        p = start + ray + wp.vec3d(bend)
         v = wp.transform_point(ways[i, powers - 1, line], p)
         for k in range(1, powers):
             v = wp.transform_point(ways[i, powers - 1 - k, line], p) + shares[row, column] * v

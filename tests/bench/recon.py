@@ -1,24 +1,41 @@
 """What each part of a fit is worth: held-out PSNR of short fits of one drive with it and without.
 
-    python -m tests.bench.recon DRIVE [--cameras NAME ...] [--steps 1200] [--splats 100000] [--size 480 270] [--only PART ...]
+    python -m tests.bench.recon DRIVE [--cameras NAME ...] [--steps 1200] [--splats 100000] [--size 480 270] [--only PART ...] [--seed 0]
 
 The first row is the whole fit; every other one leaves one part out and says what that costs, over held-out frames while the car drives.
-The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does.
+The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does. "people" is all pixels
+of all held-out frames in the recorded boxes of who has limbs and moves, taller than 20 pixels, where the first row's scene without them
+shows nothing nearer; "-" where there are none. DRIVE may be "walk": a made-up street with two people who walk (tests/walker.py), 192x108.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull, QhullError
+
 from recon import open_log
 from recon.build import assemble, begin, choose
 from recon.fit import FitConfig
-from recon.log import Log
-from recon.report import held_out_table
+from recon.frames import Frames
+from recon.log import Log, Track
+from recon.report import held_out_table, read_out
+from recon.tracks import LIMBED
+from render import render_frame
+from scenes.camera import Camera, RigCamera
+from scenes.poses import inverse
+from scenes.scene import Scene
+
+TALL = 20.0
+"""Pixels from which on people count."""
 
 Setting = tuple[Log, FitConfig]
 PARTS: dict[str, Callable[[Log, FitConfig], Setting]] = {}
@@ -46,16 +63,90 @@ for kind in FitConfig().refine:
     _unrefined(kind)
 
 
-def held_out_psnr(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[dict[str, float], float]:
-    """PSNR of each camera's held-out frames while driving, or of all where it never drives, and CPU seconds of the fit."""
+Masks = dict[tuple[int, int], torch.Tensor]
+"""By a view's camera and index, bool `[H, W]`: where people show."""
+
+
+def people(scene: Scene, log: Log, frames: Frames) -> Masks:
+    """Where held-out frames show people."""
+    walkers = [t for t in log.tracks if t.moving and t.label in LIMBED]
+    without = replace(scene, actors=tuple(a for a in scene.actors if a.track not in {t.name for t in walkers}))
+    masks = {}
+    for view, camera in _held_out(scene, frames):
+        depth = render_frame(without, camera, ("depth",)).depth
+        shown = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+        for track in walkers:
+            shown |= _shown(track, camera, depth)
+        masks[view.camera, view.index] = shown
+    return masks
+
+
+def _held_out(scene: Scene, frames: Frames):
+    for c, name in enumerate(frames.names):
+        began = dict(zip([v.index for v in frames.views if v.camera == c], scene.frame_times(name).tolist(), strict=True))
+        yield from ((view, scene.camera(name, began[view.index])) for view in frames.of(c, held_out=True))
+
+
+def _shown(track: Track, camera: Camera, depth: torch.Tensor | None) -> torch.Tensor:
+    """bool `[H, W]`: the convex hull of a box's corners, where nothing stands nearer."""
+    nowhere = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    path = track.trajectory()
+    if depth is None or not path.covers(camera.time_us):
+        return nowhere
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * track.size
+    pose = (inverse(camera.world_from_cam) @ path.at(camera.time_us)).numpy()
+    local = corners @ pose[:3, :3].T + pose[:3, 3]
+    if local[:, 2].min() < 0.5:
+        return nowhere
+    pixels = camera.lens.project(torch.from_numpy(local)).numpy()
+    try:
+        hull = ConvexHull(pixels)
+    except QhullError:
+        return nowhere
+    if np.ptp(pixels[:, 1]) < TALL:
+        return nowhere
+    inside = (camera.pixel_centres() @ torch.from_numpy(hull.equations[:, :2].T) + torch.from_numpy(hull.equations[:, 2]) <= 0).all(-1)
+    return inside & (depth >= float(local[:, 2].min()))
+
+
+def people_psnr(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: Masks) -> float:
+    """PSNR over all pixels of the masks; nan where there is none."""
+    squares, count = 0.0, 0
+    for view, camera in _held_out(scene, frames):
+        mask = masks[view.camera, view.index]
+        if mask.any():
+            rgb = render_frame(read_out(scene, camera, rig[frames.names[view.camera]]), camera).rgb
+            assert rgb is not None
+            off = (rgb - view.image.float() / 255)[mask]
+            squares, count = squares + float(off.square().sum()), count + off.numel()
+    return -10 * math.log10(squares / count) if count else math.nan
+
+
+@torch.no_grad()
+def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: Masks) -> dict[str, float]:
+    """PSNR of each camera's held-out frames while driving, or of all where it never drives, and of "people"."""
+    rows = sorted(held_out_table(scene, frames, rig), key=lambda r: r["which"] == "driving")
+    return {r["camera"]: r["psnr"] for r in rows} | {"people": people_psnr(scene, frames, rig, masks)}
+
+
+def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float]:
+    """The fitted scene, the frames, the log's cameras, and CPU seconds of the fit."""
     _, span = choose(log, names)
     start, fit = begin(log, names, span, size, config)
     began = time.process_time()
     while fit.step_count < config.steps:
         fit.step()
     spent = time.process_time() - began
-    rows = held_out_table(assemble(fit, start, log), fit.frames, start.rig)
-    return {r["camera"]: r["psnr"] for r in sorted(rows, key=lambda r: r["which"] == "driving")}, spent
+    return assemble(fit, start, log), fit.frames, start.rig, spent
+
+
+def opened(drive: Path) -> Log:
+    if str(drive) != "walk":
+        return open_log(drive)
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # as pytest does
+    from walker import log_of, walk
+
+    return log_of(walk())
 
 
 def main() -> None:
@@ -66,17 +157,24 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=100_000)
     parser.add_argument("--size", type=int, nargs=2, default=(480, 270))
     parser.add_argument("--only", nargs="+", default=list(PARTS), choices=list(PARTS), metavar="PART")
+    parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    log, config = open_log(asked.drive), FitConfig(steps=asked.steps, budget=asked.splats)
+    log, config = opened(asked.drive), FitConfig(steps=asked.steps, budget=asked.splats, seed=asked.seed)
     names, _ = choose(log, asked.cameras)
-    print(f"{'without':<24}" + "".join(f"{name:>22}" for name in names) + f"{'CPU s':>8}", flush=True)
+    size = (192, 108) if str(asked.drive) == "walk" else (asked.size[0], asked.size[1])
+    columns = [*names, "people"]
+    print(f"{'without':<24}" + "".join(f"{name:>22}" for name in columns) + f"{'CPU s':>8}", flush=True)
     whole: dict[str, float] = {}
+    masks: Masks = {}
     for what in ("", *asked.only):
         setting: Setting = PARTS[what](log, config) if what else (log, config)
-        found, spent = held_out_psnr(*setting, names, (asked.size[0], asked.size[1]))
+        scene, frames, rig, spent = fitted(*setting, names, size)
+        with torch.no_grad():
+            masks = masks or people(scene, log, frames)
+        found = told(scene, frames, rig, masks)
         whole = whole or found
-        told = [f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in names]
-        print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in told) + f"{spent:>8.0f}", flush=True)
+        cells = ["-" if math.isnan(found[n]) else f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in columns]
+        print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in cells) + f"{spent:>8.0f}", flush=True)
 
 
 if __name__ == "__main__":
