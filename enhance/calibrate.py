@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch.nn import functional as F
 
-from enhance.colour import thin
 from enhance.corrections import corrected
-from enhance.net import MULTIPLE, Net, hard_gate, recoloured
+from enhance.net import MULTIPLE, Net, hard_gate
 from enhance.precision import autocast
 from enhance.shards import Shard, Window
 
@@ -18,9 +17,6 @@ CLEAN_DB = 49.0
 """PSNR that clean training pictures must keep against themselves. New places fare worse: drive 002's front camera by 7 dB."""
 LEAST = (2.0, 0.5)
 """Least that may be chosen, without a mask and with one: a picture of which nothing is told may be any video, and right already."""
-LEAST_COLOUR = 1000.0
-"""The same of altered colours, of which nothing told says where they are. Streets never seen look altered to a network that has seen a few:
-from 9, which kept CLEAN_DB in training, frames of lund fell to 18 dB against themselves; from 1000 on they stay."""
 SHUTS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 15.0, 25.0, 40.0, 200.0, 1000.0)
 PICTURES = 16
 
@@ -29,33 +25,21 @@ Changed = Callable[[torch.Tensor, torch.Tensor], Callable[[float], torch.Tensor]
 
 
 @torch.no_grad()
-def calibrate_colour(net: Net, clean: Sequence[Shard]) -> None:
-    """Set `net.shut_colour`: the least of SHUTS, from LEAST_COLOUR, at which clean pictures without a mask keep CLEAN_DB."""
-
-    def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
-        with autocast(rgb.device):
-            fields = net.colour(thin(rgb), thin(told))
-        return lambda shut: recoloured(rgb, told, fields, torch.tensor(shut))
-
-    _choose(net.shut_colour[None], clean, changed, (LEAST_COLOUR,))
-
-
-@torch.no_grad()
 def calibrate_gate(net: Net, clean: Sequence[Shard]) -> None:
-    """Set `net.shut` in the same way, without a mask and with one, with altered colours undone or not as they are."""
+    """Set `net.shut`: the least of SHUTS, from LEAST, at which clean pictures keep CLEAN_DB, without a mask and with one."""
 
     def changed(rgb: torch.Tensor, told: torch.Tensor) -> Callable[[float], torch.Tensor]:
         mask = torch.where(told[:, 1:] > 0, told[:, :1], torch.nan)
         with autocast(rgb.device):
             out = net(rgb, mask)
-        return lambda shut: rgb + hard_gate(out.logits, shut) * (out.ungated - out.base)
+        return lambda shut: rgb + hard_gate(out.logits, shut) * (out.ungated - rgb)
 
     _choose(net.shut, clean, changed, LEAST)
 
 
 @torch.no_grad()
 def repair_gain(net: Net, pairs: Sequence[Shard]) -> list[float]:
-    """By how many dB of mean squared error `Net.repair` brings pairs nearer to their targets, beside what colours and told objects already
+    """By how many dB of mean squared error `Net.repair` brings pairs nearer to their targets, beside what told objects
     are put right: without a mask and with one. 0 where there are no pairs."""
     gains = []
     for knowing in (0, 1):
@@ -67,7 +51,7 @@ def repair_gain(net: Net, pairs: Sequence[Shard]) -> list[float]:
             with autocast(rgb.device):
                 out = net(rgb, mask)
             right = F.pad(window.target, (0, rgb.shape[-1] - shard.width, 0, rgb.shape[-2] - shard.height), mode="replicate")
-            errors.append(torch.stack([(x.clamp(0, 1) - right).square().mean() for x in (out.base, out.rgb)]))
+            errors.append(torch.stack([(x.clamp(0, 1) - right).square().mean() for x in (rgb, out.rgb)]))
         before, after = torch.stack(errors).sum(0).clamp_min(1e-12).tolist()
         gains.append(10 * math.log10(before / after))
     return gains

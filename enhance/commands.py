@@ -83,7 +83,7 @@ class Train:
     start: str | None = None
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
-    """What of colour, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
+    """What of objects, shade, enhancer to train further; the rest of the weights stays as it is."""
     resume: Flag = False
     """Go on from the folder's checkpoint."""
 

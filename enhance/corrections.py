@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 
 from enhance.objects import COEFFICIENTS, Box, Evidence, ObjectNet, along, boxes, changed, evidence, spots, whole_of
+from enhance.seam import ENDS, fitted
 from enhance.shade import NONE, optical_depths, read_ground, shaded
 
 STEADY = 8
@@ -57,17 +58,21 @@ def _looked_at(
     due = [i for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0]  # not all in the same frame
     new: dict[int, torch.Tensor] = {}
     if due:
-        whole, read, around = whole_of(rgb), [], []
+        whole, read, around, seams = whole_of(rgb), [], [], []
         for i in due:
             box = found[i]
-            mask = instance[box.outer_rows, box.outer_columns] == i
+            part, ids = rgb[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns]
+            mask = ids == i
             at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
             y, x = at.yx.unbind(1)
-            read.append(evidence(rgb[:, box.outer_rows, box.outer_columns][:, y, x].T, at, whole))
-            places, (y, x) = box.ground(instance[box.outer_rows, box.outer_columns] <= 0)
+            read.append(evidence(part[:, y, x].T, at, whole))
+            seams.append((part, ids, i, at.edges, box))
+            places, (y, x) = box.ground(ids <= 0)
             around.append(read_ground(rgb[:, y, x].T, places))
-        both = torch.cat([net(Evidence.stacked(read)), net.shade(torch.stack(around))], 1)
-        new = dict(zip(due, both, strict=True))
+        guesses, shades = net(Evidence.stacked(read)), net.shade(torch.stack(around))
+        for i, seam, guess, shade in zip(due, seams, guesses, shades, strict=True):
+            colours, left = fitted(*seam, guess, net.usual)
+            new[i] = torch.cat([colours, shade if left > ENDS else torch.zeros_like(shade)])
     after = {}
     for i, count in counts.items():
         mean = before[i][0] if i in before else new[i]

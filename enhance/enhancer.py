@@ -92,7 +92,7 @@ class Enhancer:
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Where repairing was not found worth it (`repair`), nothing is done beside colours, told objects and references. Pixels whose gate
+        Where repairing was not found worth it (`repair`), nothing is done beside told objects and references. Pixels whose gate
         and trust are 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame that needs
         nothing costs nothing. Raises ValueError for values that are not finite.
         """
@@ -115,16 +115,13 @@ class Enhancer:
             planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), given.instance, memory.objects if memory else {})
             rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
         told = given.instance is not None
-        if told and not self.repairs[1]:
+        if not self.repairs[told]:
             return rgb.contiguous(), Memory(None, (height, width), given.flow is not None, objects=corrections)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if given.instance is None else _pad(given.instance.to(self.device, torch.float32)[None, None], value=0)
         past = None if memory is None else self._brought(memory, flow, padded)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-            if not self.repairs[told]:
-                better, after = self.net.recolour(padded, past)
-                better = better.where(_pad(tiles.pixels().to(better)[None, None], value=0) > 0, padded)
-            elif tiles.everything():
+            if tiles.everything():
                 out = self.net(padded, mask, past)
                 better, after = out.rgb, out.past
             else:

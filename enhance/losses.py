@@ -34,7 +34,7 @@ def region_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, l
 def where_loss(logits: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
     """Cross entropy of `logits` `[B, 1, H, W]` with the `region` 0..1 that is damaged, counted apart where it is and is not.
 
-    For the gate and for altered colours alike. Only the product of gate and change reaches the picture: a closed gate hides the
+    Only the product of gate and change reaches the picture: a closed gate hides the
     change's error and a useless change closes the gate, and training would end there. So this teaches where, and `region_loss` of
     the ungated frame what, apart. All of a rendered frame counts as damaged: told instead how wrong each place is, the gate is
     never sure of anything there and stays shut.

@@ -5,11 +5,10 @@ because both never change, what their embeddings would add to every layer is sto
 attention alternates with temporal attention over the latents of up to `history` frames enhanced before. The decoder gets
 features of the input frame, and of the last enhanced one moved to it, at every scale, and the output is
 
-    output = base + gate * (residual + blend * (last - base)),   base = input + altered * colour
+    output = input + gate * (residual + blend * (last - input))
 
-where colour undoes altered colours, averaged over the last frames: by fields (`ColourNet`) where no mask is told; told objects come
-here corrected already (`ObjectNet`). The residual is free; blending with the last picture keeps a clip calm; altered and gate are
-exactly 0 where the frame is to be left alone. Colour, residual and blend are zero in an untrained network, which therefore changes
+Told objects come here in corrected colours (`ObjectNet`). The residual is free; blending with the last picture keeps a clip calm; the
+gate is exactly 0 where the frame is to be left alone. Residual and blend are zero in an untrained network, which therefore changes
 nothing.
 """
 
@@ -23,11 +22,10 @@ from torch.nn import functional as F
 
 from enhance.attention import Block
 from enhance.autoencoder import LATENT, STRIDE, Encoder, Residual, on_blocks, zero
-from enhance.colour import FIELDS, ColourNet, altered_logits, colour_change, enlarged, thin
 from enhance.objects import ObjectNet
 from enhance.past import Past
 from enhance.precision import lower
-from enhance.tiles import Tiles, coarser, sampled, within
+from enhance.tiles import Tiles, coarser, within
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
@@ -85,13 +83,12 @@ class Stem(nn.Module):
 
 
 class FrameDecoder(nn.Module):
-    """Tokens, colour fields and the input frame's features to what is done to each pixel."""
+    """Tokens and the input frame's features to what is done to each pixel."""
 
     def __init__(self, c: NetConfig):
         super().__init__()
         self.up_eighth = nn.Conv2d(c.width, 4 * c.eighth, 1)
         self.latent = nn.Conv2d(LATENT, c.eighth, 3, padding=1)
-        self.fields = nn.Conv2d(FIELDS, c.eighth, 1)
         self.norm = nn.GroupNorm(1, c.eighth)
         self.eighth = Residual(c.eighth)
         self.up_quarter = nn.Conv2d(c.eighth, 4 * c.quarter, 1)
@@ -101,11 +98,10 @@ class FrameDecoder(nn.Module):
         self.pixels = nn.Conv2d(c.half, 4 * 5, 3, padding=1)
         zero(self.pixels)
 
-    def forward(self, tokens, latent, fields, half, quarter, eighth) -> tuple[torch.Tensor, ...]:
+    def forward(self, tokens, latent, half, quarter, eighth) -> tuple[torch.Tensor, ...]:
         """Residual `[B, 3, H, W]`, and logits of gate and blend `[B, 1, H, W]`."""
         # Normalised, because a channel that drifts far below zero here is dead for good behind the next activation.
-        fields = enlarged(fields, eighth.shape[-2:])
-        x = self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + self.fields(fields) + eighth)
+        x = self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + eighth)
         x = self.eighth(x)
         x = self.quarter(F.pixel_shuffle(self.up_quarter(F.silu(x)), 2) + quarter)
         x = self.fine(F.pixel_shuffle(self.up_half(F.silu(x)), 2) + half)
@@ -126,22 +122,11 @@ def of_mask(pair: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     return pair[0] + (pair[1] - pair[0]) * known
 
 
-@torch.no_grad()
-def recoloured(rgb: torch.Tensor, told: torch.Tensor, fields: torch.Tensor, shut: torch.Tensor) -> torch.Tensor:
-    """`rgb` `[B, 3, H, W]` with altered colours undone as `fields` say, where they are surely altered (`hard_gate` with `shut`) and
-    told `[B, 2, H, W]` (the mask and whether it is known) knows of no mask: told objects were seen to before."""
-    altered = hard_gate(altered_logits(fields, rgb.shape[-2:]), shut) * (1 - told[:, 1:])
-    if rgb.device.type == "cpu" and not altered.any():  # on CUDA, asking would cost more than it saves
-        return rgb
-    return rgb + altered * colour_change(rgb, fields)
-
-
 @dataclass(frozen=True)
 class Enhanced:
     """What one step gives.
 
     rgb      `[B, 3, H, W]`: the frame
-    base     `[B, 3, H, W]`: the input with altered colours undone
     logits   `[B, 1, H, W]`: of the gate
     ungated  `[B, 3, H, W]`: what the frame would be with an open gate
     latent   `[B, 16, H/8, W/8]`: the enhanced frame's
@@ -149,7 +134,6 @@ class Enhanced:
     """
 
     rgb: torch.Tensor
-    base: torch.Tensor
     logits: torch.Tensor
     ungated: torch.Tensor
     latent: torch.Tensor
@@ -157,19 +141,17 @@ class Enhanced:
 
 
 class Net(nn.Module):
-    """The whole network. `encoder` is the autoencoder's, `colour` is trained on thinned pictures, `objects` on objects, all before and
-    then frozen; everything else is trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one, and
-    `shut_colour` the same of altered colours: both are set in training (`enhance.calibrate`)."""
+    """The whole network. `encoder` is the autoencoder's, `objects` is trained on objects, both before and then frozen; everything else is
+    trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one: it is set in training
+    (`enhance.calibrate`)."""
 
     shut: torch.Tensor
-    shut_colour: torch.Tensor
 
     def __init__(self, config: NetConfig | None = None):
         super().__init__()
         config = config or NetConfig()
         self.config = config
         self.encoder = Encoder()
-        self.colour = ColourNet()
         self.objects = ObjectNet(config.looks)
         self.stem = Stem(config)
         self.embed = nn.Conv2d(LATENT, config.width, PATCH, stride=PATCH)
@@ -179,7 +161,6 @@ class Net(nn.Module):
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
         self.register_buffer("shut", torch.tensor([0.5, 0.5]))
-        self.register_buffer("shut_colour", torch.tensor(2.0))
         zero(self.denoise)
 
     def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None = None, past: Past | None = None) -> Enhanced:
@@ -192,18 +173,12 @@ class Net(nn.Module):
         """
         past = past or Past.none(rgb)
         told = told_of(rgb, mask)
-        fields, count = self.look(rgb, told, past)
-        better, base, logits, ungated, latent = self.repair(rgb, told, past, fields)
-        after = past.followed(better, latent, fields, count, self.config.history)
-        return Enhanced(better, base, logits, ungated, latent, after)
+        better, logits, ungated, latent = self.repair(rgb, told, past)
+        after = past.followed(better, latent, self.config.history)
+        return Enhanced(better, logits, ungated, latent, after)
 
-    def look(self, rgb: torch.Tensor, told: torch.Tensor, past: Past) -> tuple[torch.Tensor, torch.Tensor]:
-        """The colour fields of a whole frame, averaged with those of the past, and of how many frames."""
-        with torch.no_grad():
-            return past.averaged(self.colour(thin(rgb), thin(told)))
-
-    def repair(self, rgb: torch.Tensor, told: torch.Tensor, past: Past, fields: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """A frame or a window of it by its colour fields: picture, base, logits, ungated and latent, as in `Enhanced`."""
+    def repair(self, rgb: torch.Tensor, told: torch.Tensor, past: Past) -> tuple[torch.Tensor, ...]:
+        """A frame or a window of it: picture, logits, ungated and latent, as in `Enhanced`."""
         known = told[:, 1:]
         last = past.rgb * past.seen
         # the convolutions round their input to their own precision anyway: once before it is shuffled is less to move
@@ -217,22 +192,13 @@ class Net(nn.Module):
             x = block(x, history, inside)
         tokens = self.norm(x).permute(0, 3, 1, 2)
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
-        residual, logits, blend = self.decoder(tokens, enhanced, fields, half, quarter, eighth)
+        residual, logits, blend = self.decoder(tokens, enhanced, half, quarter, eighth)
         enhanced = enhanced.float()
-        base = recoloured(rgb.float(), told, fields, self.shut_colour)
-        ungated = base + residual + hard_gate(blend, 1.0) * past.seen * (last - base)
+        given = rgb.float()
+        ungated = given + residual + hard_gate(blend, 1.0) * past.seen * (last - given)
         shut = SHUT_TRAINING if torch.is_grad_enabled() else of_mask(self.shut, known)
-        better = base + hard_gate(logits, shut) * (ungated - base)
-        return better, base, logits, ungated, enhanced
-
-    @torch.no_grad()
-    def recolour(self, rgb: torch.Tensor, past: Past | None) -> tuple[torch.Tensor, Past]:
-        """A frame `[1, 3, H, W]` of which nothing is told, with altered colours undone and nothing else done to it, and its past."""
-        past, told = past or Past.none(rgb), told_of(rgb, None)
-        fields, count = self.look(rgb, told, past)
-        better = recoloured(rgb, told, fields, self.shut_colour)
-        none = rgb.new_zeros(1, LATENT, rgb.shape[-2] // STRIDE, rgb.shape[-1] // STRIDE)
-        return better, past.followed(better, none, fields, count, 0)
+        better = given + hard_gate(logits, shut) * (ungated - given)
+        return better, logits, ungated, enhanced
 
     @torch.no_grad()
     def parts(self, rgb: torch.Tensor, mask: torch.Tensor | None, past: Past | None, tiles: Tiles) -> tuple[torch.Tensor, Past]:
@@ -240,22 +206,20 @@ class Net(nn.Module):
         they are, and nothing of them is remembered but the picture."""
         past = past or Past.none(rgb)
         told = told_of(rgb, mask)
-        fields, count = self.look(rgb, told, past)
         height, width = rgb.shape[-2:]
         better, pixels = rgb.clone(), F.pad(tiles.pixels(), (0, width - tiles.width, 0, height - tiles.height))
         latent = rgb.new_zeros(1, LATENT, height // STRIDE, width // STRIDE)
         known = latent[:, :1].clone()
         for window, core in tiles.windows():
             y, x = within(window, height, width)
-            local = sampled(fields, (y, x), height, width)
-            picture, _, _, _, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)), local)
+            picture, _, _, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)))
             v, u = within(core, height, width)
             inner = slice(v.start - y.start, v.stop - y.start), slice(u.start - x.start, u.stop - x.start)
             better[..., v, u] = torch.where(pixels[v, u].to(rgb.device), picture[..., inner[0], inner[1]], rgb[..., v, u])
             rows, columns = coarser((v, u), STRIDE)
             part = coarser(inner, STRIDE)
             latent[..., rows, columns], known[..., rows, columns] = found[..., part[0], part[1]], 1
-        return better, past.followed(better, latent, fields, count, self.config.history, known)
+        return better, past.followed(better, latent, self.config.history, known)
 
     def _history(self, past: Past) -> tuple[torch.Tensor, torch.Tensor]:
         """Tokens of the latents `[B, K, h, w, C]` and where they may be attended to, bool `[B, K, h, w]`."""

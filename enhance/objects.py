@@ -16,7 +16,6 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional as F
 
-from enhance.colour import LUMA
 from enhance.shade import DOWN, SEEN, ShadeNet, at_most
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
@@ -27,6 +26,7 @@ DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 FEWEST = 64
 """Pixels that an object must have: what is smaller stays as it is."""
 COEFFICIENTS = 15
+LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,7 @@ class Spots:
     within  `[SEAM, 8]`: which of a profile's pixels are in the object
     known   bool `[SEAM]`: which profiles there are
     size    logarithm of the object's share of the frame, near 0
+    edges   `[E, 4]`: all pixels at the seam, and the way out along rows or columns
     """
 
     yx: torch.Tensor
@@ -134,11 +135,15 @@ class Spots:
     within: torch.Tensor
     known: torch.Tensor
     size: float
+    edges: torch.Tensor
 
 
 def spots(mask: torch.Tensor, box: Box, share: float) -> Spots:
     """Of an object with bool `mask` `[h, w]` in the box's outer part and with its share of the frame."""
-    edges, known = _edges(mask)
+    seam = _edges(mask)
+    count = min(SEAM, len(seam))
+    known = torch.arange(SEAM, device=mask.device) < count
+    edges = F.pad(_spread(seam, count) if count else seam, (0, 0, 0, SEAM - count))
     steps = torch.arange(1 - REACH, REACH + 1, device=mask.device)
     y = (edges[:, :1] + steps * edges[:, 2:3]).clamp(0, mask.shape[0] - 1)
     x = (edges[:, 1:2] + steps * edges[:, 3:]).clamp(0, mask.shape[1] - 1)
@@ -151,6 +156,7 @@ def spots(mask: torch.Tensor, box: Box, share: float) -> Spots:
         mask[y, x],
         known,
         math.log(share) / 4 + 1,
+        seam,
     )
 
 
@@ -164,19 +170,15 @@ def evidence(colours: torch.Tensor, at: Spots, whole: torch.Tensor) -> Evidence:
     return Evidence(seam[None], torch.cat([places, at.along], 1)[None], at.known[None], inside[None], outside[None], whole)
 
 
-def _edges(mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels of `mask` at its seam `[SEAM, 4]`, with the way out along rows or columns, and which of them there are; where the picture
-    ends is no seam."""
+def _edges(mask: torch.Tensor) -> torch.Tensor:
+    """Pixels of `mask` at its seam `[E, 4]`, with the way out along rows or columns; where the picture ends is no seam."""
     h, w = mask.shape
     further = F.pad(mask, (1, 1, 1, 1), value=True)
     found = []
     for dy, dx in DIRECTIONS:
         yx = (mask & ~further[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]).nonzero()
         found.append(torch.cat([yx, torch.tensor([[dy, dx]], device=yx.device).expand(len(yx), 2)], 1))
-    edges = torch.cat(found)
-    count = min(SEAM, len(edges))
-    known = torch.arange(SEAM, device=mask.device) < count
-    return F.pad(_spread(edges, count) if count else edges, (0, 0, 0, SEAM - count)), known
+    return torch.cat(found)
 
 
 def _spread(rows: torch.Tensor, count: int) -> torch.Tensor:
@@ -218,7 +220,10 @@ def _attended(layer: nn.MultiheadAttention, x: torch.Tensor, tokens: torch.Tenso
 
 
 class ObjectNet(nn.Module):
-    """Evidence to coefficients `[B, 15]` of a colour change for the whole object (`changed`), zero at first; `shade` goes with it."""
+    """Evidence to coefficients `[B, 15]` of a colour change for the whole object (`changed`), zero at first; `shade` goes with it, and
+    `usual`, the root of the covariance of such changes, by which a seam is read (`enhance.seam`)."""
+
+    usual: torch.Tensor
 
     def __init__(self, width: int = 96, heads: int = 4, questions: int = 12, rounds: int = 3):
         super().__init__()
@@ -233,6 +238,7 @@ class ObjectNet(nn.Module):
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
         self.shade = ShadeNet()
+        self.register_buffer("usual", torch.zeros(COEFFICIENTS, COEFFICIENTS))
 
     def forward(self, e: Evidence) -> torch.Tensor:
         seam = self.seam(torch.cat([e.seam.flatten(2), e.place], 2))

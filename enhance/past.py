@@ -1,4 +1,4 @@
-"""What the network knows of the frames before: their enhanced latents, the last picture, and the colour fields so far."""
+"""What the network knows of the frames before: their enhanced latents, and the last picture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from torch.nn import functional as F
 
 from enhance.autoencoder import LATENT, STRIDE
-from enhance.colour import FIELDS, thin
 from enhance.flow import shrink_flow
 from enhance.tiles import Window, coarser
 from render.warp import warp
@@ -18,8 +17,8 @@ CUT = 0.5
 """Mean difference of pictures shrunk to BLOCKS, against how much those vary within themselves, from which they do not show the same place.
 Measured on 480 frames of drives: up to 0.29 from a frame to the next, 0.75 and more between places."""
 
-STEADY = 3
-"""Frames whose colour fields are averaged with a new one's, at most."""
+LONG = 160
+"""Pixels of a thinned picture's longer side."""
 
 
 @dataclass(frozen=True)
@@ -30,36 +29,23 @@ class Past:
     valid    `[B, K, 1, H/8, W/8]`: 1 where those were inside the image
     rgb      `[B, 3, H, W]`: the last enhanced picture
     seen     `[B, 1, H, W]`: 1 where that was inside the image; 0 throughout at the start
-    fields   `[B, 13, h, w]`: the mean of the colour fields so far
-    count    `[B, 1, h, w]`: how many frames are in that mean, 0 to STEADY
     """
 
     latents: torch.Tensor
     valid: torch.Tensor
     rgb: torch.Tensor
     seen: torch.Tensor
-    fields: torch.Tensor
-    count: torch.Tensor
 
     @classmethod
     def none(cls, rgb: torch.Tensor) -> Past:
         """The past of a first frame `[B, 3, H, W]`."""
         b, _, h, w = rgb.shape
         latents = rgb.new_zeros(b, 0, LATENT, h // STRIDE, w // STRIDE)
-        return cls(
-            latents,
-            latents[:, :, :1],
-            torch.zeros_like(rgb),
-            torch.zeros_like(rgb[:, :1]),
-            rgb.new_zeros(b, FIELDS, 1, 1),
-            rgb.new_zeros(b, 1, 1, 1),
-        )
+        return cls(latents, latents[:, :, :1], torch.zeros_like(rgb), torch.zeros_like(rgb[:, :1]))
 
     def moved(self, flow_prev: torch.Tensor) -> Past:
         """Brought to the next frame by its flow `[B, 2, H, W]` to the frame before; where that is unknown nothing is known."""
         rgb, inside = warp(torch.cat([self.rgb, self.seen], 1), flow_prev)
-        grid = shrink_flow(flow_prev, self.fields.shape[-2:])
-        mean, inside_grid = warp(torch.cat([self.fields, self.count], 1), grid)
         latents, valid = self.latents, self.valid
         if latents.shape[1]:
             b, k = latents.shape[:2]
@@ -67,12 +53,12 @@ class Past:
             both, inside_coarse = warp(torch.cat([latents.flatten(0, 1), valid.flatten(0, 1)], 1), coarse)
             latents = both[:, :-1].unflatten(0, (b, k))
             valid = ((both[:, -1:] > 0.5) * inside_coarse).unflatten(0, (b, k))
-        return Past(latents, valid, rgb[:, :3], (rgb[:, 3:] > 0.99) * inside, mean[:, :-1], mean[:, -1:].round() * inside_grid)
+        return Past(latents, valid, rgb[:, :3], (rgb[:, 3:] > 0.99) * inside)
 
     def fitting(self, rgb: torch.Tensor) -> Past:
         """What of it belongs to the coming frame `[B, 3, H, W]`: nothing after a cut or a jump, where the two do not look alike."""
         fits = alike(rgb, self.rgb, self.seen).to(rgb.dtype)[:, None, None, None]
-        return replace(self, valid=self.valid * fits[:, None], seen=self.seen * fits, count=self.count * fits)
+        return replace(self, valid=self.valid * fits[:, None], seen=self.seen * fits)
 
     def cropped(self, window: Window) -> Past:
         """In a window of the frame; its sides are multiples of STRIDE."""
@@ -81,18 +67,10 @@ class Past:
         latents, valid = self.latents[..., rows, columns], self.valid[..., rows, columns]
         return replace(self, latents=latents, valid=valid, rgb=self.rgb[..., y, x], seen=self.seen[..., y, x])
 
-    def averaged(self, fields: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """A new frame's `fields` averaged with those so far, and the count after it."""
-        if self.fields.shape[-2:] != fields.shape[-2:]:
-            return fields, torch.ones_like(fields[:, :1])
-        return (fields + self.count * self.fields) / (1 + self.count), (self.count + 1).clamp_max(STEADY)
-
     def followed(
         self,
         rgb: torch.Tensor,
         latent: torch.Tensor,
-        fields: torch.Tensor,
-        count: torch.Tensor,
         longest: int,
         known: torch.Tensor | None = None,
     ) -> Past:
@@ -102,7 +80,16 @@ class Past:
         known = torch.ones_like(latent[:, :1]) if known is None else known
         latents = torch.cat([latent[:, None], self.latents], 1)[:, :longest]
         valid = torch.cat([known[:, None], self.valid], 1)[:, :longest]
-        return Past(latents, valid, rgb, torch.ones_like(rgb[:, :1]), fields.detach(), count.detach())
+        return Past(latents, valid, rgb, torch.ones_like(rgb[:, :1]))
+
+
+def thin(image: torch.Tensor) -> torch.Tensor:
+    """Evenly spaced pixels of `[B, C, H, W]`: the longer side LONG, both even; a small picture keeps all its pixels but an odd row's."""
+    sides = image.shape[-2:]
+    share = min(1.0, LONG / max(sides))
+    small = [max(2, 2 * round(side * share / 2 - 0.25)) for side in sides]
+    y, x = (torch.linspace(0, side - 1, n, device=image.device).round().long() for side, n in zip(sides, small, strict=True))
+    return image[..., y[:, None], x]
 
 
 def alike(rgb: torch.Tensor, last: torch.Tensor, seen: torch.Tensor | None = None) -> torch.Tensor:

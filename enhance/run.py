@@ -17,11 +17,11 @@ from enhance.prior import Time
 from enhance.shards import KINDS
 from scenes.atomic import atomic_file
 
-STAGES = ("autoencoder", "prior", "colour", "objects", "shade", "enhancer")
+STAGES = ("autoencoder", "prior", "objects", "shade", "enhancer")
 FURTHER = STAGES[2:]
 """What trained weights are trained further by: a prior would undo what their transformer has learnt since."""
 RATES = {"autoencoder": 2.5, "objects": 2.0, "shade": 7.5}  # of the highest rate
-FROZEN = ("encoder.", "colour.", "objects.")  # parts of the network that the last stage leaves as they are
+FROZEN = ("encoder.", "objects.")  # parts of the network that the last stage leaves as they are
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,6 @@ class TrainConfig:
     """Share of the budget for the autoencoder."""
     prior: float = 0.04
     """Share of the budget for the transformer's prior."""
-    colour: float = 0.35
-    """Share of the budget for the colour network."""
     objects: float = 0.25
     """Share of the budget for objects' colours."""
     shade: float = 0.01
@@ -44,8 +42,6 @@ class TrainConfig:
     """Smallest crops in an image batch; larger ones are fewer."""
     clips: int = 3
     """Clips of smallest crops in a temporal batch."""
-    thinned: int = 24
-    """Thinned pictures in a batch of the colour network."""
     looked_at: int = 32
     """Objects in a batch of objects' colours, and of missing shadows."""
     frames: int = 4
@@ -94,7 +90,6 @@ class Run:
                 betas=(0.9, 0.98),
                 weight_decay=1e-2,
             ),
-            "colour": torch.optim.AdamW(self.net.colour.parameters(), betas=(0.9, 0.98), weight_decay=1e-2),
             "objects": torch.optim.AdamW(
                 [p for n, p in self.net.objects.named_parameters() if not n.startswith("shade.")], betas=(0.9, 0.98), weight_decay=1e-2
             ),
@@ -131,7 +126,7 @@ class Run:
     def share(self, stage: str) -> float:
         """A stage's share of the budget, of which those that are left out take nothing."""
         c = self.config
-        all_of = {"autoencoder": c.autoencoder, "prior": c.prior, "colour": c.colour, "objects": c.objects, "shade": c.shade}
+        all_of = {"autoencoder": c.autoencoder, "prior": c.prior, "objects": c.objects, "shade": c.shade}
         all_of["enhancer"] = 1 - sum(all_of.values())
         return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 

@@ -45,16 +45,6 @@ class Sample:
     visible: torch.Tensor
 
 
-@dataclass(frozen=True)
-class Thinned:
-    """Thinned pictures `[B, C, h, w]`: given, target, region where colours are altered, mask (NaN where not told)."""
-
-    given: torch.Tensor
-    target: torch.Tensor
-    region: torch.Tensor
-    mask: torch.Tensor
-
-
 class Photos:
     """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
 
@@ -121,12 +111,6 @@ class Sampler:
         drawn = [self._sample(rng, frames, size, kind) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
-    def thinned(self, step: int, count: int, height: int = 90, width: int = 160) -> Thinned:
-        """Large parts of pictures, thinned to `height` x `width` pixels, with regions in other colours or none."""
-        rng = self.rng(step)
-        drawn = [self._thinned(rng, height, width) for _ in range(count)]
-        return Thinned(**{f.name: torch.stack([getattr(d, f.name) for d in drawn]) for f in fields(Thinned)})
-
     def objects(self, step: int, count: int) -> Objects:
         """Objects in wrong colours or in their own."""
         return self._objects.draw(self.rng(step), count)
@@ -134,53 +118,6 @@ class Sampler:
     def grounds(self, step: int, count: int) -> Grounds | None:
         """Ground by objects with and without their shadow."""
         return self._shade.draw(self.rng(step), count)
-
-    def _thinned(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
-        if self.shards["relight"] and rng.random() < 0.2:
-            return self._thinned_relit(rng, height, width)
-        rgb, instance = self._part(rng, height, width)
-        target = random_isp(rng, 0.7)(rgb) if rng.random() < 0.7 else rgb
-        objects = ((instance > 0) & (instance < 255)).float()[None]
-        given, region = target, torch.zeros_like(objects)
-        for _ in range(rng.choice([0, 1, 2], p=[0.15, 0.6, 0.25])):
-            ids = [i for i in instance.unique().tolist() if 0 < i < 255 and rng.random() < 0.5]
-            one = torch.isin(instance, torch.tensor(ids, dtype=instance.dtype)).float()
-            if one.sum() < 40 or rng.random() < 0.35:
-                one = (torch.from_numpy(random_mask(rng, height, width)) > 0.5).float()
-            one = one[None] * (1 - region)
-            given = alter(given, one, random_isp(rng))
-            region = region + one
-        given = (given * 255).round() / 255
-        given = torch.where(region > 0, given, target)
-        told = region if rng.random() < 0.3 else torch.maximum(region, objects)
-        if rng.random() >= MASK_KNOWN:
-            told = torch.full_like(told, torch.nan)
-        if rng.random() < 0.5:
-            given, target, region, told = (x.flip(-1) for x in (given, target, region, told))
-        return Thinned(given, target, region, told)
-
-    def _thinned_relit(self, rng: np.random.Generator, height: int, width: int) -> Thinned:
-        """Objects in the light of another sky."""
-        shard = self.shards["relight"][rng.integers(len(self.shards["relight"]))]
-        w = shard.window(int(rng.integers(shard.frames)), 1)
-        y, x = _grid(rng, (shard.height, shard.width), height, width)
-        given, target, region, instance = (a[0][:, y, x] for a in (w.input, w.target, w.region, w.instance))
-        told = torch.maximum((region > 0.5).float(), (instance > 0).float())
-        if rng.random() >= MASK_KNOWN:
-            told = torch.full_like(told, torch.nan)
-        return Thinned(given, target, region, told)
-
-    def _part(self, rng: np.random.Generator, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Evenly spaced pixels `[3, height, width]` of a picture or a large part of it, and their instances `[height, width]`."""
-        stored = [s for of in self.shards.values() for s in of]
-        if self.photos is not None and (not stored or rng.random() < 0.3):
-            rgb = torch.from_numpy(self.photos.frames[rng.integers(len(self.photos.frames))])
-            instance = torch.zeros(rgb.shape[:2], dtype=torch.uint8)
-        else:
-            shard = stored[rng.integers(len(stored))]
-            rgb, instance = shard.frame("input" if shard.meta["kind"] in RENDERED else "target", int(rng.integers(shard.frames)))
-        y, x = _grid(rng, (instance.shape[0], instance.shape[1]), height, width)
-        return rgb[y, x].permute(2, 0, 1).float() / 255, instance[y, x]
 
     def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
         kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k in self.kinds and (k in AFRESH or self.shards[k])]
@@ -241,17 +178,6 @@ class Sampler:
 def _with_alien(objects: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
     """Ids of objects, and a further one where `region` reaches beyond them."""
     return torch.where((objects == 0) & (region > 0.5), float(ALIEN), objects)
-
-
-def _grid(rng: np.random.Generator, sides: tuple[int, int], height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows `[height, 1]` and columns `[width]` evenly over an image of `sides` or a large part of it."""
-    zoom = 1.0 if rng.random() < 0.4 else rng.uniform(1.0, 2.5)
-    places = []
-    for side, n in zip(sides, (height, width), strict=True):
-        span = (side - 1) / zoom
-        first = rng.uniform(0, side - 1 - span)
-        places.append(torch.linspace(first, first + span, n).round().long())
-    return places[0][:, None], places[1]
 
 
 def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed: bool) -> Window:

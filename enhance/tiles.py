@@ -93,13 +93,3 @@ def coarser(window: Window, by: int) -> Window:
     """A window on a grid whose cells are `by` pixels wide."""
     rows, columns = window
     return slice(rows.start // by, -(-rows.stop // by)), slice(columns.start // by, -(-columns.stop // by))
-
-
-def sampled(image: torch.Tensor, window: Window, height: int, width: int) -> torch.Tensor:
-    """A coarse `image` `[1, C, h, w]` that covers a frame of `height` x `width`, enlarged in a window just as F.interpolate
-    would enlarge all of it."""
-    rows, columns = window
-    y = (torch.arange(rows.start, rows.stop, device=image.device) + 0.5) * (2 / height) - 1
-    x = (torch.arange(columns.start, columns.stop, device=image.device) + 0.5) * (2 / width) - 1
-    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
-    return F.grid_sample(image.float(), grid, mode="bilinear", padding_mode="border", align_corners=False)

@@ -1,5 +1,5 @@
-"""Training: the autoencoder on single images, the prior on its latents, the colour network on thinned pictures, the objects' colours on
-objects, then, with all but the prior frozen, the enhancer on pairs.
+"""Training: the autoencoder on single images, the prior on its latents, the objects' colours on objects, then, with all but
+the prior frozen, the enhancer on pairs.
 
 The enhancer's batches alternate: images without a past, and clips that the network walks through with its own earlier outputs as
 their past, with any number of latents from 0 to K, so that it never sees a past better than the one it will make itself.
@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.calibrate import calibrate_colour, calibrate_gate, repair_gain
-from enhance.colour import altered_logits, colour_change
+from enhance.calibrate import calibrate_gate, repair_gain
 from enhance.corrections import corrected
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
@@ -27,6 +26,7 @@ from enhance.precision import autocast
 from enhance.prior import flow_matching_loss
 from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig
 from enhance.samples import Photos, Sample, Sampler
+from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
 from enhance.shards import PairSet
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
@@ -34,6 +34,8 @@ from scenes.names import unknown
 
 NEAR_ENOUGH = 3e-4
 """Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
+USUAL = 1000
+"""Objects by which it is told what changes are usual."""
 SHADE_NEAR_ENOUGH = 1e-3
 """The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
 
@@ -59,7 +61,7 @@ def train(
     minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly.
     seed      of the first weights and of every sample drawn
     out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
-    photos    folders of images and videos, for the autoencoder, colour changes and clean frames
+    photos    folders of images and videos, for the autoencoder, objects' colours and clean frames
     about     written into the weights' header, beside the data's attribution
     progress  called with the share done, 0..1, and a line of words
     start     weights to train further, "builtin" or a file; their autoencoder is kept
@@ -98,13 +100,12 @@ def train(
         if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
         _stage(run, "prior", lambda step: _prior_step(run, sampler, step), checkpoint, save_every, report)
-        _stage(run, "colour", lambda step: _colour_step(run, sampler, step), checkpoint, save_every, report)
-        if "colour" in run.stages:
-            calibrate_colour(run.net, clean)
         _stage(run, "objects", lambda step: _objects_step(run, sampler, step), checkpoint, save_every, report)
+        if "objects" in run.stages:
+            run.net.objects.usual.copy_(usual_changes(sampler.objects(3, USUAL)))
         _stage(run, "shade", lambda step: _shade_step(run, sampler, step), checkpoint, save_every, report)
         now = run.net.state_dict()
-        frozen = {k: v for k, v in now.items() if k.startswith((*FROZEN, "shut_colour"))}
+        frozen = {k: v for k, v in now.items() if k.startswith(FROZEN)}
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
@@ -168,18 +169,6 @@ def _prior_step(run: Run, sampler: Sampler, step: int) -> float:
     with autocast(right.device):
         loss = flow_matching_loss(run.net, run.time, latents.float(), drawn)
     return _update(run, "prior", [loss])
-
-
-def _colour_step(run: Run, sampler: Sampler, step: int) -> float:
-    drawn = sampler.thinned(3 * step + 2, run.config.thinned)
-    known = torch.isfinite(drawn.mask).float()
-    with autocast(drawn.given.device):
-        fields = run.net.colour(drawn.given, torch.cat([torch.nan_to_num(drawn.mask), known], 1))
-    logits = altered_logits(fields, drawn.given.shape[-2:])
-    change = colour_change(drawn.given, fields)
-    loss = pixel_loss(drawn.given + drawn.region * change, drawn.target, drawn.region)
-    loss = loss + pixel_loss(drawn.given + torch.sigmoid(logits) * change, drawn.target, drawn.region)
-    return _update(run, "colour", [loss + 0.1 * where_loss(logits, drawn.region)])
 
 
 def _objects_step(run: Run, sampler: Sampler, step: int) -> float:

@@ -11,6 +11,6 @@ def stirred(seed=0):
     """A network whose last layers do something, as after training."""
     torch.manual_seed(seed)
     net = Net(SMALL).eval()
-    for layer in (net.colour.head, net.decoder.pixels, net.denoise):
+    for layer in (net.decoder.pixels, net.denoise):
         torch.nn.init.normal_(layer.weight, std=0.05)
     return net

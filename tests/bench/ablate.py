@@ -2,11 +2,10 @@
 
     python -m tests.bench.ablate PAIRS... [-o ablation] [--steps 150] [--limit 4] [--only ROW ...]
 
-Pairs are halved (320x180 of 640x360), every second training clip is used. The autoencoder and the colour network, which does nothing where
-objects are told, are the shipped ones; prior, objects' colours, missing shadows and the enhancer are trained anew in each row, with the
-same seed and steps. Measured are held-out clips, told their objects, as `render --enhance` tells them. Identity first, then the whole; a
-kind left out is no damage that is trained on. NAFNet sees the same samples one by one. One thread; a run that was broken off goes on where
-it stopped, and a row that is there is not trained again.
+Pairs are halved (320x180 of 640x360), every second training clip is used. The autoencoder is the shipped one; prior, objects' colours,
+missing shadows and the enhancer are trained anew in each row, with the same seed and steps. Measured are held-out clips, told their
+objects, as `render --enhance` tells them. Identity first, then the whole; a kind left out is no damage that is trained on. NAFNet sees the
+same samples one by one. One thread; a run that was broken off goes on where it stopped, and a row that is there is not trained again.
 """
 
 from __future__ import annotations
@@ -126,14 +125,12 @@ class Bench:
         self.pairs, self.out, self.steps, self.seed = pairs, out, steps, seed
 
     def started(self) -> Path:
-        """Untrained weights but for the shipped autoencoder and colour network."""
+        """Untrained weights but for the shipped autoencoder."""
         path = self.out / "start.safetensors"
         if not path.exists():
             torch.manual_seed(self.seed)
             net, shipped = Net(), load_net(BUILTIN)[0]
-            for part in ("encoder", "colour"):
-                getattr(net, part).load_state_dict(getattr(shipped, part).state_dict())
-            net.shut_colour.copy_(shipped.shut_colour)
+            net.encoder.load_state_dict(shipped.encoder.state_dict())
             save_net(net, path, {})
         return path
 

@@ -60,16 +60,6 @@ def test_samples_of_a_batch_do_not_mix():
     assert torch.allclose(both[1:], one, atol=1e-5)
 
 
-def test_colour_fields_are_averaged_over_frames():
-    rgb, past = inputs(k=0)
-    net = stirred()
-    with torch.inference_mode():
-        first = net(rgb).past
-        second = net(rgb * 0.5, None, first).past
-        alone = net(rgb * 0.5).past
-    assert torch.allclose(second.fields, (first.fields + alone.fields) / 2, atol=1e-5) and (second.count == 2).all()
-
-
 def test_the_gate_closes_exactly():
     with torch.no_grad():
         gate = hard_gate(torch.tensor([-9.0, 0.0, 9.0]))
@@ -85,7 +75,7 @@ def test_a_closed_gate_still_has_a_gradient():
 def test_the_frozen_parts_get_no_gradient():
     net = stirred().train()
     net(torch.rand(1, 3, 32, 48)).rgb.sum().backward()
-    assert all(p.grad is None for part in (net.encoder, net.colour) for p in part.parameters()) and net.stem.fine.weight.grad is not None
+    assert all(p.grad is None for p in net.encoder.parameters()) and net.stem.fine.weight.grad is not None
 
 
 def test_the_autoencoder_keeps_the_size():

@@ -1,9 +1,10 @@
 """The past moved to the next frame."""
 
+import pytest
 import torch
 
 from enhance.flow import shrink_flow
-from enhance.past import Past
+from enhance.past import Past, thin
 
 
 def constant_flow(x, y, h=10, w=14):
@@ -19,23 +20,32 @@ def test_shrunk_flow_is_the_mean_in_blocks():
 
 
 def a_past(h=24, w=24):
-    grid = torch.rand(1, 13, h // 8, w // 8)
     return Past(torch.rand(1, 2, 16, h // 8, w // 8), torch.ones(1, 2, 1, h // 8, w // 8), torch.rand(1, 3, h, w),
-                torch.ones(1, 1, h, w), grid, torch.full_like(grid[:, :1], 2))  # fmt: skip
+                torch.ones(1, 1, h, w))  # fmt: skip
 
 
 def test_all_of_the_past_moves_by_whole_cells_and_what_left_the_image_is_forgotten():
     past = a_past()
     moved = past.moved(constant_flow(8, 0, 24, 24))
-    for name in ("latents", "fields"):
-        assert torch.allclose(getattr(moved, name)[..., :-1], getattr(past, name)[..., 1:], atol=1e-5), name
+    assert torch.allclose(moved.latents[..., :-1], past.latents[..., 1:], atol=1e-5)
     assert torch.allclose(moved.rgb[..., :-8], past.rgb[..., 8:], atol=1e-5)
-    for kept in (moved.valid, moved.count / 2):
-        assert kept[..., :-1].min() == 1 and kept[..., -1].max() == 0
+    assert moved.valid[..., :-1].min() == 1 and moved.valid[..., -1].max() == 0
     assert moved.seen[..., :-8].min() == 1 and moved.seen[..., -8:].max() == 0
 
 
 def test_unknown_flow_forgets_the_past_there():
     moved = a_past().moved(torch.full((1, 2, 24, 24), torch.nan))
-    assert moved.valid.max() == 0 and moved.seen.max() == 0 and moved.count.max() == 0
+    assert moved.valid.max() == 0 and moved.seen.max() == 0
     assert all(torch.isfinite(value).all() for value in vars(moved).values())
+
+
+@pytest.mark.parametrize(
+    ("size", "small"),
+    [((360, 640), (90, 160)), ((540, 960), (90, 160)), ((1920, 1080), (160, 90)), ((16, 16), (16, 16)), ((17, 33), (16, 32))],
+)
+def test_thinning_keeps_proportions_and_whole_pixels(size, small):
+    image = torch.rand(1, 3, *size)
+    found = thin(image)
+    assert found.shape[-2:] == small
+    assert torch.isin(found[0, 0], image[0, 0]).all()
+    assert torch.equal(found[..., 0, 0], image[..., 0, 0]) and torch.equal(found[..., -1, -1], image[..., -1, -1])

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 
 from enhance.enhancer import Enhancer
 from enhance.net import Net
-from enhance.tiles import TILE, Tiles, sampled
+from enhance.tiles import TILE, Tiles
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -53,17 +53,9 @@ def test_windows_hold_their_tiles_with_a_margin_and_far_ones_are_apart():
     assert Tiles.of(torch.ones(H, W)).everything() and Tiles.of(torch.zeros(H, W)).nothing() and not far.everything()
 
 
-def test_a_window_of_an_enlarged_image_is_that_part_of_it():
-    image = torch.rand(1, 13, 21, 40)
-    whole = F.interpolate(image, (160, 336), mode="bilinear", align_corners=False)
-    part = sampled(image, (slice(32, 128), slice(96, 224)), 160, 336)
-    assert torch.allclose(part, whole[..., 32:128, 96:224], atol=1e-5)
-
-
 def test_a_frame_that_needs_nothing_comes_back_bit_by_bit_and_costs_no_network(enhancer, monkeypatch):
     _, memory = enhancer.step(frame(picture()))
     monkeypatch.setattr(Net, "repair", None)
-    monkeypatch.setattr(Net, "look", None)
     rgb = picture(1)
     better, after = enhancer.step(frame(rgb, need=torch.zeros(H, W)), memory)
     assert torch.equal(better, rgb) and after.past is memory.past

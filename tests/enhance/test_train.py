@@ -82,7 +82,7 @@ def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
 
 
 def test_training_undoes_a_constant_error(pairs, tmp_path):
-    config = replace(QUICK, autoencoder=0.05, colour=0.04, objects=0.01, rate=3e-3, kinds=("underfit", "isp", "clean"))
+    config = replace(QUICK, autoencoder=0.05, objects=0.01, rate=3e-3, kinds=("underfit", "isp", "clean"))
     weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
     rows = evaluate(pairs, Enhancer.load(weights))
     assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, *METHODS]

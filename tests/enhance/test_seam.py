@@ -1,0 +1,90 @@
+"""What a seam tells of an object's colours, without anything learnt about streets."""
+
+import pytest
+import torch
+
+from enhance.isp import Isp, alter
+from enhance.object_samples import Objects
+from enhance.objects import COEFFICIENTS, _edges, boxes, changed
+from enhance.seam import ENDS, effects, fitted, usual_changes
+
+NOTHING = torch.zeros(COEFFICIENTS)
+BROAD = 0.5 * torch.eye(COEFFICIENTS)
+ISP = Isp(exposure=-0.6, red=0.2, blue=-0.2, saturation=0.7)
+
+
+def surface(seed=0, grain=0.01, h=240, w=360):
+    """A picture of stripes of many colours that go on from side to side, but for a little grain."""
+    drawn = torch.Generator().manual_seed(seed)
+    stripes = (0.15 + 0.7 * torch.rand(3, h // 8, 1, generator=drawn)).repeat_interleave(8, 1)
+    return (stripes + grain * torch.randn(3, h, w, generator=drawn)).clamp(0.02, 0.98)
+
+
+def region(h=240, w=360):
+    ids = torch.zeros(h, w, dtype=torch.int32)
+    ids[60:180, 90:270] = 1
+    return ids
+
+
+def found(rgb, ids, guess=NOTHING, usual=BROAD):
+    box = boxes(ids)[1]
+    part, inner = rgb[:, box.outer_rows, box.outer_columns], ids[box.outer_rows, box.outer_columns]
+    return fitted(part, inner, 1, _edges(inner == 1), box, guess, usual)
+
+
+def left(rgb, right, ids, coefficients):
+    """Root of the mean squared error in the object with a change and without, in levels."""
+    mask, box = ids == 1, boxes(ids)[1]
+    height = box.placed(*mask.nonzero().unbind(1))[:, 0]
+    given, wanted = rgb[:, mask].T, right[:, mask].T
+    better = given + changed(given[None], height[None], coefficients[None])[0]
+    return [255 * float((x - wanted).square().mean().sqrt()) for x in (better, given)]
+
+
+def test_colours_that_jump_at_the_seam_of_one_surface_are_put_right():
+    right, ids = surface(), region()
+    rgb = alter(right, (ids == 1).float()[None], ISP)
+    after, before = left(rgb, right, ids, found(rgb, ids)[0])
+    assert after < before / 2.5 and before > 20
+
+
+def test_a_wrong_guess_is_undone_and_one_without_usual_changes_kept():
+    right, ids, guess = surface(1), region(), torch.linspace(-0.1, 0.1, COEFFICIENTS)
+    after, guessed = (left(right, right, ids, k)[0] for k in (found(right, ids, guess)[0], guess))
+    assert after < guessed / 3
+    assert torch.equal(found(right, ids, guess, torch.zeros(COEFFICIENTS, COEFFICIENTS))[0], guess)
+
+
+def test_what_is_right_stays_nearly_so_and_its_surface_does_not_end():
+    right, ids = surface(2), region()
+    coefficients, gap = found(right, ids)
+    assert left(right, right, ids, coefficients)[0] < 2 and gap < ENDS
+
+
+def test_an_object_of_other_colours_ends_at_its_seam():
+    other, ids = surface(3), region()
+    rgb = torch.where(ids == 1, surface(4, 0.1), other)
+    assert found(rgb, ids)[1] > ENDS
+
+
+def test_neighbouring_objects_and_the_picture_s_end_are_no_surroundings():
+    rgb, ids = surface(), torch.full((240, 360), 2, dtype=torch.int32)
+    ids[:, 90:270] = 1  # from the top of the picture to its end, between two other objects
+    guess = torch.ones(COEFFICIENTS)
+    coefficients, gap = found(rgb, ids, guess)
+    assert torch.equal(coefficients, guess) and gap == float("inf")
+
+
+def test_effects_are_those_of_the_change():
+    rgb, height, k = torch.rand(7, 3), torch.rand(7) * 2 - 1, torch.randn(COEFFICIENTS)
+    torch.testing.assert_close(effects(rgb, height) @ k, changed(rgb[None], height[None], k[None])[0])
+
+
+def test_usual_changes_are_those_of_the_objects():
+    drawn = torch.Generator().manual_seed(0)
+    given, height = torch.rand(400, 200, 3, generator=drawn), torch.rand(400, 200, generator=drawn) * 2 - 1
+    by = 0.1 * torch.randn(400, 1, 1, generator=drawn)
+    root = usual_changes(Objects(None, given, given + by, height))
+    covariance = root @ root.T
+    assert covariance[0, 0].sqrt() == pytest.approx(0.1, rel=0.15) and covariance[0, 1] == pytest.approx(float(covariance[0, 0]), rel=0.05)
+    assert covariance.diagonal()[3:].max() < 1e-3
