@@ -20,6 +20,7 @@ from recon.model import MODEL, Knots
 from recon.motion import Motion
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
+from recon.skies import seen_sky
 from recon.start import Start, prepare
 from recon.strides import stride_of
 from recon.tracks import LIMBED
@@ -218,7 +219,8 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     sky = Sky(linear_from_srgb(fit.sky.detach().clamp(0, 1)))
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
-    return Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
+    scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
+    return replace(scene, sky=seen_sky(scene))
 
 
 def middle_pose(track: Track) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What lidar does not reach: the first picture of the sky, and splats for the other unexplained pixels.
+"""What lidar does not reach: splats for pixels that neither it nor the sky explains.
 
 Lidar sees about 15 degrees up and loses dark and shiny things. Buildings above it, wires, far blocks and windows get splats at
 the depth of what stands below them in the image, since facades and poles are upright.
@@ -20,39 +20,6 @@ FAR = 250.0
 
 STEP = 6
 """Pixels between filling splats."""
-
-
-class SkyPicture:
-    """Running sums of sky colours by direction, in the reference exposure, on an equirectangular grid `[H, 2H]`."""
-
-    def __init__(self, height: int):
-        self.sum = np.zeros((height, 2 * height, 3))
-        self.count = np.zeros((height, 2 * height))
-
-    def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray) -> None:
-        """Count the masked pixels of a uint8 image, divided by its camera's gain."""
-        rows, columns = np.nonzero(mask)
-        pixels = torch.from_numpy(np.stack([columns, rows], 1) + 0.5)
-        x, y, z = (camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T).numpy().T
-        h = len(self.sum)
-        c = ((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * h).astype(np.int64) % (2 * h)
-        r = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * h).astype(np.int64).clip(0, h - 1)
-        np.add.at(self.sum, (r, c), image[rows, columns] / 255 / gain)
-        np.add.at(self.count, (r, c), 1)
-
-    def picture(self) -> torch.Tensor:
-        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings; grey without any sample."""
-        if not self.count.any():
-            return torch.full((*self.count.shape, 3), 0.7)
-        out = np.full(self.sum.shape, np.nan)
-        sigma = 0.0
-        while np.isnan(out).any():
-            modes = ("nearest", "wrap")
-            blur = [ndimage.gaussian_filter(a, sigma, mode=modes) if sigma else a for a in (*np.moveaxis(self.sum, -1, 0), self.count)]
-            take = np.isnan(out[..., 0]) & (blur[3] > 1e-3)
-            out[take] = np.stack(blur[:3], -1)[take] / blur[3][take][:, None]
-            sigma = max(1.5, sigma * 2)
-        return torch.from_numpy(out).float()
 
 
 def unexplained(

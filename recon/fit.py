@@ -63,6 +63,10 @@ WINDOW = (180, 320)
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
 
+SKY_PRIOR = 3e-6
+"""Of the squared distance of the sky from its first picture, in a step's gradient: a twentieth of what a picture's sky weighs, and more
+than what shines through a wall, which Adam would turn into noise that a shifted view shows between the houses."""
+
 SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
 
@@ -95,6 +99,7 @@ class Fit:
     ):
         self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
         self.splats, self.sky, self.exposures = splats, sky, exposures
+        self.first_sky = sky.clone()
         self.step_count = 0
         self.training = frames.training()
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -229,6 +234,8 @@ class Fit:
         """The steps of what all pictures share."""
         if self.exposures.grad is not None:
             self.exposures.grad[0] = 0  # the first camera is the reference
+        if self.sky.grad is not None:
+            self.sky.grad.add_(self.sky.detach() - self.first_sky, alpha=SKY_PRIOR)
         self.rest_adam.step()
         if self.progress >= self.config.poses_from:
             self.pose_adam.param_groups[0]["lr"] = 0.03 * max(0.1, 1 - self.progress)
@@ -259,6 +266,7 @@ class Fit:
             "growth": self.growth.tensors(),
             "descent": self.descent.tensors(),
             "sky": self.sky.detach(),
+            "first_sky": self.first_sky,
             "exposures": self.exposures.detach(),
             "motion": self.motion.tensors(),
             "limbs": self.limbs.tensors(),
@@ -272,7 +280,7 @@ class Fit:
         """Go on from `tensors()` of another run: the same steps follow as would have followed there."""
         self.splats = Splats(state["fields"], state["sizes"], state["reach"])
         self.growth, self.descent = Growth(**state["growth"]), Descent(**state["descent"])
-        self.sky, self.exposures = state["sky"], state["exposures"]
+        self.sky, self.first_sky, self.exposures = state["sky"], state["first_sky"], state["exposures"]
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])
         self._optimise()

@@ -11,8 +11,11 @@ from scipy import ndimage
 
 from recon.gains import picture_gains
 from recon.log import Log
-from recon.skies import sky_mask
+from recon.skies import like_sky, sky_mask
 from scenes.poses import inverse
+
+RIM = 6
+"""Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,8 @@ def divided(image: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
 
 
 def _sky(image: torch.Tensor) -> torch.Tensor:
-    """The sky of an image on a grid about 240 cells wide, without its rim."""
+    """The sky of an image on a grid about 240 cells wide: without its rim, but for what of that looks like it, where splats of its colour
+    would stand before walls as soon as it is seen from elsewhere."""
     step = max(1, image.shape[1] // 240)
-    coarse = sky_mask(np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy()))
-    return torch.from_numpy(ndimage.binary_erosion(coarse, border_value=1))
+    coarse = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy())
+    return torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse), border_value=1), RIM))

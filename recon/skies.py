@@ -1,9 +1,21 @@
-"""Which pixels are sky."""
+"""The sky: which pixels show it, its picture by direction, and what of that was truly seen."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy import ndimage
+
+from render import render_frame
+from scenes.camera import Camera
+from scenes.scene import Scene
+from scenes.sky import Sky, linear_from_srgb, srgb_from_linear
+
+LOOKS = 12
+"""Moments of each camera at which it is found out where light comes from the sky."""
+
+FREE = 0.05
+"""Of all looks in a direction, those that must meet nothing for the sky there to be believed."""
 
 
 def sky_mask(image: np.ndarray) -> np.ndarray:
@@ -19,10 +31,73 @@ def sky_mask(image: np.ndarray) -> np.ndarray:
     return ndimage.binary_closing(np.pad(np.isin(label, top), 4, mode="edge"), iterations=2)[4:-4, 4:-4]
 
 
-def like_sky(image: np.ndarray, sky: np.ndarray) -> np.ndarray:
-    """The sky and what looks like the nearest of it: gaps between leaves and wires, where splats of its colour would float."""
+def like_sky(image: np.ndarray, sky: np.ndarray, reach: int = 40) -> np.ndarray:
+    """The sky and what looks like the nearest of it, up to `reach` pixels away: gaps between leaves and wires, where splats of its colour
+    would float."""
     if not sky.any():
         return sky
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     away, nearest = ndimage.distance_transform_edt(~sky, return_indices=True)
-    return sky | ((np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 14) & (away < 40))
+    return sky | ((np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 14) & (away < reach))
+
+
+class SkyPicture:
+    """Running sums of sky colours by direction, in the reference exposure, on an equirectangular grid `[H, 2H]`."""
+
+    def __init__(self, height: int):
+        self.sum = np.zeros((height, 2 * height, 3))
+        self.count = np.zeros((height, 2 * height))
+
+    def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray) -> None:
+        """Count the masked pixels of a uint8 image, divided by its camera's gain."""
+        cells = _cells(mask, camera, len(self.sum))
+        np.add.at(self.sum, cells, image[mask] / 255 / gain)
+        np.add.at(self.count, cells, 1)
+
+    def picture(self) -> torch.Tensor:
+        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings; grey without any sample."""
+        if not self.count.any():
+            return torch.full((*self.count.shape, 3), 0.7)
+        out = np.full(self.sum.shape, np.nan)
+        sigma = 0.0
+        while np.isnan(out).any():
+            modes = ("nearest", "wrap")
+            blur = [ndimage.gaussian_filter(a, sigma, mode=modes) if sigma else a for a in (*np.moveaxis(self.sum, -1, 0), self.count)]
+            take = np.isnan(out[..., 0]) & (blur[3] > 1e-3)
+            out[take] = np.stack(blur[:3], -1)[take] / blur[3][take][:, None]
+            sigma = max(1.5, sigma * 2)
+        return torch.from_numpy(out).float()
+
+
+def _cells(mask: np.ndarray, camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the equirectangular grid `[height, 2 height]` that each masked pixel looks at."""
+    rows, columns = np.nonzero(mask)
+    pixels = torch.from_numpy(np.stack([columns, rows], 1) + 0.5)
+    x, y, z = (camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T).numpy().T
+    c = ((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * height).astype(np.int64) % (2 * height)
+    r = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64).clip(0, height - 1)
+    return r, c
+
+
+def seen_sky(scene: Scene) -> Sky:
+    """The scene's sky as its cameras saw it, spread into directions in which something always stood before it.
+
+    What shines through a wall of alpha 0.99 is enough for Adam to turn the texels behind into noise, which a shifted view then shows
+    between the houses.
+    """
+    assert scene.sky is not None
+    own = srgb_from_linear(scene.sky.linear).numpy()
+    looks, free = np.zeros(own.shape[:2]), np.zeros(own.shape[:2])
+    for name in scene.rig:
+        times = scene.frame_times(name)
+        for k in np.unique(np.linspace(0, len(times) - 1, LOOKS).astype(int)):
+            camera = scene.camera(name, int(times[k]))
+            camera = camera.resized(max(16, camera.width // 2), max(16, camera.height // 2))
+            alpha = render_frame(scene, camera, ("alpha",)).alpha
+            assert alpha is not None
+            np.add.at(looks, _cells(np.ones(alpha.shape, bool), camera, len(own)), 1)
+            np.add.at(free, _cells((alpha < 0.5).numpy(), camera, len(own)), 1)
+    picture = SkyPicture(len(own))
+    picture.count = np.where(free > FREE * looks, free, 0)
+    picture.sum = own * picture.count[..., None]
+    return Sky(linear_from_srgb(picture.picture().clamp(0, 1)))

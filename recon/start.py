@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 from recon.actors import split_points
 from recon.carpet import carpet
 from recon.densify import LARGEST
-from recon.fill import SkyPicture, unexplained
+from recon.fill import unexplained
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
-from recon.skies import like_sky, sky_mask
+from recon.skies import SkyPicture, like_sky, sky_mask
 from recon.sparse import cloud_from_points
 from recon.sweep import companions
 from scenes.camera import RigCamera

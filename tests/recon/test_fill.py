@@ -3,12 +3,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from recon.fill import FAR, SkyPicture, unexplained
+from recon.fill import FAR, unexplained
 from recon.frames import View
-from recon.skies import like_sky, sky_mask
+from recon.skies import SkyPicture, like_sky, seen_sky, sky_mask
 from recon.sweep import companions, swept_depth
-from scenes.camera import Camera
-from scenes.lenses import Pinhole
+from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
 
 def house_under_sky():
@@ -87,3 +86,26 @@ def test_what_stands_far_behind_a_house_is_found_there_by_other_pictures():
     depth = swept_depth(pixels, np.full(len(pixels), 12.0), 2.0, *views[0], views[2:])
     assert np.median(depth) > 90
     assert (swept_depth(pixels, np.full(len(pixels), 12.0), 2.0, *views[0], []) == 12).all()
+
+
+def test_a_sky_that_something_always_hid_is_spread_from_where_it_was_seen():
+    """A wall before the left half of the view, noise behind it: of the noise nothing stays, of what was seen everything."""
+    y, z = torch.meshgrid(torch.arange(0.3, 12, 0.5), torch.arange(-8, 8, 0.5), indexing="ij")
+    means = torch.stack([torch.full_like(y, 10.0), y, z], -1).reshape(-1, 3).float()
+    n = len(means)
+    wall = Gaussians(
+        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), -1.0), torch.full((n,), 6.0), torch.zeros(n, 1, 3)
+    )
+    still = torch.eye(4, dtype=torch.float64)
+    ego = Trajectory(torch.tensor([0, 100_000]), still.repeat(2, 1, 1))
+    rig = {"front": RigCamera(camera().lens, 80, 60, camera().world_from_cam)}
+    noise = torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(1))
+    blue = torch.tensor([0.2, 0.4, 0.8])
+    looked = torch.zeros(64, 128, dtype=torch.bool)
+    looked[26:38, 52:64] = True  # 34 degrees to the left of +x and as much up and down as the wall covers
+    sky = Sky(torch.where(looked[..., None], noise, blue))
+    seen = seen_sky(Scene(Placed(wall, still), (), sky, ego, rig)).linear
+    assert (seen[looked] - blue).abs().max() < 1e-3
+    assert (seen[26:38, 66:72] - blue).abs().max() < 1e-5
+    untouched = seen_sky(Scene(Placed(wall.select(torch.zeros(0, dtype=torch.long)), still), (), sky, ego, rig)).linear
+    assert (untouched[looked] - noise[looked]).abs().max() < 1e-5, "with no wall all of it was seen"
