@@ -47,6 +47,9 @@ MOST = 8000, 450_000
 PER_PHOTO = 25, 2500
 """The same of each photo that stands steps apart from the next: nothing is shared by most of them."""
 
+DROP = 0.2
+"""Part of the splats that a step leaves out where photos stand steps apart."""
+
 
 def reconstruct(
     log: Log,
@@ -136,13 +139,13 @@ def fit_config(log: Log, names: Sequence[str], span: tuple[int, int] | None = No
     """How long and how finely to fit the pictures of `span`, all where None: the more there are, the longer and finer.
 
     Photos that stand steps apart are learnt by heart long before a drive's pictures are: colours that turn with the view, and more than
-    `PER_PHOTO` steps and splats each, improve the photos and nothing between them.
+    `PER_PHOTO` steps and splats each, improve the photos and nothing between them. Splats that are left out by lot do the reverse.
     """
     first, last = span or choose(log, names)[1]
     pictures = sum(int(((t >= first) & (t <= last)).sum()) for t in (log.camera(name).times_us for name in names))
     if log.points is not None:
         steps, splats = (min(n * pictures, most) for n, most in zip(PER_PHOTO, MOST, strict=True))
-        return FitConfig(steps=steps, budget=splats, sh_degree=0)
+        return FitConfig(steps=steps, budget=splats, sh_degree=0, drop=DROP)
     steps, splats = (min(base + n * pictures, most) for base, n, most in zip(SHARED, PER_PICTURE, MOST, strict=True))
     return FitConfig(steps=steps, budget=splats)
 

@@ -53,6 +53,9 @@ class FitConfig:
     """Weight of 1 - SSIM against L1."""
     still_weight: float = 0.4
     """How often a view is drawn while the car stands, against one while it drives."""
+    drop: float = 0.0
+    """Part of the splats in sight that a step leaves out of its picture, by lot, towards the end; the others are denser for them. Where few
+    photos see a place, none may serve one photo alone (DropGaussian, Park et al. 2025)."""
     seed: int = 0
     """Of the order of views."""
 
@@ -177,10 +180,20 @@ class Fit:
 
     def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment]) -> tuple[torch.Tensor, torch.Tensor]:
         """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes."""
-        placed = self._placed(shown, view, camera)
+        placed = self._placed(self._drawn_by_lot(shown), view, camera)
         rgb, alpha = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha")
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha
+
+    def _drawn_by_lot(self, shown: Splats) -> Splats:
+        """Without `drop` of them, which rises over the first four fifths of the fit; the mean of all draws is as dense as all are."""
+        share = self.config.drop * min(1.0, self.progress / 0.8)
+        if share == 0:
+            return shown
+        opacity = torch.sigmoid(shown.fields["logits"])
+        stays = torch.rand(opacity.shape, generator=self.generator) >= share
+        denser = torch.where(stays, opacity / (1 - share), 0.0).clamp(1e-5, 0.999)
+        return Splats(shown.fields | {"logits": torch.logit(denser)}, shown.sizes, shown.reach)
 
     def _placed(self, shown: Splats, view: View, camera: Camera) -> list[Placed]:
         """The splats in sight where they are at a view's moment."""

@@ -23,7 +23,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.build import assemble, begin, choose
+from recon.build import assemble, begin, choose, fit_config
 from recon.fit import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Track
@@ -50,6 +50,12 @@ def part(leave_out: Callable[[Log, FitConfig], Setting]) -> Callable[[Log, FitCo
 def rolling_shutter(log: Log, config: FitConfig) -> Setting:
     instant = {name: replace(camera, shutter="global", readout_us=0) for name, camera in log.cameras.items()}
     return replace(log, cameras=instant), config
+
+
+@part
+def splats_left_out_by_lot(log: Log, config: FitConfig) -> Setting:
+    """Which none is in a drive."""
+    return log, replace(config, drop=0.0)
 
 
 def _unrefined(what: str) -> None:
@@ -159,8 +165,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=list(PARTS), choices=list(PARTS), metavar="PART")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    log, config = opened(asked.drive), FitConfig(steps=asked.steps, budget=asked.splats, seed=asked.seed)
+    log = opened(asked.drive)
     names, _ = choose(log, asked.cameras)
+    config = replace(fit_config(log, names), steps=asked.steps, budget=asked.splats, seed=asked.seed)
     size = (192, 108) if str(asked.drive) == "walk" else (asked.size[0], asked.size[1])
     columns = [*names, "people"]
     print(f"{'without':<24}" + "".join(f"{name:>22}" for name in columns) + f"{'CPU s':>8}", flush=True)

@@ -204,7 +204,7 @@ def test_photos_are_not_learnt_by_heart(workspace, drive):
     config = fit_config(log, ["camera"])
     assert (config.steps, config.budget) == tuple(12 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
     drive_config = fit_config(open_log(drive), ["front_camera"])
-    assert drive_config.steps > config.steps and drive_config.sh_degree > 0
+    assert drive_config.steps > config.steps and drive_config.sh_degree > 0 and drive_config.drop == 0 < config.drop
     assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
 
 

@@ -1,6 +1,7 @@
 import os
 import signal
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from recon import open_log, reconstruct, stopped_early
 from recon.build import _span
 from recon.checkpoint import checkpoint_path
 from recon.fit import Fit, FitConfig
-from recon.model import Knots, small_poses
+from recon.model import Knots, Splats, small_poses
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
 from scenes import Scene, load
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
+from tests.bench.presets import random_splats
 
 CONFIG = FitConfig(steps=160, budget=11_000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
 SIZE = (96, 54)
@@ -43,6 +45,17 @@ def test_photos_are_kept_that_were_not_held_out(whole):
     times = made.frame_times("front_camera").tolist()
     assert sorted(references.times.tolist()) == [t for i, t in enumerate(times) if i % 4]
     assert references.shots[0].read(*SIZE).shape == (SIZE[1], SIZE[0], 3)
+
+
+def test_splats_drawn_by_lot_are_as_dense_as_all_are_in_the_mean():
+    opacity = torch.linspace(0.05, 0.45, 50)
+    splats = Splats.of([replace(random_splats(50, 1, sh_count=1), logit_opacities=torch.logit(opacity))], [torch.ones(50)])
+    fit = SimpleNamespace(config=FitConfig(drop=0.5), progress=0.9, generator=torch.Generator().manual_seed(1))
+    draws = torch.stack([torch.sigmoid(Fit._drawn_by_lot(fit, splats).fields["logits"]) for _ in range(4000)])
+    assert ((draws < 1e-4).float().mean(0) - 0.5).abs().max() < 0.04
+    assert (draws.mean(0) / opacity - 1).abs().max() < 0.08
+    fit.progress = 0.0
+    assert Fit._drawn_by_lot(fit, splats) is splats
 
 
 def test_held_out_frames_are_reported_with_the_mean_image(whole):
