@@ -50,8 +50,7 @@ def fitted(
 
 def _robust(does: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """How much of each usual change `[15]`, by what each of them does to colours `[N, 3, 15]` and what these miss `[N, 3]`; and the mean
-    squares `[N]` that are left. Reweighted least squares (Cauchy's), for a spread that the profiles
-    themselves show."""
+    squares `[N]` that are left. Reweighted least squares (Cauchy's), for a spread that the profiles themselves show."""
     flat, missing = does.flatten(0, 1), missing.flatten()
     pull = PULL * torch.eye(COEFFICIENTS, device=does.device)
     off = missing.new_zeros(len(does))

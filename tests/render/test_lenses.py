@@ -11,6 +11,7 @@ from scenes import Camera, Equirectangular, Fisheye, FTheta, Gaussians, OpenCV, 
 from scenes.poses import pose_from, translation
 from tests import oracle
 from tests.bench.presets import random_splats
+from tests.render.test_rasterize import assert_gradient, largest
 
 WIDTH, HEIGHT = 56, 40
 START = pose_from([1, 0.02, 0.01, -0.03], [0.1, 0.2, -0.3])
@@ -53,10 +54,6 @@ SCENES = [
 ]
 
 
-def largest(mine: torch.Tensor, reference: torch.Tensor, where: torch.Tensor) -> float:
-    return float((mine.detach().double() - reference.detach()).abs()[where].max())
-
-
 @pytest.mark.parametrize(("make", "model"), SCENES, ids=["ut", "ewa", "stretched"])
 @pytest.mark.parametrize("name", LENSES)
 def test_every_lens_draws_what_the_oracle_draws(make, name, model):
@@ -70,13 +67,6 @@ def test_every_lens_draws_what_the_oracle_draws(make, name, model):
     solid = sure & (alpha > 0.01)
     assert largest(frame.depth / depth, torch.ones_like(depth), solid) < 1e-4
     assert (frame.instance != instance)[sure & ((alpha - 0.5).abs() > 1e-4)].float().mean() < 0.002
-
-
-def assert_gradient(name: str, mine: torch.Tensor, reference: torch.Tensor) -> None:
-    error = (mine.double() - reference).abs()
-    allowed = 1e-3 * reference.abs() + 1e-6 * reference.abs().max()
-    off = f"{name}: {int((error > allowed).sum())} of {error.numel()} off, worst {float((error / allowed).max()):.1f}x"
-    assert (error <= allowed).all(), off
 
 
 def gradients(placed: list[Placed], camera: Camera, model: SplatModel):

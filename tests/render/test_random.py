@@ -9,8 +9,8 @@ import torch
 from render import RenderConfig, rasterize
 from scenes import Equirectangular, Placed, SplatModel
 from tests import oracle
-from tests.render.test_lenses import LENSES, around, camera_of, largest, stretched
-from tests.render.test_rasterize import needles_and_pancakes, off_axis_and_close, two_instances
+from tests.render.test_lenses import LENSES, around, camera_of, stretched
+from tests.render.test_rasterize import largest, needles_and_pancakes, off_axis_and_close, two_instances
 from tests.render.test_shutter import PINHOLE, crash, driven, traffic
 
 STILL = (two_instances, needles_and_pancakes, off_axis_and_close, around, stretched, traffic, crash)

@@ -12,7 +12,8 @@ from scenes import Camera, Equirectangular, Fisheye, OpenCV, Pinhole, Placed, Sp
 from scenes.poses import interpolate, matrix_from_quat, pose_from, translation
 from tests import oracle
 from tests.bench.presets import random_splats
-from tests.render.test_lenses import HEIGHT, LENSES, START, WIDTH, assert_gradient, gradients, largest
+from tests.render.test_lenses import HEIGHT, LENSES, START, WIDTH, gradients
+from tests.render.test_rasterize import assert_gradient, largest
 
 PINHOLE = Pinhole(48.0, 50.0, 27.0, 18.0)
 FISHEYE = Fisheye(20.0, 20.5, 28.0, 20.0, -0.02, 0.004)
