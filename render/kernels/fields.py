@@ -2,14 +2,12 @@
 
 import warp as wp
 
-from render.kernels.types import ONE, TWO
-
-LEAST_LENGTH = wp.constant(wp.float64(1.0e-30))
+from render.kernels.types import LEAST, ONE, TWO
 
 
 @wp.func
 def length_of(q: wp.vec4):
-    return wp.max(wp.length(wp.vec4d(q)), LEAST_LENGTH)
+    return wp.max(wp.length(wp.vec4d(q)), LEAST)
 
 
 @wp.func

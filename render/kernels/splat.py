@@ -24,6 +24,7 @@ from render.kernels.types import (
     GREEN,
     HALF,
     INSTANCE,
+    LEAST,
     OPACITY,
     RED,
     S_MAX,
@@ -45,8 +46,6 @@ from render.kernels.types import (
 LARGEST = wp.constant(wp.float64(1.0e16))  # px^2, of a variance: beyond it floats lose the rest
 
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float64)
-
-LEAST = wp.constant(wp.float64(1.0e-30))
 
 
 @wp.struct

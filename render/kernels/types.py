@@ -66,7 +66,7 @@ HALF, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.5, 1.0, 2.0))
 REACH = wp.constant(3.33)  # sigma at which the most opaque splat has faded to 1/255
 FARTHEST = wp.constant(1.0e12)  # metres from the camera beyond which a splat is not drawn: squares of squares must stay floats
 CULLED = wp.constant(2147483647)
-TINY = wp.constant(1.0e-30)
+TINY, LEAST = wp.constant(1.0e-30), wp.constant(wp.float64(1.0e-30))  # what a length or a variance is divided by at least
 
 
 @wp.struct
