@@ -96,7 +96,7 @@ NEEDS = (
     _package("zstandard", "convert to and from .spz"),
     Need("weights", "render --enhance, enhance, demo", "git checkout enhance/weights, or install again", WEIGHTS),
     _package("pyarrow", "recon of Argoverse 2 and Waymo", extra="arrow"),
-    _package("pycolmap", "recon of COLMAP folders, photos and videos", extra="colmap"),
+    _package("pycolmap", "recon of COLMAP folders, photos, videos, and drives without lidar", extra="colmap"),
     _package("diffusers", "enhance and render with --weights of Difix", extra="public"),
 )
 

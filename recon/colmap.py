@@ -101,6 +101,18 @@ LENSES: dict[str, Callable[..., Lens]] = {
 }
 
 
+def colmap_lens(lens: Lens, where: Path) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's lens model for ours, the reverse of `lens_of`. ValueError for lenses that COLMAP has not."""
+    model = {Pinhole: "PINHOLE", OpenCV: "FULL_OPENCV", Fisheye: "OPENCV_FISHEYE"}.get(type(lens))
+    params = tuple(lens.params().tolist())
+    if model == "FULL_OPENCV" and not any(params[12:]):
+        params = params[:12]
+    elif model in (None, "FULL_OPENCV"):
+        what = f"lens {lens.kind}" + " with thin prisms" * (model is not None)
+        raise ValueError(f"{where} has no lidar, and COLMAP, which finds depths in pictures, has no {what} as its cameras have; add lidar")
+    return model, params
+
+
 def camera_names(model: Model) -> dict[int, str]:
     """A name for every camera that took a picture: "camera" for the only one, else its pictures' folder, else camera_<id>.
 

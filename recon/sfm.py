@@ -14,8 +14,11 @@ PARTS = ("cameras", "images", "points3D")
 EXHAUSTIVE = 40
 """Pictures of which every pair is matched; of more, those whose names are near."""
 
+FEATURES = 4096
+"""Of a picture whose pose is known, at most: they only have to tell how far things are."""
+
 FEWEST_PLACED = 3
-FIX = "COLMAP models are read by pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
+FIX = "COLMAP models, photos and drives without lidar need pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,16 @@ class Model:
     images: tuple[ModelImage, ...]
     xyz: np.ndarray
     rigid: bool
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A picture whose pose is known: its name below the folder of images, as camera/000001.png, COLMAP's name of its lens model with
+    that model's parameters, the same in all pictures of a folder, and `cam_from_world` float64 `[4, 4]`."""
+
+    name: str
+    lens: tuple[str, tuple[float, ...]]
+    cam_from_world: np.ndarray
 
 
 def pycolmap():
@@ -86,8 +99,7 @@ def read_model(folder: Path) -> Model:
     for image in sorted((i for i in found.images.values() if i.has_pose), key=lambda i: i.name):
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        shown = [place[p.point3D_id] for p in image.get_observation_points2D() if p.point3D_id in place]
-        images.append(ModelImage(image.name, image.camera_id, image.frame_id, pose, np.unique(np.array(shown, dtype=np.int64))))
+        images.append(ModelImage(image.name, image.camera_id, image.frame_id, pose, _shown(image, place)))
     if not images:
         raise ValueError(f"{folder} registers no picture; COLMAP found no pose, so there is nothing to reconstruct from")
     values = np.concatenate([xyz.ravel(), *(i.cam_from_world.ravel() for i in images)])
@@ -131,6 +143,60 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> i
     shutil.rmtree(made)
     database.unlink()
     return count
+
+
+def triangulate(workspace: Path, pictures: list[Posed], pairs: list[tuple[str, str]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Points `[N, 3]` that the pictures in `workspace`/images show at their poses, and by name which of them each shows.
+
+    SIFT features, matched between `pairs`, and triangulated with the poses held (Schönberger and Frahm 2016), all on the CPU.
+    """
+    colmap = pycolmap()
+    database, images = workspace / "database.db", workspace / "images"
+    folders: dict[str, list[Posed]] = {}
+    for picture in pictures:
+        folders.setdefault(picture.name.split("/")[0], []).append(picture)
+    cpu, extraction = colmap.Device.cpu, colmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = FEATURES
+    with Progress("points from pictures") as steps:
+        for folder, of in folders.items():
+            steps.step(note=f"features of {folder}")
+            lens, params = of[0].lens
+            reader = colmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
+            colmap.extract_features(
+                database, images, [p.name for p in of], colmap.CameraMode.SINGLE, reader_options=reader,
+                extraction_options=extraction, device=cpu,
+            )  # fmt: skip
+        steps.step(note="matches")
+        listed = workspace / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+        colmap.match_image_pairs(database, pairing_options=colmap.ImportedPairingOptions(match_list_path=str(listed)), device=cpu)
+        steps.step(note="depths")
+        found = _at_poses(colmap, database, pictures)
+        if len(found.images) > 1:
+            (workspace / "found").mkdir()
+            found = colmap.triangulate_points(found, database, images, workspace / "found")
+    place = {key: i for i, key in enumerate(sorted(found.points3D))}
+    xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
+    nothing = {picture.name: np.zeros(0, np.int64) for picture in pictures}
+    return xyz, nothing | {image.name: _shown(image, place) for image in found.images.values()}
+
+
+def _at_poses(colmap, database: Path, pictures: list[Posed]):
+    """COLMAP's reconstruction of those of the database's pictures that match any other, at their poses, without points."""
+    poses = {p.name: colmap.Rigid3d(p.cam_from_world[:3]) for p in pictures}
+    found = colmap.Reconstruction()
+    with colmap.Database.open(database) as opened:
+        found.load(colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions()))
+    for image in found.images.values():
+        image.frame.set_cam_from_world(image.camera_id, poses[image.name])
+        found.register_frame(image.frame_id)
+    return found
+
+
+def _shown(image, place: dict[int, int]) -> np.ndarray:
+    """Which points a registered picture shows, by their places."""
+    points = [place[p.point3D_id] for p in image.get_observation_points2D() if p.point3D_id in place]
+    return np.unique(np.array(points, dtype=np.int64))
 
 
 def _first_line(problem: Exception) -> str:

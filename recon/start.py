@@ -21,6 +21,7 @@ from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_
 from recon.skies import SkyPicture, like_sky, sky_mask
 from recon.sparse import cloud_from_points
 from recon.sweep import companions
+from recon.triangulate import triangulated
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
@@ -55,7 +56,10 @@ class Start:
 
 
 def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_count: int, report: Callable[[str], None]) -> Start:
-    """Read the sweeps of the span and make the start of a fit. ValueError where a drive has no lidar point in view."""
+    """Read the sweeps of the span and make the start of a fit; where it has none, points are found in the pictures.
+
+    ValueError where a drive has no lidar point in view.
+    """
     rig = log.rig(frames.width, frames.height, frames.names)
     ego = body_path(log, frames, rig)
     sweeps = [s for s in log.sweeps if span_us[0] - 200_000 <= s.time_us <= span_us[1] + 200_000]
@@ -63,8 +67,9 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
     report("colouring points")
-    if log.points is not None:
-        cloud, gains = cloud_from_points(log, frames), np.ones((len(frames.names), 3))
+    points = log.points or (None if sweeps else triangulated(log, frames))
+    if points is not None:
+        cloud, gains = cloud_from_points(log, frames, points, movers), np.ones((len(frames.names), 3))
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
         ground = estimate_ground(split.static, log.ego)

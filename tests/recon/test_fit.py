@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from recon import open_log, reconstruct, stopped_early
 from recon.build import _span
@@ -147,10 +148,13 @@ def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
         _span(log, names, 0, -1)
 
 
-def test_a_drive_without_lidar_in_view_is_refused(own_drive, tmp_path):
+def test_a_drive_without_lidar_whose_pictures_show_no_features_is_refused(own_drive, tmp_path):
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
     for file in (own_drive / "lidar").glob("*.pkl.gz"):
         file.unlink()
-    with pytest.raises(ValueError, match="no lidar point"):
+    for file in (own_drive / "camera").glob("*/*.jpg"):
+        Image.new("RGB", (96, 54), (90, 90, 90)).save(file)
+    with pytest.raises(ValueError, match="no training picture shows 8 points"):
         reconstruct(open_log(own_drive), tmp_path / "s", size=SIZE, config=replace(CONFIG, steps=1))
 
 
