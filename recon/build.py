@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from recon.album import keep_album
@@ -46,6 +47,10 @@ MOST = 8000, 450_000
 
 PER_PHOTO = 25, 2500
 """The same of each photo that stands steps apart from the next: nothing is shared by most of them."""
+
+APART = 0.12
+"""Way from a photo to the next, in distances to what it shows, from which on they stand steps apart. A video's pictures do not (0.05 at 12
+metres a second), and are fitted as a drive's."""
 
 DROP = 0.2
 """Part of the splats that a step leaves out where photos stand steps apart."""
@@ -138,16 +143,27 @@ def fit_size(log: Log, names: Sequence[str]) -> tuple[int, int]:
 def fit_config(log: Log, names: Sequence[str], span: tuple[int, int] | None = None) -> FitConfig:
     """How long and how finely to fit the pictures of `span`, all where None: the more there are, the longer and finer.
 
-    Photos that stand steps apart are learnt by heart long before a drive's pictures are: colours that turn with the view, and more than
-    `PER_PHOTO` steps and splats each, improve the photos and nothing between them. Splats that are left out by lot do the reverse.
+    Photos that stand steps apart (`APART`) are learnt by heart long before a drive's pictures are: colours that turn with the view, and
+    more than `PER_PHOTO` steps and splats each, improve the photos and nothing between them. Splats left out by lot do the reverse.
     """
     first, last = span or choose(log, names)[1]
     pictures = sum(int(((t >= first) & (t <= last)).sum()) for t in (log.camera(name).times_us for name in names))
-    if log.points is not None:
+    if _apart(log, names[0]) > APART:
         steps, splats = (min(n * pictures, most) for n, most in zip(PER_PHOTO, MOST, strict=True))
         return FitConfig(steps=steps, budget=splats, sh_degree=0, drop=DROP)
     steps, splats = (min(base + n * pictures, most) for base, n, most in zip(SHARED, PER_PICTURE, MOST, strict=True))
     return FitConfig(steps=steps, budget=splats)
+
+
+def _apart(log: Log, name: str) -> float:
+    """How far a camera's pictures lie apart, in distances to the points that they show: the median; 0 for a log that has none."""
+    if log.points is None:
+        return 0.0
+    eyes = log.camera(name).world_from_cam[:, :3, 3].numpy()
+    shown = [np.linalg.norm(log.points.xyz[points] - eye, axis=1) for points, eye in zip(log.points.seen[name], eyes, strict=True)]
+    far = [float(np.median(d)) for d in shown if len(d)]
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    return float(np.median(steps) / np.median(far)) if len(steps) and far else 0.0
 
 
 def begin(

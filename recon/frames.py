@@ -12,10 +12,20 @@ from scipy import ndimage
 from recon.gains import picture_gains
 from recon.log import Log
 from recon.skies import like_sky, sky_mask
+from scenes.camera import Camera
 from scenes.poses import inverse
 
 RIM = 6
 """Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
+
+BLUE = 0.02
+"""Part of a drive's pictures from which on their sky is blue, and nothing else is taken for it."""
+
+SWEEPS = 16
+"""Sweeps, spread over the span, by which is told what is no sky."""
+
+STRUCK, AROUND = 0.1, 7
+"""Part of what looks like sky in so many columns from which on, where lidar strikes it, it is a wall."""
 
 
 @dataclass(frozen=True)
@@ -38,19 +48,28 @@ class Frames:
     """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
 
     From the first on (0, 8, ...), or, where frames are photos taken steps apart, from the middle of the eight (4, 12, ...): what the
-    first photo shows at its edges, no other one does.
+    first photo shows at its edges, no other one does. `overcast` where their sky has no colour.
     """
 
     names: list[str]
     width: int
     height: int
     views: list[View]
+    overcast: bool = False
 
     def training(self) -> list[View]:
         return [v for v in self.views if not v.held_out]
 
     def held_out(self) -> list[View]:
         return [v for v in self.views if v.held_out]
+
+    def sky_of(self, view: View) -> np.ndarray:
+        """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
+        found = sky_mask(view.image.numpy(), self.overcast)
+        if not self.overcast:
+            return found
+        rows, columns = (np.arange(n) * of // n for n, of in zip(found.shape, view.sky.shape, strict=True))
+        return found & ndimage.binary_dilation(view.sky.numpy(), iterations=2)[rows[:, None], columns]
 
     def of(self, camera: int, held_out: bool = False) -> list[View]:
         return [v for v in self.views if v.camera == camera and v.held_out == held_out]
@@ -80,7 +99,50 @@ def load_frames(
             report()
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
-    return Frames(names, *size, views if log.points is None else _balanced(log, names, views))
+    views, overcast = _under_their_sky(log, names, views)
+    return Frames(names, *size, views if log.points is None else _balanced(log, names, views), overcast)
+
+
+def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], bool]:
+    """The views, and whether their sky is overcast: then each is told its sky as such a one is known.
+
+    That takes colour, and what lidar strikes is left out: a white wall fits the description as well.
+    """
+    blue = float(np.mean([v.sky.float().mean() for v in views]))
+    if blue >= BLUE or all(_colourless(v.image) for v in views[:: max(1, len(views) // 8)]):
+        return views, False
+    first, last = min(v.time_us for v in views), max(v.time_us for v in views)
+    within = [s for s in log.sweeps if first - 200_000 <= s.time_us <= last + 200_000]
+    chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
+    points = [s.read().xyz for s in chosen]
+    grey = []
+    for view in views:
+        sky = _sky(view.image, overcast=True).numpy()
+        if chosen:
+            nearest = min(range(len(chosen)), key=lambda i: abs(chosen[i].time_us - view.time_us))
+            camera = log.camera(names[view.camera]).camera(view.index, sky.shape[1], sky.shape[0])
+            sky = _unstruck(sky, points[nearest], camera)
+        grey.append(replace(view, sky=torch.from_numpy(sky)))
+    if float(np.mean([v.sky.float().mean() for v in grey])) <= 2 * blue:
+        return views, False
+    return grey, True
+
+
+def _colourless(image: torch.Tensor) -> bool:
+    return bool((image[..., 0] == image[..., 2]).all())
+
+
+def _unstruck(sky: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
+    """A mask `[h, w]` without the columns in which lidar's `points` `[N, 3]`, as a camera of its size sees them, strike it."""
+    back = inverse(camera.world_from_cam)
+    local = torch.from_numpy(points) @ back[:3, :3].T + back[:3, 3]
+    local = local[(local[:, 2] > 0.5) & camera.lens.valid(local)]
+    column, row = camera.lens.project(local).floor().long().T.numpy()
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    struck = np.zeros(sky.shape, np.float32)
+    struck[row[inside], column[inside]] = 1
+    hits, cells = (ndimage.uniform_filter1d(m.sum(0, dtype=np.float32), AROUND) for m in (struck * sky, sky))
+    return sky & (hits <= STRUCK * cells)
 
 
 def _balanced(log: Log, names: list[str], views: list[View]) -> list[View]:
@@ -109,9 +171,9 @@ def divided(image: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
     return (image.float() / gain).round().clamp(0, 255).to(torch.uint8)
 
 
-def _sky(image: torch.Tensor) -> torch.Tensor:
+def _sky(image: torch.Tensor, overcast: bool = False) -> torch.Tensor:
     """The sky of an image on a grid about 240 cells wide: without its rim, but for what of that looks like it, where splats of its colour
     would stand before walls as soon as it is seen from elsewhere."""
     step = max(1, image.shape[1] // 240)
     coarse = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy())
-    return torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse), border_value=1), RIM))
+    return torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse, overcast), border_value=1), RIM))

@@ -18,7 +18,7 @@ from recon.ground import estimate_ground
 from recon.log import Log, Track
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
-from recon.skies import SkyPicture, like_sky, sky_mask
+from recon.skies import SkyPicture, like_sky
 from recon.sparse import cloud_from_points
 from recon.sweep import companions
 from recon.triangulate import triangulated
@@ -67,9 +67,9 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
     report("colouring points")
-    points = log.points or (None if sweeps else triangulated(log, frames))
-    if points is not None:
-        cloud, gains = cloud_from_points(log, frames, points, movers), np.ones((len(frames.names), 3))
+    sparse = log.points or (None if sweeps else triangulated(log, frames))
+    if sparse is not None:
+        cloud, gains = cloud_from_points(log, frames, sparse, movers), np.ones((len(frames.names), 3))
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
         ground = estimate_ground(split.static, log.ego)
@@ -180,7 +180,7 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
                     placed.append(Placed(splats, trajectory.at(view.time_us)))
             alpha, depth = (t.numpy() for t in draw(placed, camera, "alpha", "depth"))
             covered = (alpha > 0.3) | hidden
-            sky = sky_mask(view.image.numpy()) & ~covered
+            sky = frames.sky_of(view) & ~covered
             picture.add(view.image.numpy(), sky, camera, gains[c])
             sky = like_sky(view.image.numpy(), sky) & ~covered
             floor = float(ground.height(camera.world_from_cam[:2, 3]))

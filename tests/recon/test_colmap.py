@@ -199,13 +199,18 @@ def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
         open_log(workspace)
 
 
-def test_photos_are_not_learnt_by_heart(workspace, drive):
-    log = open_log(workspace)
+def test_photos_that_stand_apart_are_not_learnt_by_heart(street, drive, tmp_path):
+    log = open_log(write_colmap(tmp_path / "far", street, {"": pictures_along(street, count=6, step=4.0)}))
     config = fit_config(log, ["camera"])
-    assert (config.steps, config.budget) == tuple(12 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
+    assert (config.steps, config.budget) == tuple(6 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
     drive_config = fit_config(open_log(drive), ["front_camera"])
     assert drive_config.steps > config.steps and drive_config.sh_degree > 0 and drive_config.drop == 0 < config.drop
     assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
+
+
+def test_pictures_as_near_as_a_videos_are_fitted_as_a_drives(workspace, drive):
+    near = fit_config(open_log(workspace), ["camera"])
+    assert near.drop == 0 and near.steps > fit_config(open_log(drive), ["front_camera"]).steps  # of eight pictures, and these are twelve
 
 
 def test_a_fit_is_longer_and_finer_the_more_pictures_it_has(drive):

@@ -1,0 +1,73 @@
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from recon import open_log
+from recon.colmap import CAM_FROM_BODY
+from recon.frames import load_frames
+from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
+from scenes.lenses import Pinhole
+from scenes.trajectory import Trajectory
+
+ALL = (0, 2**62)
+SIZE = (240, 120)
+
+
+def _log(sky: tuple[int, int, int], strikes: bool) -> Log:
+    """Three pictures of a street: sky to the left, to the right a wall as white as an overcast one, and lidar on it, or on the road."""
+    generator = np.random.default_rng(0)
+    image = generator.integers(20, 120, (120, 240, 3)).astype(np.uint8)
+    image[:50] = sky
+    image[:70, 130:] = 231, 229, 226
+    buffer = BytesIO()
+    Image.fromarray(image).save(buffer, "png")
+    times = torch.arange(3) * 100_000
+    bodies = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses = bodies @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+    camera = LogCamera("front", Pinhole(120, 120, 120, 60), *SIZE, (Packed("street", buffer.getvalue),) * 3, times, poses)
+    # ten metres ahead: to the right and up to 5 m, or below
+    y, z = np.meshgrid(np.linspace(-10.5, -1.0, 80), np.linspace(*((0.0, 4.9) if strikes else (-4.0, -1.0)), 60))
+    xyz = np.stack([np.full(y.size, 10.0), y.ravel(), z.ravel()], 1)
+    sweep = Sweep(0, 100_000, lambda: LidarPoints(xyz, np.full(len(xyz), 100_000), np.zeros(len(xyz), np.int64)))
+    return Log("street", Path("street"), {"front": camera}, (sweep,), (), Trajectory(times, bodies), {}, ("front",))
+
+
+def _skies(log: Log) -> tuple[bool, np.ndarray, np.ndarray]:
+    frames = load_frames(log, ["front"], ALL, SIZE, 0)
+    return frames.overcast, frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
+
+
+def test_a_white_wall_under_an_overcast_sky_is_told_from_it_by_lidar():
+    overcast, coarse, fine = _skies(_log((236, 238, 240)[::-1], strikes=True))
+    assert overcast
+    for mask in (coarse, fine):
+        assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
+    _, unguarded, _ = _skies(_log((236, 238, 240)[::-1], strikes=False))
+    assert unguarded[3:40, 140:235].mean() > 0.9  # so it was lidar that told
+
+
+def test_under_a_blue_sky_nothing_white_is_taken_for_it():
+    overcast, coarse, fine = _skies(_log((150, 180, 225), strikes=False))
+    assert not overcast
+    for mask in (coarse, fine):
+        assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
+
+
+def test_pictures_without_colour_tell_no_sky():
+    overcast, coarse, _ = _skies(_log((255, 255, 255), strikes=True))
+    assert overcast and coarse.any()  # white among colours
+    grey = _log((255, 255, 255), strikes=True)
+    plain = BytesIO()
+    Image.open(BytesIO(grey.cameras["front"].files[0].read())).convert("L").save(plain, "png")
+    camera = grey.cameras["front"]
+    object.__setattr__(camera, "files", (Packed("grey", plain.getvalue),) * 3)
+    overcast, coarse, _ = _skies(grey)
+    assert not overcast and not coarse.any()
+
+
+def test_the_made_up_streets_sky_is_blue(drive):
+    log = open_log(drive)
+    assert not load_frames(log, list(log.cameras), ALL, (96, 54), 8).overcast
