@@ -62,18 +62,20 @@ class SkyPicture:
         np.add.at(self.count, cells, 1)
 
     def picture(self) -> torch.Tensor:
-        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings; grey without any sample."""
+        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too little;
+        grey without any sample."""
         if not self.count.any():
             return torch.full((*self.count.shape, 3), 0.7)
         out = np.full(self.sum.shape, np.nan)
         sigma = 0.0
-        while np.isnan(out).any():
+        while np.isnan(out).any() and sigma < len(out):
             modes = ("nearest", "wrap")
             blur = [ndimage.gaussian_filter(a, sigma, mode=modes) if sigma else a for a in (*np.moveaxis(self.sum, -1, 0), self.count)]
             take = np.isnan(out[..., 0]) & (blur[3] > 1e-3)
             out[take] = np.stack(blur[:3], -1)[take] / blur[3][take][:, None]
             sigma = max(1.5, sigma * 2)
-        return torch.from_numpy(out).float()
+        mean = self.sum.sum((0, 1)) / self.count.sum()
+        return torch.from_numpy(np.where(np.isnan(out), mean, out)).float()
 
 
 def _cells(mask: np.ndarray, camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:

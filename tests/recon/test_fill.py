@@ -23,6 +23,12 @@ def camera():
     return Camera(Pinhole(60.0, 60.0, 40.0, 30.0), 80, 60, pose)
 
 
+def test_a_sky_of_which_hardly_anything_was_seen_takes_that_everywhere():
+    sky = SkyPicture(64)
+    sky.count[20, 30], sky.sum[20, 30] = 1, (0.2, 0.4, 0.6)
+    np.testing.assert_allclose(sky.picture(), np.broadcast_to(np.float32([0.2, 0.4, 0.6]), (64, 128, 3)), atol=1e-4)
+
+
 def test_an_overcast_sky_is_known_by_its_light_and_only_where_it_is_asked_for():
     generator = np.random.default_rng(0)
     image = generator.integers(40, 160, (48, 64, 3)).astype(np.uint8)
