@@ -62,8 +62,8 @@ class SkyPicture:
         np.add.at(self.count, cells, 1)
 
     def picture(self) -> torch.Tensor:
-        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too little;
-        grey without any sample."""
+        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too
+        little; grey without any sample."""
         if not self.count.any():
             return torch.full((*self.count.shape, 3), 0.7)
         out = np.full(self.sum.shape, np.nan)
