@@ -160,7 +160,7 @@ class Render:
             from render.album import references_of
 
             references = references_of(self.scene, scene)
-            stages, needs = enhancement(self.weights, self.device, references)
+            stages, needs = enhancement(self.weights, self.device, references, scene)
             facts["photos"] = len(references.shots) if references else 0
         record(
             scene, self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,

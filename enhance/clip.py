@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
 from scenes.opening import warn
+from scenes.scene import Scene
 
 HUGE = 50_000_000
 """Weights from which a model is no matter of milliseconds on a CPU."""
@@ -31,20 +32,36 @@ def load_saying(weights: str, device: str = "cpu") -> Steps:
     return enhancer
 
 
-def enhance_frames(frames: Iterable[Frame], enhancer: Steps) -> Iterator[Frame]:
-    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`."""
+def enhance_frames(frames: Iterable[Frame], enhancer: Steps, scene: Scene | None = None) -> Iterator[Frame]:
+    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`. Of the
+    instances it is told those that are `anew` in the `scene`, all where None: recorded actors have their own light and shadow already."""
     memory = None
     for frame in frames:
-        better, memory = enhancer.step(frame, memory)
+        better, memory = enhancer.step(frame if scene is None else telling(frame, anew(scene)), memory)
         yield replace(frame, rgb=better)
 
 
-def enhancement(weights: str, device: str = "cpu", references: References | None = None) -> tuple[Stages, tuple[str, ...]]:
+def anew(scene: Scene) -> list[int]:
+    """Instances of the actors that were put in or edited."""
+    return [i + 1 for i, actor in enumerate(scene.actors) if actor.anew]
+
+
+def telling(frame: Frame, ids: Sequence[int]) -> Frame:
+    """The frame with these of its instances, if it has them at all; the others count as background."""
+    if frame.instance is None:
+        return frame
+    known = torch.isin(frame.instance, torch.tensor(ids, dtype=frame.instance.dtype, device=frame.instance.device))
+    return replace(frame, instance=torch.where(known, frame.instance, frame.instance.clamp_max(0)))
+
+
+def enhancement(
+    weights: str, device: str = "cpu", references: References | None = None, scene: Scene | None = None
+) -> tuple[Stages, tuple[str, ...]]:
     """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads. references: of the
-    scene, if it has photos."""
+    scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
     enhancer = load_saying(weights, device)
     outputs = tuple(name for name in enhancer.reads if name != "reference")
-    stages: dict[str, Callable] = {"enhance": partial(enhance_frames, enhancer=enhancer)}
+    stages: dict[str, Callable] = {"enhance": partial(enhance_frames, enhancer=enhancer, scene=scene)}
     if references is None or "reference" not in enhancer.reads:
         return stages, outputs
     return {"references": references.along, **stages}, (*outputs, *NEEDED)

@@ -68,7 +68,7 @@ def demonstrate(data: Path, folder: Path, weights: str = "builtin") -> None:
     shown = _rows(len(times))
     before: dict[int, torch.Tensor] = {}
     after: dict[int, torch.Tensor] = {}
-    stages, needs = enhancement(weights)
+    stages, needs = enhancement(weights, scene=scene)
     enhance = stages["enhance"]
 
     def noted(frames: Iterator[Frame]) -> Iterator[Frame]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from enhance.clip import telling
 from enhance.drift import KEPT, drift, drift_text, of_video
 from enhance.enhancer import Enhancer
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
@@ -33,10 +34,11 @@ EVERY = 3
 SMALLEST = 200
 """Pixels that a region must have to be measured by itself."""
 
-TOLD = "ours + instances"
+TOLD, PUT_IN = "ours + instances", "ours + what was put in"
 METHODS = ("identity", "ours", TOLD)
+"""TOLD is told all actors; PUT_IN, of kinds that change some, those alone, as `render --enhance` does with what was inserted."""
 PHOTOS = ("references alone", "ours + instances + references")
-"""Where a rendered scene has photos: what those say of the frame, and that enhanced as `render --enhance` does."""
+"""Where a rendered scene has photos: what those say of the frame, and that enhanced."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ def evaluate(
     features, rows, others = shipped_features(), [], dict(beside or {})
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
-        for method in (*METHODS, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
+        some = (PUT_IN,) if shards and all("instances" in s.meta for s in shards) else ()
+        for method in (*METHODS, *some, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
             rows.append(measured(kind, method, shards, others.get(method, enhancer), features))
@@ -124,6 +127,8 @@ def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, f
         memory = None
         for t in range(shard.frames):
             frame = _frame(window, t, told=method not in METHODS or method == TOLD, referenced=method in PHOTOS)
+            if method == PUT_IN:
+                frame = telling(frame, shard.meta["instances"])
             start = time.perf_counter()
             if method == "identity":
                 better = window.input[t].permute(1, 2, 0)

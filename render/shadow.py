@@ -63,7 +63,7 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     """The inserted assets whose shadow can fall into the view."""
     found = []
     for i, actor in enumerate(scene.actors):
-        if not _placed_anew(actor) or not actor.trajectory.covers(camera.time_us):
+        if not actor.anew or not actor.trajectory.covers(camera.time_us):
             continue
         pose, shade = actor.trajectory.at(camera.time_us), _shade(scene)
         directions, weights = shade.at(actor, pose)
@@ -105,11 +105,6 @@ def _light(frame: Frame, caster: Caster) -> torch.Tensor:
         seen = [view(rays, wp.vec3), view(depth, float), view(instance, int), x0, y0, view(light, float)]
         run(fall, light.numel(), [told, view(blocked, float), *seen], device)
     return light
-
-
-def _placed_anew(actor: Actor) -> bool:
-    """Whether it stands where no photo shows its shadow."""
-    return bool(actor.asset.meta.get("inserted") or actor.asset.meta.get("edited"))
 
 
 class Shade:

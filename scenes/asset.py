@@ -38,3 +38,8 @@ class Actor:
     trajectory: Trajectory
     track: str
     deformation: Deformation | None = None
+
+    @property
+    def anew(self) -> bool:
+        """Whether it was put in or edited, so that no photo shows it as it stands, in its light and with its shadow."""
+        return bool(self.asset.meta.get("inserted") or self.asset.meta.get("edited"))

@@ -1,15 +1,18 @@
 """Whole videos."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from small_net import SMALL, stirred
 
-from enhance.clip import enhance_video, enhancement
+from enhance.clip import enhance_frames, enhance_video, enhancement, telling
 from enhance.enhancer import Enhancer
 from enhance.net import Net
 from enhance.weights_file import save_net
 from render.clip import render_clip
+from render.frame_types import Frame
 from render.references import References, Shot
 from render.video import VideoWriter, read_video
 
@@ -75,3 +78,24 @@ def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     assert "no frame was changed" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "other.mp4", Enhancer(stirred()))
     assert "no frame was changed" not in capsys.readouterr().err
+
+
+def test_of_a_scenes_actors_those_that_were_put_in_or_edited_are_told(street):
+    class Listening:
+        told = ()
+
+        def step(self, frame, memory=None):
+            self.told = (*self.told, frame.instance)
+            return frame.rgb, None
+
+    actor = street.actors[0]
+    put_in = replace(actor, asset=replace(actor.asset, meta={**actor.asset.meta, "inserted": True}), track="put_in")
+    scene = replace(street, actors=(actor, put_in))
+    instance = torch.tensor([[-1, 0, 1, 2]], dtype=torch.int32)
+    frame = Frame(street.camera("front_camera", times(street)[0]), rgb=torch.rand(1, 4, 3), instance=instance)
+    listening = Listening()
+    (after,) = enhance_frames([frame], listening, scene)
+    assert listening.told[0].tolist() == [[-1, 0, 0, 2]] and after.instance is instance
+    list(enhance_frames([frame], listening))
+    assert listening.told[1] is instance
+    assert telling(replace(frame, instance=None), [1]).instance is None

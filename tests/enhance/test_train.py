@@ -10,7 +10,7 @@ import torch
 from small_net import SMALL
 
 from enhance.enhancer import Enhancer
-from enhance.evaluate import METHODS, PHOTOS, _told, evaluate, table
+from enhance.evaluate import METHODS, PHOTOS, PUT_IN, _told, evaluate, table
 from enhance.net import Net
 from enhance.run import TrainConfig
 from enhance.shards import PairSet, to_bytes, write_shard
@@ -41,7 +41,8 @@ def pairs(tmp_path_factory):
             "depth": torch.ones(3, 40, 56, dtype=torch.float16),
         }
         for i, split in enumerate(("train", "held out")):
-            write_shard(folder / kind / f"{i}.safetensors", tensors, {"kind": kind, "split": split})
+            changed = {"instances": [1]} if kind == "isp" else {}
+            write_shard(folder / kind / f"{i}.safetensors", tensors, {"kind": kind, "split": split, **changed})
     return PairSet(folder)
 
 
@@ -85,12 +86,12 @@ def test_training_undoes_a_constant_error(pairs, tmp_path):
     config = replace(QUICK, autoencoder=0.05, objects=0.01, rate=3e-3, kinds=("underfit", "isp", "clean"))
     weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
     rows = evaluate(pairs, Enhancer.load(weights))
-    assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, *METHODS]
+    assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, PUT_IN, *METHODS]
     by = {(r.kind, r.method): r for r in rows}
     assert by["underfit", "ours"].mean("region") > by["underfit", "identity"].mean("region") + 0.3
     assert by["clean", "identity"].mean("frame") == float("inf") and by["isp", "identity"].mean("warp error") > 0
     text = table(rows)
-    assert text.count("\n") == 12 and "| clean | identity | - | - | equal |" in text
+    assert text.count("\n") == 13 and "| clean | identity | - | - | equal |" in text
 
 
 def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_path):
@@ -158,5 +159,5 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
             return frame.rgb * 0.5, True
 
     rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
-    assert [r.method for r in rows] == [*METHODS, *PHOTOS, "half", *METHODS, "half", *METHODS, "half"]
+    assert [r.method for r in rows] == [*METHODS, *PHOTOS, "half", *METHODS, PUT_IN, "half", *METHODS, "half"]
     assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)
