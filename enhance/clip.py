@@ -35,15 +35,10 @@ def load_saying(weights: str, device: str = "cpu") -> Steps:
 def enhance_frames(frames: Iterable[Frame], enhancer: Steps, scene: Scene | None = None) -> Iterator[Frame]:
     """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`. Of the
     instances it is told those that are `anew` in the `scene`, all where None: recorded actors have their own light and shadow already."""
-    memory = None
+    memory, anew = None, None if scene is None else scene.anew()
     for frame in frames:
-        better, memory = enhancer.step(frame if scene is None else telling(frame, anew(scene)), memory)
+        better, memory = enhancer.step(frame if anew is None else telling(frame, anew), memory)
         yield replace(frame, rgb=better)
-
-
-def anew(scene: Scene) -> list[int]:
-    """Instances of the actors that were put in or edited."""
-    return [i + 1 for i, actor in enumerate(scene.actors) if actor.anew]
 
 
 def telling(frame: Frame, ids: Sequence[int]) -> Frame:

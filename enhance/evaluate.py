@@ -81,8 +81,9 @@ def evaluate(
     progress: Callable[[str], None] | None = None,
     beside: Mapping[str, Steps] | None = None,
 ) -> list[Row]:
-    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of rendered
-    kinds for what photos say, and the enhancer told that and the instances; then for those `beside` it by name, told the instances too.
+    """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of those
+    that change some instances for the enhancer told these alone; of rendered kinds for what photos say, and the enhancer told that and the
+    instances; then for those `beside` it by name, told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.

@@ -54,16 +54,6 @@ class Model:
     rigid: bool
 
 
-@dataclass(frozen=True)
-class Posed:
-    """A picture whose pose is known: its name below the folder of images, as camera/000001.png, COLMAP's name of its lens model with
-    that model's parameters, the same in all pictures of a folder, and `cam_from_world` float64 `[4, 4]`."""
-
-    name: str
-    lens: tuple[str, tuple[float, ...]]
-    cam_from_world: np.ndarray
-
-
 def pycolmap():
     """The module; ModuleNotFoundError's fix as ValueError where it is not installed."""
     try:
@@ -145,25 +135,26 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> i
     return count
 
 
-def triangulate(workspace: Path, pictures: list[Posed], pairs: list[tuple[str, str]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def triangulate(
+    workspace: Path, lenses: dict[str, tuple[str, tuple[float, ...]]], poses: dict[str, np.ndarray], pairs: list[tuple[str, str]]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Points `[N, 3]` that the pictures in `workspace`/images show at their poses, and by name which of them each shows.
 
-    SIFT features, matched between `pairs`, and triangulated with the poses held (Schönberger and Frahm 2016), all on the CPU.
+    lenses: by folder of pictures COLMAP's name of their lens model, and its parameters; poses: by a picture's name, as camera/000001.png,
+    `cam_from_world` float64 `[4, 4]`. SIFT features, matched between `pairs`, and triangulated with the poses held (Schönberger and Frahm
+    2016), all on the CPU.
     """
     colmap = pycolmap()
     database, images = workspace / "database.db", workspace / "images"
-    folders: dict[str, list[Posed]] = {}
-    for picture in pictures:
-        folders.setdefault(picture.name.split("/")[0], []).append(picture)
     cpu, extraction = colmap.Device.cpu, colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = FEATURES
     with Progress("points from pictures") as steps:
-        for folder, of in folders.items():
+        for folder, (lens, params) in lenses.items():
             steps.step(note=f"features of {folder}")
-            lens, params = of[0].lens
+            names = [name for name in poses if name.startswith(f"{folder}/")]
             reader = colmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
             colmap.extract_features(
-                database, images, [p.name for p in of], colmap.CameraMode.SINGLE, reader_options=reader,
+                database, images, names, colmap.CameraMode.SINGLE, reader_options=reader,
                 extraction_options=extraction, device=cpu,
             )  # fmt: skip
         steps.step(note="matches")
@@ -171,24 +162,23 @@ def triangulate(workspace: Path, pictures: list[Posed], pairs: list[tuple[str, s
         listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         colmap.match_image_pairs(database, pairing_options=colmap.ImportedPairingOptions(match_list_path=str(listed)), device=cpu)
         steps.step(note="depths")
-        found = _at_poses(colmap, database, pictures)
+        found = _at_poses(colmap, database, poses)
         if len(found.images) > 1:
             (workspace / "found").mkdir()
             found = colmap.triangulate_points(found, database, images, workspace / "found")
     place = {key: i for i, key in enumerate(sorted(found.points3D))}
     xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
-    nothing = {picture.name: np.zeros(0, np.int64) for picture in pictures}
+    nothing = dict.fromkeys(poses, np.zeros(0, np.int64))
     return xyz, nothing | {image.name: _shown(image, place) for image in found.images.values()}
 
 
-def _at_poses(colmap, database: Path, pictures: list[Posed]):
+def _at_poses(colmap, database: Path, poses: dict[str, np.ndarray]):
     """COLMAP's reconstruction of those of the database's pictures that match any other, at their poses, without points."""
-    poses = {p.name: colmap.Rigid3d(p.cam_from_world[:3]) for p in pictures}
     found = colmap.Reconstruction()
     with colmap.Database.open(database) as opened:
         found.load(colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions()))
     for image in found.images.values():
-        image.frame.set_cam_from_world(image.camera_id, poses[image.name])
+        image.frame.set_cam_from_world(image.camera_id, colmap.Rigid3d(poses[image.name][:3]))
         found.register_frame(image.frame_id)
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from PIL import Image
 from recon.colmap import colmap_lens
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints
-from recon.sfm import Posed, triangulate
+from recon.sfm import triangulate
 from scenes.poses import inverse
 
 AHEAD = (1, 2, 4, 8)
@@ -29,15 +30,16 @@ def triangulated(log: Log, frames: Frames) -> SparsePoints:
     views = sorted(frames.training(), key=lambda v: (v.camera, v.time_us))
     names = [f"{frames.names[v.camera]}/{v.index:06d}.png" for v in views]
     with tempfile.TemporaryDirectory() as folder:
-        posed = []
+        lenses, poses = {}, {}
         for view, name in zip(views, names, strict=True):
             camera = log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height)
             file = Path(folder, "images", name)
             file.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(view.image.numpy()).save(file, compress_level=1)
-            posed.append(Posed(name, colmap_lens(camera.lens, log.path), inverse(camera.world_from_cam).numpy()))
+            lenses[file.parent.name] = colmap_lens(camera.lens, log.path)
+            poses[name] = inverse(camera.world_from_cam).numpy()
         pairs = [(names[i], names[j]) for i, j in matched(views)]
-        xyz, shown = triangulate(Path(folder), posed, pairs)
+        xyz, shown = triangulate(Path(folder), lenses, poses, pairs)
     seen = {camera: [np.zeros(0, np.int64)] * len(log.camera(camera)) for camera in frames.names}
     for view, name in zip(views, names, strict=True):
         seen[frames.names[view.camera]][view.index] = shown[name]
@@ -46,11 +48,8 @@ def triangulated(log: Log, frames: Frames) -> SparsePoints:
 
 def matched(views: list[View]) -> list[tuple[int, int]]:
     """Which of the views, sorted by camera and time, are matched: those of a camera that are `AHEAD`, and those of a moment."""
-    pairs = [(i, i + n) for n in AHEAD for i in range(len(views) - n) if views[i].camera == views[i + n].camera]
-    for i, one in enumerate(views):
-        pairs += [
-            (i, j)
-            for j, other in enumerate(views[i + 1 :], i + 1)
-            if other.camera != one.camera and abs(other.time_us - one.time_us) <= TOGETHER_US
-        ]
-    return pairs
+    return [
+        (i, j)
+        for (i, one), (j, other) in combinations(enumerate(views), 2)
+        if (j - i in AHEAD if one.camera == other.camera else abs(other.time_us - one.time_us) <= TOGETHER_US)
+    ]

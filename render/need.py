@@ -65,8 +65,7 @@ def need_of(scene: Scene, frame: Frame, shaded: torch.Tensor) -> torch.Tensor:
     parts = [*frame.features.detach().clamp(0, 1).unbind(-1), alpha * far_from_photos(scene, frame.camera, frame.depth.detach())]
     # with a sky, where all light passes there is sky; where some does, a wall with holes
     parts.append((4 * alpha * (1 - alpha) if scene.sky is not None else 1 - alpha).clamp(0, 1))
-    anew = [i + 1 for i, a in enumerate(scene.actors) if a.anew]
-    parts.append((torch.isin(frame.instance, torch.tensor(anew, dtype=torch.int32, device=alpha.device)) | shaded).float())
+    parts.append((torch.isin(frame.instance, torch.tensor(scene.anew(), dtype=torch.int32, device=alpha.device)) | shaded).float())
     return 1 - torch.stack([1 - part for part in parts]).prod(0)
 
 

@@ -63,6 +63,10 @@ class Scene:
         times = self.rig_camera(name).times_us
         return times if len(times) else self.ego.times_us
 
+    def anew(self) -> list[int]:
+        """Instance ids of the actors that were put in or edited."""
+        return [i + 1 for i, actor in enumerate(self.actors) if actor.anew]
+
     def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:
         """Background and the actors that exist at a time, each at its pose and under its instance id; with the pose to which it
         moves while an image is read out, where that takes `readout_us`. What deforms stands as in the middle of it."""
