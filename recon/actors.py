@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +38,7 @@ def inside(local: np.ndarray, size: np.ndarray, margin: float, below: float = 0.
     return (np.abs(local[:, :2]) <= half).all(1) & (local[:, 2] >= -below) & (local[:, 2] <= size[2] + margin)
 
 
-def split_points(log: Log, sweeps: list[Sweep], tracks: list[Track]) -> Split:
+def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Split:
     """Sort the points of `sweeps` into static ones and those of the moving `tracks`.
 
     A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the

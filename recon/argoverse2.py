@@ -22,6 +22,8 @@ from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory
 
 FRONT = ("ring_front_center", "ring_front_left", "ring_front_right")
+LIDARS = ("up_lidar", "down_lidar")
+"""By the number that their points get."""
 LABELS = {
     "REGULAR_VEHICLE": "car", "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK_CAB": "truck", "SCHOOL_BUS": "bus",
     "ARTICULATED_BUS": "bus", "VEHICULAR_TRAILER": "trailer", "RAILED_VEHICLE": "tram", "BICYCLIST": "cyclist", "MOTORCYCLIST": "cyclist",
@@ -72,7 +74,9 @@ def read_argoverse2(path: Path) -> Log:
         "attribution": "Argoverse 2 by Argo AI", "body": "ego frame, x forward, y left, z up", "world_origin": origin.tolist(),
     }  # fmt: skip
     tracks = _tracks(path / "annotations.feather", ego)
-    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+    lidars = {k: mount_of[name][:3, 3].numpy() for k, name in enumerate(LIDARS) if name in mount_of}
+    front = tuple(n for n in FRONT if n in cameras)
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars=lidars)
 
 
 def _us(nanoseconds: np.ndarray) -> np.ndarray:

@@ -16,9 +16,10 @@ from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, sav
 from recon.fit import Fit, FitConfig, run
 from recon.frames import Frames, load_frames
 from recon.limbs import Limbs
-from recon.log import Log, Track
+from recon.log import Log, Sweep, Track
 from recon.model import MODEL, Knots
 from recon.motion import Motion
+from recon.movers import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.skies import seen_sky
@@ -96,8 +97,9 @@ def reconstruct(
     saved = load_checkpoint(checkpoint, options) if resume else None
 
     unseen = held_out_sweeps(log, held_out)
-    fitted = replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
-    start, fit = begin(fitted, names, span, size, config, held_out, saved[0] if saved else None)
+    seen = tuple(s for s in log.sweeps if s not in unseen)
+    log = annotated(log, replace(log, sweeps=seen).sweeps_within(span))
+    start, fit = begin(replace(log, sweeps=seen), names, span, size, config, held_out, saved[0] if saved else None)
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
@@ -123,6 +125,17 @@ def reconstruct(
         keep_album(scene, fit.frames, start.rig, output, steps.step)
     checkpoint.unlink(missing_ok=True)
     return scene
+
+
+def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
+    """The log, with the movers that `sweeps` show where it has no boxes of its own."""
+    if log.tracks or not sweeps:
+        return log
+    with Progress("movers", total=len(sweeps)) as steps:
+        found = with_movers(log, sweeps, steps.step)
+    count = len(found.tracks)
+    print(f"{log.path} has no boxes: its lidar shows {count} thing{'s that move' if count != 1 else ' that moves'}", file=sys.stderr)
+    return found
 
 
 def choose(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from recon.build import assemble, begin, choose
+from recon.build import annotated, assemble, begin, choose
 from recon.fit import FitConfig
 from recon.log import Log
 from render.progress import Progress
@@ -38,6 +38,7 @@ def stopped_early(
         return list(paths.values())
     folder.mkdir(parents=True, exist_ok=True)
     names, span = choose(log, cameras)
+    log = annotated(log, log.sweeps_within(span))
     start, fit = begin(log, names, span, size, config)
     with Progress(f"fit {folder.name}", total=max(paths)) as steps:
         while fit.step_count < max(paths):

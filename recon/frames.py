@@ -111,8 +111,7 @@ def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[lis
     blue = float(np.mean([v.sky.float().mean() for v in views]))
     if blue >= BLUE or all(_colourless(v.image) for v in views[:: max(1, len(views) // 8)]):
         return views, False
-    first, last = min(v.time_us for v in views), max(v.time_us for v in views)
-    within = [s for s in log.sweeps if first - 200_000 <= s.time_us <= last + 200_000]
+    within = log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views)))
     chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
     points = [s.read().xyz for s in chosen]
     grey = []

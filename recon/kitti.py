@@ -71,7 +71,7 @@ def read_kitti_raw(path: Path) -> Log:
         "geodetic_origin": dict(zip(("lat", "long", "height"), first[:3], strict=True)),
     }  # fmt: skip
     tracks = _tracklets(path / "tracklet_labels.xml", lidar_times, inverse(lidar_from_imu), ego)
-    return _log(meta, path, cameras, sweeps, tracks, ego)
+    return _log(meta, path, cameras, sweeps, tracks, ego, inverse(lidar_from_imu)[:3, 3])
 
 
 def read_kitti_odometry(path: Path) -> Log:
@@ -107,15 +107,15 @@ def read_kitti_odometry(path: Path) -> Log:
         "name": f"kitti-odometry-{number}", "source": f"KITTI odometry sequence {number}", **SHARE,
         "body": "lidar, x forward, y left, z up",
     }  # fmt: skip
-    return _log(meta, path, cameras, sweeps, (), ego)
+    return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3))
 
 
-def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory) -> Log:
+def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory, lidar: torch.Tensor) -> Log:
     if not cameras:
         raise ValueError(f"{path} holds no camera; KITTI's colour cameras are image_02 and image_03 (odometry: image_2 and image_3)")
     front = next((n for n in FRONT if n in cameras), next(iter(cameras)))
     cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != front, item[0])))
-    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, (front,))
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, (front,), lidars={0: lidar.numpy()})
 
 
 def _camera(name: str, projection: torch.Tensor, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:

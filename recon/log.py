@@ -16,6 +16,9 @@ from scenes.names import unknown
 from scenes.poses import interpolate, inverse
 from scenes.trajectory import Trajectory
 
+SWEEP_US = 200_000
+"""As long as a sweep may take."""
+
 
 @dataclass(frozen=True)
 class Packed:
@@ -124,7 +127,8 @@ class Log:
     """A drive: cameras by name, lidar sweeps (gaps are normal), tracks, and the body's trajectory. The world starts near its first pose.
 
     `front` names the cameras that a reconstruction takes where nobody names any; the first one where it is empty. `points` stand
-    in for lidar where the poses come from pictures. `meta["metric"]` is False where the world's unit is not the metre.
+    in for lidar where the poses come from pictures. `lidars` is where they stand in the body, `[3]` by the points' sensor number; of a
+    sensor that it lacks that is not known. `meta["metric"]` is False where the world's unit is not the metre.
     """
 
     name: str
@@ -136,6 +140,11 @@ class Log:
     meta: dict
     front: tuple[str, ...] = ()
     points: SparsePoints | None = None
+    lidars: dict[int, np.ndarray] = field(default_factory=lambda: {0: np.zeros(3)})
+
+    def sweeps_within(self, span_us: tuple[int, int]) -> tuple[Sweep, ...]:
+        """The sweeps of a span of time, and those that begin before it or end after it: `SWEEP_US` around."""
+        return tuple(s for s in self.sweeps if span_us[0] - SWEEP_US <= s.time_us <= span_us[1] + SWEEP_US)
 
     def camera(self, name: str) -> LogCamera:
         """The camera of that name; ValueError naming the nearest where there is none."""

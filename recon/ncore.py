@@ -18,7 +18,7 @@ import torch
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track, lengthened
 from recon.tracks import Boxes, slug, tracks_of
 from scenes.lenses import Fisheye, FTheta, Lens, OpenCV, Pinhole
-from scenes.poses import translation
+from scenes.poses import inverse, translation
 from scenes.trajectory import Trajectory
 
 KEYS = ("sequence_id", "sequence_timestamp_interval_us", "component_stores")
@@ -80,7 +80,9 @@ def read_ncore(path: Path) -> Log:
         "licence": str(about.get("license", about.get("licence", "as the sequence's publisher says"))),
         "body": "rig frame, x forward, y left, z up", "world_origin": origin.tolist(),
     }  # fmt: skip
-    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in cameras if _rank(n)[0] < 2))
+    mounts = {k: inverse(bodies[0]) @ _poses(loader, name, times[:1], file)[0] for name, k in numbers.items()}
+    front = tuple(n for n in cameras if _rank(n)[0] < 2)
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars={k: m[:3, 3].numpy() for k, m in mounts.items()})
 
 
 def _rank(name: str) -> tuple[int, str]:

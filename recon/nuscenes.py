@@ -58,7 +58,7 @@ def read_nuscenes(path: Path) -> Log:
         # frames between the annotated ones come as a download of their own, which need not be there
         if d["is_key_frame"] or (root / d["filename"]).is_file():
             by_channel.setdefault(channels[mounts[d["calibrated_sensor_token"]]["sensor_token"]], []).append(d)
-    cameras, sweeps = {}, []
+    cameras, sweeps, lidars = {}, [], {}
     for channel, frames in sorted(by_channel.items(), key=lambda item: (item[0] != FRONT[0], item[0])):
         mount = mounts[frames[0]["calibrated_sensor_token"]]
         files = tuple(root / d["filename"] for d in frames)
@@ -72,7 +72,7 @@ def read_nuscenes(path: Path) -> Log:
             lens = Pinhole(float(k[0][0]), float(k[1][1]), float(k[0][2]), float(k[1][2]))
             cameras[channel] = LogCamera(channel, lens, int(frames[0]["width"]), int(frames[0]["height"]), files, stamps, poses)
         elif channel == "LIDAR_TOP":
-            when = stamps.tolist()
+            when, lidars = stamps.tolist(), {0: _pose(mount)[:3, 3].numpy()}
             sweeps = [Sweep(i, t, partial(_points, files[i], poses[i], t)) for i, t in enumerate(when)]
     if not cameras:
         raise ValueError(f"{scene['name']} in {tables.folder} has no camera; nuScenes' are CAM_FRONT and five more")
@@ -81,7 +81,8 @@ def read_nuscenes(path: Path) -> Log:
         "attribution": "nuScenes by Motional", "body": "ego frame, x forward, y left, z up", "world_origin": origin.tolist(),
     }  # fmt: skip
     tracks = _tracks(tables, samples, by_channel.get("LIDAR_TOP", []), home, ego)
-    return Log(meta["name"], path, cameras, tuple(sweeps), tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+    front = tuple(n for n in FRONT if n in cameras)
+    return Log(meta["name"], path, cameras, tuple(sweeps), tracks, ego, meta, front, lidars=lidars)
 
 
 class Tables:

@@ -62,7 +62,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     """
     rig = log.rig(frames.width, frames.height, frames.names)
     ego = body_path(log, frames, rig)
-    sweeps = [s for s in log.sweeps if span_us[0] - 200_000 <= s.time_us <= span_us[1] + 200_000]
+    sweeps = log.sweeps_within(span_us)
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)

@@ -63,7 +63,8 @@ def read_waymo(path: Path) -> Log:
     }  # fmt: skip
     sweeps = tuple(Sweep(i, t, partial(_points, component, t, home)) for i, t in enumerate(_swept(component)))
     tracks = _tracks(component("lidar_box"), ego)
-    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+    front = tuple(n for n in FRONT if n in cameras)
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars=_mounts(component) if sweeps else {})
 
 
 def _segment(root: Path, name: str | None) -> str:
@@ -129,6 +130,14 @@ def _swept(component) -> list[int]:
         if not component(kind).is_file():
             raise FileNotFoundError(f"{component(kind)} is missing; lidar/ cannot be read without it: fetch it too")
     return [int(t) for t in np.unique(read_table(component("lidar"), (WHEN,), others=False)[WHEN])]
+
+
+def _mounts(component) -> dict[int, np.ndarray]:
+    """Where the lidars stand in the vehicle."""
+    matrices = "[LiDARCalibrationComponent].extrinsic.transform"
+    table = read_table(component("lidar_calibration"), ("key.laser_name", matrices))
+    pairs = zip(table["key.laser_name"].tolist(), table[matrices], strict=True)
+    return {int(laser): _matrix(m, component("lidar_calibration"))[:3, 3].numpy() for laser, m in pairs}
 
 
 def _points(component, stamp: int, home: torch.Tensor) -> LidarPoints:

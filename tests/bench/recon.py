@@ -3,9 +3,10 @@
     python -m tests.bench.recon DRIVE [--cameras NAME ...] [--steps 1200] [--splats 100000] [--size 480 270] [--only PART ...] [--seed 0]
 
 The first row is the whole fit; every other one leaves one part out and says what that costs, over held-out frames while the car drives.
-The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does. "people" is all pixels
-of all held-out frames in the recorded boxes of who has limbs and moves, taller than 20 pixels, where the first row's scene without them
-shows nothing nearer; "-" where there are none. DRIVE may be "walk": a made-up street with two people who walk (tests/walker.py), 192x108.
+The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does. "movers" is all pixels
+of all held-out frames in the recorded boxes of what moves, taller than 20 pixels, where the first row's scene without them shows nothing
+nearer, "people" the same of who has limbs; "-" where there are none. DRIVE may be "walk": a made-up street with two people who walk
+(tests/walker.py), 192x108.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.build import assemble, begin, choose, fit_config
+from recon.build import annotated, assemble, begin, choose, fit_config
 from recon.fit import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Track
@@ -35,7 +36,7 @@ from scenes.poses import inverse
 from scenes.scene import Scene
 
 TALL = 20.0
-"""Pixels from which on people count."""
+"""Pixels from which on movers count."""
 
 Setting = tuple[Log, FitConfig]
 PARTS: dict[str, Callable[[Log, FitConfig], Setting]] = {}
@@ -69,21 +70,31 @@ for kind in FitConfig().refine:
     _unrefined(kind)
 
 
+@part
+def boxes(log: Log, config: FitConfig) -> Setting:
+    """Which are then found in its lidar."""
+    return annotated(replace(log, tracks=()), log.sweeps), config
+
+
+@part
+def movers(log: Log, config: FitConfig) -> Setting:
+    return replace(log, tracks=()), config
+
+
 Masks = dict[tuple[int, int], torch.Tensor]
-"""By a view's camera and index, bool `[H, W]`: where people show."""
+"""By a view's camera and index, bool `[H, W]`: where some movers show."""
 
 
-def people(scene: Scene, log: Log, frames: Frames) -> Masks:
-    """Where held-out frames show people."""
-    walkers = [t for t in log.tracks if t.moving and t.label in LIMBED]
-    without = replace(scene, actors=tuple(a for a in scene.actors if a.track not in {t.name for t in walkers}))
+def shown(scene: Scene, tracks: list[Track], frames: Frames) -> Masks:
+    """Where held-out frames show some of the tracks."""
+    without = replace(scene, actors=tuple(a for a in scene.actors if a.track not in {t.name for t in tracks}))
     masks = {}
     for view, camera in _held_out(scene, frames):
         depth = render_frame(without, camera, ("depth",)).depth
-        shown = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-        for track in walkers:
-            shown |= _shown(track, camera, depth)
-        masks[view.camera, view.index] = shown
+        seen = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+        for track in tracks:
+            seen |= _shown(track, camera, depth)
+        masks[view.camera, view.index] = seen
     return masks
 
 
@@ -115,7 +126,7 @@ def _shown(track: Track, camera: Camera, depth: torch.Tensor | None) -> torch.Te
     return inside & (depth >= float(local[:, 2].min()))
 
 
-def people_psnr(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: Masks) -> float:
+def masked_psnr(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: Masks) -> float:
     """PSNR over all pixels of the masks; nan where there is none."""
     squares, count = 0.0, 0
     for view, camera in _held_out(scene, frames):
@@ -129,10 +140,10 @@ def people_psnr(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: 
 
 
 @torch.no_grad()
-def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: Masks) -> dict[str, float]:
-    """PSNR of each camera's held-out frames while driving, or of all where it never drives, and of "people"."""
+def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: dict[str, Masks]) -> dict[str, float]:
+    """PSNR of each camera's held-out frames while driving, or of all where it never drives, and of those `masks`."""
     rows = sorted(held_out_table(scene, frames, rig), key=lambda r: r["which"] == "driving")
-    return {r["camera"]: r["psnr"] for r in rows} | {"people": people_psnr(scene, frames, rig, masks)}
+    return {r["camera"]: r["psnr"] for r in rows} | {of: masked_psnr(scene, frames, rig, m) for of, m in masks.items()}
 
 
 def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float]:
@@ -169,15 +180,17 @@ def main() -> None:
     names, _ = choose(log, asked.cameras)
     config = replace(fit_config(log, names), steps=asked.steps, budget=asked.splats, seed=asked.seed)
     size = (192, 108) if str(asked.drive) == "walk" else (asked.size[0], asked.size[1])
-    columns = [*names, "people"]
+    moving = [t for t in log.tracks if t.moving]
+    counted = {"movers": moving, "people": [t for t in moving if t.label in LIMBED]}
+    columns = [*names, *counted]
     print(f"{'without':<24}" + "".join(f"{name:>22}" for name in columns) + f"{'CPU s':>8}", flush=True)
     whole: dict[str, float] = {}
-    masks: Masks = {}
+    masks: dict[str, Masks] = {}
     for what in ("", *asked.only):
         setting: Setting = PARTS[what](log, config) if what else (log, config)
         scene, frames, rig, spent = fitted(*setting, names, size)
         with torch.no_grad():
-            masks = masks or people(scene, log, frames)
+            masks = masks or {of: shown(scene, tracks, frames) for of, tracks in counted.items()}
         found = told(scene, frames, rig, masks)
         whole = whole or found
         cells = ["-" if math.isnan(found[n]) else f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in columns]

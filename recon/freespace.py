@@ -1,0 +1,100 @@
+"""What must have moved: points that stand where other sweeps saw through (visibility in range images; Kim and Kim 2020, "Remove, then
+Revert")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from recon.log import LidarPoints
+from scenes.trajectory import Trajectory
+
+OFFSETS = (0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
+"""Seconds before and after a sweep at which others are asked: near ones for what is fast, far ones for what waits before it goes on."""
+
+PER_CELL, CELL = 2.0, (0.4, 2.0)
+"""Points that a range image's cell has on average, and the least and the largest side of one, in degrees. What a lidar covers of the sphere
+is taken to be `BAND` degrees high."""
+
+BAND = 25.0
+
+FARTHER = 0.5, 0.02
+"""Metres, and parts of the distance, that others must have seen farther than a point to have seen through it."""
+
+TURN = 16
+"""Parts of a sweep in which the lidar goes straight on."""
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """What one lidar saw in a sweep: `range_m` `[H, W]`, how far it saw in each direction, azimuth by elevation in cells of `cell` degrees;
+    inf where nothing came back. `clear_m` is the least of a cell and its eight neighbours, `told` how many of them had a return. `stood`
+    `[W, 3]` is where it was when it looked at an azimuth, `middle` `[3]` where it was half-way."""
+
+    range_m: np.ndarray
+    clear_m: np.ndarray
+    told: np.ndarray
+    cell: float
+    middle: np.ndarray
+    stood: np.ndarray
+
+    def votes(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether it saw through the world points `[N, 3]`, and whether it saw something where they are: bool `[N]` each."""
+        _, _, column = _cells(xyz - self.middle, self.cell)
+        away, row, column = _cells(xyz - self.stood[column], self.cell)
+        margin = FARTHER[0] + FARTHER[1] * away
+        clear = self.clear_m[row, column]
+        through = (self.told[row, column] >= 2) & (clear > away + margin)
+        return through, np.abs(self.range_m[row, column] - away) < margin
+
+
+def range_image(points: LidarPoints, ego: Trajectory, mount: np.ndarray) -> RangeImage:
+    """The range image of one lidar's points of a sweep, which has some; `mount` `[3]` is where it stands in the body."""
+    times = points.times_us
+    knots = np.unique(np.linspace(times.min(), times.max(), TURN + 1).round().astype(np.int64))
+    poses = np.stack([ego.near(int(t)).numpy() for t in knots])
+    eyes = poses[:, :3, :3] @ mount + poses[:, :3, 3]
+    cell = float(np.clip(np.sqrt(PER_CELL * 360 * BAND / len(times)), *CELL))
+    away, row, column = _cells(points.xyz - _at(times, knots, eyes), cell)
+    shape = int(180 / cell) + 1, int(360 / cell) + 1
+    seen = np.full(shape, np.inf, np.float32)
+    np.minimum.at(seen, (row, column), away)
+    around = {"size": 3, "mode": ("nearest", "wrap")}
+    told = np.rint(9 * ndimage.uniform_filter(np.isfinite(seen).astype(np.float32), **around))
+    passed, counts = np.zeros(shape[1]), np.bincount(column, minlength=shape[1])
+    np.add.at(passed, column, times - knots[0])
+    passed = knots[0] + np.where(counts > 0, passed / np.maximum(counts, 1), (times - knots[0]).mean())
+    return RangeImage(seen, ndimage.minimum_filter(seen, **around), told, cell, eyes[len(eyes) // 2], _at(passed, knots, eyes))
+
+
+def _at(times_us: np.ndarray, knots_us: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(times_us, knots_us, eyes[:, k]) for k in range(3)], 1)
+
+
+def _cells(towards: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Length, row and column of directions `[N, 3]`."""
+    towards = towards.astype(np.float32)
+    away = np.linalg.norm(towards, axis=1)
+    elevation = np.degrees(np.arcsin(np.clip(towards[:, 2] / np.maximum(away, np.float32(1e-6)), -1, 1)))
+    azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
+    return away, ((elevation + 90) / cell).astype(np.int64), ((azimuth + 180) / cell).astype(np.int64)
+
+
+def tally(xyz: np.ndarray, time_us: int, others: list[tuple[int, RangeImage]]) -> tuple[np.ndarray, np.ndarray]:
+    """How many of the range images nearest to `OFFSETS` saw through the points `[N, 3]` of a sweep at a time, and how many saw something
+    there: int `[N]` each. others: time in us and range image; an offset that has none within a half of itself asks nobody."""
+    through, there = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
+    times = np.array([t for t, _ in others])
+    asked = set()
+    for offset in OFFSETS:
+        for wanted in (time_us - 1e6 * offset, time_us + 1e6 * offset):
+            nearest = np.abs(times - wanted).min(initial=np.inf)
+            if nearest < 0.5e6 * offset:
+                asked.update(np.flatnonzero(np.abs(times - wanted) == nearest).tolist())
+    for index in sorted(asked):
+        saw_through, saw = others[index][1].votes(xyz)
+        through += saw_through
+        there += saw
+    return through, there

@@ -1,0 +1,131 @@
+"""Finds what moves in a drive that nobody annotated: points that others saw through, clustered, and followed from sweep to sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from recon.actors import MARGIN, SWEPT_MARGIN, inside
+from recon.boxing import boxed
+from recon.following import FEWEST, Cluster, Followed, follow
+from recon.freespace import range_image, tally
+from recon.ground import estimate_ground
+from recon.log import LidarPoints, Log, Sweep, Track
+from recon.tracks import named
+from scenes.ground import Ground
+from scenes.poses import inverse
+
+HEIGHTS = (0.3, 4.5)
+"""Metres above the ground that are looked at."""
+
+REACH = 60.0
+"""Metres around the body that are looked at."""
+
+MOST, THIN = 15_000, 20_000
+"""Points of a sweep that are looked at, and about as many that tell where the ground is."""
+
+THROUGH, OVER = 2, 0.3
+"""Others that must have seen through a point, and times those that saw something there, for it to have moved: a car before a red light
+stands where it is for most of them."""
+
+NEAR = 0.45, 2.0, 1.4
+"""Metres between points of one object: so many, and so many cells of the range image at that distance, up to so many."""
+
+SHARE = 0.4
+"""Part of all points in and around an object's box that must have moved: leaves and edges seem to, in the midst of what stands."""
+
+
+def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
+    """The log with what moves in `sweeps` as its tracks, at the stamps of all its sweeps. `report` is called after each."""
+    read = [(s, s.read()) for s in sweeps]
+    ground = estimate_ground(np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for _, p in read]), log.ego)
+    images = [(s.time_us, range_image(_of(p, k), log.ego, log.lidars[k])) for s, p in read for k in _known(p, log)]
+    followed: list[Followed] = []
+    asked: dict[int, np.ndarray] = {}
+    for sweep, points in read:
+        asked[sweep.time_us] = candidates(log, sweep, points, ground)
+        eye = log.ego.near(sweep.time_us)[:3, 3].numpy()
+        found = clusters(sweep, asked[sweep.time_us], images, eye)
+        follow(followed, found, sweep.time_us, eye, asked[sweep.time_us])
+        report()
+    stamps = np.array([s.time_us for s in log.sweeps])
+    made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed]
+    tracks = [(f, t) for f, t in made if t is not None and _moved(f.clusters, t, asked) >= SHARE]
+    return replace(log, tracks=named(_apart(tracks), log.ego))
+
+
+def _moved(clusters: list[Cluster], track: Track, asked: dict[int, np.ndarray]) -> float:
+    """Part of the points in an object's box that moved, over all sweeps that saw it."""
+    moved = there = 0
+    places = {int(t): i for i, t in enumerate(track.times_us)}
+    for cluster in (c for c in clusters if c.moved):
+        back = inverse(track.world_from_box[places[cluster.time_us]]).numpy()
+        for_all, own = (
+            inside(x @ back[:3, :3].T + back[:3, 3], track.size, SWEPT_MARGIN).sum() for x in (asked[cluster.time_us], cluster.xyz)
+        )
+        moved, there = moved + own, there + for_all
+    return moved / max(there, 1)
+
+
+def _apart(made: list[tuple[Followed, Track]]) -> list[Track]:
+    """The tracks without those that are parts of a longer one most of the time: a bonnet that was followed by itself."""
+    kept: list[Track] = []
+    for one, track in sorted(made, key=lambda m: (-len(m[1].times_us), -m[1].size.prod())):
+        if not any(_within(one, other) > 0.5 for other in kept):
+            kept.append(track)
+    return kept
+
+
+def _within(one: Followed, track: Track) -> float:
+    """Part of an object's time in which its middle lies in the box of a track."""
+    times = np.array([c.time_us for c in one.clusters])
+    _, mine, its = np.intersect1d(times, track.times_us, return_indices=True)
+    back = inverse(track.world_from_box[its]).numpy()
+    local = np.einsum("nij,nj->ni", back[:, :2, :2], np.array(one.places)[mine]) + back[:, :2, 3]
+    return float((np.abs(local) < track.size[:2] / 2 + MARGIN).all(1).sum()) / len(times)
+
+
+def _known(points: LidarPoints, log: Log) -> list[int]:
+    """Lidars that have points in a sweep, and of which it is known where they stand."""
+    return [k for k in np.unique(points.sensor).tolist() if k in log.lidars]
+
+
+def _of(points: LidarPoints, sensor: int) -> LidarPoints:
+    mine = points.sensor == sensor
+    return LidarPoints(points.xyz[mine], points.times_us[mine], points.sensor[mine])
+
+
+def candidates(log: Log, sweep: Sweep, points: LidarPoints, ground: Ground) -> np.ndarray:
+    """The points `[N, 3]` of a sweep that may move: over the ground, within reach, and not the recording car itself."""
+    xyz = points.xyz
+    pose = log.ego.near(sweep.time_us).numpy()
+    local = (xyz - pose[:3, 3]) @ pose[:3, :3]
+    height = xyz[:, 2] - ground.height(torch.from_numpy(xyz[:, :2])).numpy()
+    own = (np.abs(local[:, 0]) < 2.6) & (np.abs(local[:, 1]) < 1.1)
+    away = np.linalg.norm(local[:, :2], axis=1)
+    kept = xyz[(height > HEIGHTS[0]) & (height < HEIGHTS[1]) & (away < REACH) & ~own]
+    return kept[:: max(1, -(-len(kept) // MOST))]
+
+
+def clusters(sweep: Sweep, xyz: np.ndarray, images: list, eye: np.ndarray) -> list[Cluster]:
+    """What of a sweep's points moved, one cluster an object."""
+    through, there = tally(xyz, sweep.time_us, images)
+    moved = xyz[(through >= THROUGH) & (through >= OVER * there)]
+    if len(moved) < FEWEST:
+        return []
+    spacing = np.radians(min(image.cell for _, image in images)) * np.linalg.norm(moved - eye, axis=1)
+    near = np.clip(NEAR[0] + NEAR[1] * spacing, None, NEAR[2])
+    pairs = cKDTree(moved[:, :2]).query_pairs(NEAR[2], output_type="ndarray")
+    apart = np.linalg.norm(moved[pairs[:, 0], :2] - moved[pairs[:, 1], :2], axis=1)
+    pairs = pairs[apart < near[pairs].min(1)]
+    joined = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(moved), len(moved)))
+    _, object_of = connected_components(joined, directed=False)
+    order = np.argsort(object_of, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(object_of[order])) + 1)
+    return [Cluster(moved[p], sweep.time_us, eye) for p in parts if len(p) >= FEWEST]

@@ -1,0 +1,155 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from made_sweeps import MOUNT, Box, drive, standing
+
+from recon.boxing import headings, smoothed
+from recon.build import annotated
+from recon.freespace import range_image, tally
+from recon.log import Track
+from recon.movers import with_movers
+
+CAR = (4.4, 1.8, 1.5)
+WALLS = [standing(20, side * 14, (140, 1, 8)) for side in (-1, 1)]
+PARKED = [standing(x, side * 5.5) for x in (-12, -4, 6, 13, 24, 33, 45) for side in (-1, 1)]
+STREET = [*WALLS, *PARKED, *(standing(x, 8.5, (0.3, 0.3, 6.0)) for x in (0, 15, 30, 45))]
+
+
+def braking(seconds: float) -> tuple[float, float, float]:
+    """15 metres ahead at 8 m/s; from 1.5 s on it brakes by 4 m/s2 and stands."""
+    t = min(max(seconds - 1.5, 0.0), 2.0)
+    return 15 + 8 * min(seconds, 1.5) + 8 * t - 2 * t * t, 0.0, 0.0
+
+
+def turning(seconds: float) -> tuple[float, float, float]:
+    """A quarter of a circle of 10 metres at 5 m/s, to the left."""
+    turned = 0.5 * seconds
+    return 20 + 10 * np.sin(turned), -2 + 10 * (1 - np.cos(turned)), turned
+
+
+MOVING = {
+    "ahead": Box(CAR, lambda t: (14 + 9 * t, 0.0, 0.0)),
+    "oncoming": Box(CAR, lambda t: (45 - 9 * t, 3.0, np.pi)),
+    "bus": Box((11.0, 2.5, 3.0), lambda t: (-14 + 13 * t, -2.8, 0.0)),
+    "brakes": Box(CAR, braking),
+    "turns": Box(CAR, turning),
+    "walks": Box((0.6, 0.7, 1.75), lambda t: (18.0, 6.0 - 1.6 * t, -np.pi / 2)),
+    "pedals": Box((1.8, 0.7, 1.8), lambda t: (8 + 5 * t, -3.5, 0.0)),
+}
+
+
+def found(*boxes: Box, **how) -> tuple[Track, ...]:
+    log = drive([*STREET, *boxes], **how)
+    return with_movers(log, log.sweeps).tracks
+
+
+def misses(track: Track, box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Metres `[T]` between the middles, and radians between the headings, at the moments at which the lidar looked at the box."""
+    off, turned = [], []
+    for stamp, pose in zip(track.times_us.tolist(), track.world_from_box.numpy(), strict=True):
+        x, y, _ = box.at(stamp / 1e6)
+        eye = np.array([8.0 * stamp / 1e6, 0]) + MOUNT[:2]
+        # the lidar looks ahead at its stamp, and elsewhere before or after
+        x, y, yaw = box.at(stamp / 1e6 + 0.1 * np.arctan2(y - eye[1], x - eye[0]) / (2 * np.pi))
+        off.append(np.linalg.norm(pose[:2, 3] - [x, y]))
+        turned.append(np.abs((np.arctan2(pose[1, 0], pose[0, 0]) - yaw + np.pi) % (2 * np.pi) - np.pi))
+    return np.array(off), np.array(turned)
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_what_moves_is_found_once_where_it_is(name):
+    box = MOVING[name]
+    tracks = found(box)
+    assert len(tracks) == 1
+    off, turned = misses(tracks[0], box)
+    assert tracks[0].moving and np.median(off) < 0.2 and np.quantile(off, 0.9) < 0.5 and np.median(turned) < 0.05
+    assert abs(tracks[0].size - box.size).max() < 0.7  # of the bus, the roof is above what the lidar sees
+    kinds = {"bus": "truck", "walks": "pedestrian", "pedals": "cyclist"}
+    assert tracks[0].label == kinds.get(name, "car")
+
+
+def test_several_at_once_are_told_apart():
+    boxes = [MOVING[name] for name in ("ahead", "oncoming", "walks", "bus")]
+    tracks = found(*boxes)
+    assert len(tracks) == 4
+    for box in boxes:
+        assert min(np.median(misses(t, box)[0]) for t in tracks) < 0.4
+
+
+@pytest.mark.parametrize("speed", [0.0, 8.0, 15.0])
+def test_nothing_is_found_where_nothing_moves(speed):
+    """Though everything moves past the car, and hides and shows what is behind."""
+    assert found(speed=speed) == ()
+
+
+def test_a_car_that_waits_before_it_goes_is_followed_as_it_goes():
+    """While it waits, one moment shows its rear, another its side: it is known less well."""
+    box = Box(CAR, lambda t: (22 + 3 * max(t - 2, 0) ** 2, -2.5, 0.0))
+    (track,) = found(box)
+    off, turned = misses(track, box)
+    assert off[-10:].max() < 0.3 and turned[-10:].max() < 0.1 and np.median(off) < 1.0
+
+
+def test_a_car_that_stops_ahead_is_followed_to_the_end():
+    """Where it stands, nobody ever sees through: it is known by its shape."""
+    (track,) = found(MOVING["brakes"], count=60, speed=2.0)
+    assert track.times_us[-1] == 59 * 100_000
+    x, y, _ = braking(5.9)
+    assert np.linalg.norm(track.world_from_box[-1, :2, 3].numpy() - [x, y]) < 0.4
+
+
+def test_sparse_sweeps_are_enough():
+    (track,) = found(MOVING["oncoming"], rows=16, columns=180)
+    assert np.median(misses(track, MOVING["oncoming"])[0]) < 0.6
+
+
+def test_sensors_that_stand_nowhere_known_are_not_asked():
+    log = drive([*STREET, MOVING["oncoming"]], count=12)
+    assert with_movers(replace(log, lidars={}), log.sweeps).tracks == ()
+
+
+def test_tracks_stand_at_all_stamps_of_the_log():
+    """Also at those of sweeps that were kept from the search: they are measured against."""
+    log = drive([*STREET, MOVING["oncoming"]])
+    (track,) = with_movers(log, [s for s in log.sweeps if s.index % 8 != 4]).tracks
+    stamps = [s.time_us for s in log.sweeps]
+    inside = [t for t in stamps if track.times_us[0] <= t <= track.times_us[-1]]
+    assert track.times_us.tolist() == inside and len(inside) > 25
+
+
+def test_a_log_with_boxes_keeps_them(capsys):
+    log = drive([*STREET, MOVING["oncoming"]], count=20)
+    searched = annotated(log, log.sweeps)
+    assert len(searched.tracks) == 1 and "has no boxes: its lidar shows 1 thing that moves" in capsys.readouterr().err
+    assert annotated(searched, log.sweeps) is searched
+    assert annotated(log, ()) is log
+
+
+def test_votes_tell_free_space_from_what_is_hidden():
+    log = drive([standing(20, 0, (1, 30, 6)), standing(10, -6, (1, 4, 6))], count=3, speed=0.0)
+    image = range_image(log.sweeps[0].read(), log.ego, MOUNT)
+    points = {"free": [15.0, 3, 1.5], "wall": [19.5, 3, 1.5], "behind it": [22.0, 3, 1.5], "behind a box": [15.0, -9.5, 1.5]}
+    through, there = (dict(zip(points, v.tolist(), strict=True)) for v in image.votes(np.array(list(points.values()))))
+    assert [k for k, v in through.items() if v] == ["free"] and [k for k, v in there.items() if v] == ["wall"]
+    others = [(s.time_us, range_image(s.read(), log.ego, MOUNT)) for s in log.sweeps]
+    through, there = tally(np.array([[15.0, 3, 1.5], [19.5, 3, 1.5]]), 0, others)
+    assert through.tolist() == [1, 0] and there.tolist() == [0, 1]  # the sweep 0.2 s later; its neighbour saw the same
+
+
+def test_a_smoothed_way_keeps_what_is_straight_and_leaves_out_what_is_odd():
+    times = np.linspace(0, 3, 31)
+    way = np.stack([4 * times, 1 - 2 * times], 1)
+    np.testing.assert_allclose(smoothed(times, way, times), way, atol=1e-6)
+    odd = way.copy()
+    odd[15] += [0.0, 3.0]
+    assert np.abs(smoothed(times, odd, times) - way).max() < 0.25
+    at = np.array([0.05, 1.51])
+    np.testing.assert_allclose(smoothed(times, way, at), np.stack([4 * at, 1 - 2 * at], 1), atol=1e-6)
+
+
+def test_what_stands_faces_where_it_came_from_or_goes():
+    way = np.array([[0.0, 0], [0, 1], [0, 2], [0, 3], [0.02, 3], [-0.02, 3.01], [0, 3], [0.01, 2.99]])
+    assert np.abs(headings(way, 1.5) - np.pi / 2).max() < 0.02
+    assert torch.isfinite(torch.from_numpy(headings(np.zeros((3, 2)), 1.5))).all()
