@@ -63,14 +63,12 @@ def rows(log: Log, found: tuple[Track, ...], reach: float) -> Iterator[Row]:
                 if not len(at):
                     continue
                 place = other.world_from_box[at[0]]
-                local = own @ inverse(place)[:3, :3].numpy().T + inverse(place)[:3, 3].numpy()
-                mine = inside(local, other.size, MARGIN, FLOOR)
+                there = inverse(place).numpy()
+                mine = inside(own @ there[:3, :3].T + there[:3, 3], other.size, MARGIN, FLOOR)
                 caught |= mine
                 if mine.mean() > 0.5:
-                    miss = back @ place
-                    row.off.append(
-                        (other.name, float(miss[0, 3]), float(miss[1, 3]), float(np.degrees(np.arctan2(miss[1, 0], miss[0, 0]))))
-                    )
+                    miss = (back @ place).numpy()
+                    row.off.append((other.name, miss[0, 3], miss[1, 3], np.degrees(np.arctan2(miss[1, 0], miss[0, 0]))))
             row.nearest, row.seen, row.hit = min(row.nearest, away), row.seen + 1, row.hit + int(caught.mean() > 0.5)
             row.points, row.inside = row.points + len(own), row.inside + int(caught.sum())
         if row.seen:
@@ -88,21 +86,16 @@ def main() -> None:
     asked = parser.parse_args()
     log = open_log(asked.drive)
     found = with_movers(replace(log, tracks=()), log.sweeps).tracks
-    print(
-        f"{'annotated':<10}{'':<14}{'nearest':>8}{'went':>7}{'sweeps':>8}{'found':>7}   {'along, m':>14}{'across, m':>14}{'turned':>14}   as"
-    )
+    columns = "".join(f"{c:>16}" for c in ("along, m", "across, m", "turned, deg"))
+    print(f"{'annotated':<10}{'':<14}{'nearest':>8}{'went':>7}{'sweeps':>8}{'found':>7}{columns}   as")
     told = list(rows(log, found, asked.reach))
     for row in told:
         middles = row.track.world_from_box[:, :2, 3]
         head = f"{row.track.name:<10}{row.track.label:<14}{row.nearest:>6.0f} m{float((middles - middles[0]).norm(dim=1).max()):>5.0f} m"
         off = np.array([o[1:] for o in row.off]).reshape(-1, 3)
         cells = [f"{np.median(c):+.2f} +- {np.std(c):.2f}" if len(c) else "-" for c in off.T]
-        print(
-            f"{head}{row.seen:>8}{row.hit:>7}   "
-            + "".join(f"{c:>14}" for c in cells)
-            + "   "
-            + ", ".join(dict.fromkeys(o[0] for o in row.off))
-        )
+        names = ", ".join(dict.fromkeys(o[0] for o in row.off))
+        print(f"{head}{row.seen:>8}{row.hit:>7}" + "".join(f"{c:>16}" for c in cells) + "   " + names)
     matched = {o[0] for row in told for o in row.off}
     print(f"{100 * sum(r.inside for r in told) / max(sum(r.points for r in told), 1):.1f} % of their points lie in found boxes")
     print("found and not annotated: " + (", ".join(f"{t.name} ({t.label})" for t in found if t.name not in matched) or "none"))
