@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from recon.gains import picture_gains
 from recon.log import Log
+from recon.project import project
 from recon.skies import like_sky, sky_mask
 from scenes.camera import Camera
 from scenes.poses import inverse
@@ -47,8 +48,8 @@ class View:
 class Frames:
     """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
 
-    From the first on (0, 8, ...), or, where frames are photos taken steps apart, from the middle of the eight (4, 12, ...): what the
-    first photo shows at its edges, no other one does. `overcast` where their sky has no colour.
+    From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
+    shows at its edges, no other one does. `overcast` where their sky has no colour.
     """
 
     names: list[str]
@@ -133,11 +134,7 @@ def _colourless(image: torch.Tensor) -> bool:
 
 def _unstruck(sky: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
     """A mask `[h, w]` without the columns in which lidar's `points` `[N, 3]`, as a camera of its size sees them, strike it."""
-    back = inverse(camera.world_from_cam)
-    local = torch.from_numpy(points) @ back[:3, :3].T + back[:3, 3]
-    local = local[(local[:, 2] > 0.5) & camera.lens.valid(local)]
-    column, row = camera.lens.project(local).floor().long().T.numpy()
-    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    row, column, _, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
     struck = np.zeros(sky.shape, np.float32)
     struck[row[inside], column[inside]] = 1
     hits, cells = (ndimage.uniform_filter1d(m.sum(0, dtype=np.float32), AROUND) for m in (struck * sky, sky))
@@ -151,16 +148,11 @@ def _balanced(log: Log, names: list[str], views: list[View]) -> list[View]:
     for view in views:
         camera = log.camera(names[view.camera]).camera(view.index, view.image.shape[1], view.image.shape[0])
         points = log.points.seen[names[view.camera]][view.index]
-        back = inverse(camera.world_from_cam)
-        local = torch.from_numpy(log.points.xyz[points]) @ back[:3, :3].T + back[:3, 3]
-        pixels = camera.lens.project(local).floor().long()
-        size = torch.tensor([camera.width, camera.height])
-        inside = ((pixels >= 0) & (pixels < size)).all(1) & (local[:, 2] > 0)
-        column, row = pixels[inside].T
+        row, column, _, inside = project(log.points.xyz[points], inverse(camera.world_from_cam).numpy(), camera)
         # a point's own pixel is at an edge as likely as not: what is around it is steadier
         smooth = ndimage.uniform_filter(view.image.numpy().astype(np.float32), (5, 5, 0)) / 255
-        colours.append(smooth[row, column])
-        shown.append(points[inside.numpy()])
+        colours.append(smooth[row[inside], column[inside]])
+        shown.append(points[inside])
     gains = picture_gains(colours, shown, len(log.points.xyz))
     return [replace(v, image=divided(v.image, torch.from_numpy(g).float())) for v, g in zip(views, gains, strict=True)]
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from recon.actors import split_points
 from recon.log import Log, Sweep
-from recon.seed import project
+from recon.project import project
 from render import render_frame
 from render.rays import world_directions
 from render.warp import warp

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from recon.frames import Frames, View
 from recon.log import Log, Track
+from recon.project import project
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
@@ -64,15 +65,6 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
             seen &= ~view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
             out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
     return out
-
-
-def project(points: np.ndarray, cam_from_local: np.ndarray, cam: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Row, column, depth and whether in view, of points `[N, 3]`."""
-    local = points @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
-    z = np.maximum(local[:, 2], 1e-6)
-    column, row = np.floor(cam.lens.project(torch.from_numpy(np.column_stack([local[:, :2], z]))).numpy()).T
-    seen = (local[:, 2] > 0.3) & (column >= 0) & (column < cam.width) & (row >= 0) & (row < cam.height)
-    return np.where(seen, row, 0).astype(np.int64), np.where(seen, column, 0).astype(np.int64), z, seen
 
 
 def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:

@@ -90,6 +90,9 @@ def check(log: Log, tape: Tape, names: dict[str, str], atol: float = 1e-6, lidar
     assert first[2, 2] > 0.999 and first[:3, 3].norm() < 3
     if log.sweeps:
         assert len(log.sweeps) == FRAMES - 1  # the writers lose one
+        assert log.lidars.keys() & set(log.sweeps[0].read().sensor.tolist())
+        for place in log.lidars.values():
+            np.testing.assert_allclose(place, BODY_FROM_LIDAR[:3, 3], atol=1e-5)
         for sweep in (log.sweeps[0], log.sweeps[-1]):
             got = sweep.read()
             ours = got.xyz @ home[:3, :3].numpy().T + home[:3, 3].numpy()

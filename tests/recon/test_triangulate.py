@@ -9,7 +9,7 @@ from PIL import Image
 from recon.colmap import CAM_FROM_BODY, colmap_lens, lens_of
 from recon.frames import View, load_frames
 from recon.log import Log, LogCamera, Packed, Track
-from recon.seed import project
+from recon.project import project
 from recon.sfm import ModelCamera
 from recon.sparse import cloud_from_points
 from recon.triangulate import matched, triangulated
