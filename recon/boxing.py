@@ -22,7 +22,7 @@ CHORDS = 6.0, 3.0, 1.5
 """Metres before and after on an object's way between which it faces, first and then: at first, shorter ones tell how the points on it
 come and go as the lidar passes."""
 
-OFF, PUSH = 0.15, 1.5
+OFF, PUSH = 0.15, 3.0
 """Metres by which what is seen of a box is off, and metres a second squared by which things speed up, brake and turn."""
 
 MOST_SEEN = 0.75

@@ -29,14 +29,16 @@ TURN = 16
 
 @dataclass(frozen=True)
 class RangeImage:
-    """What one lidar saw in a sweep: `range_m` `[H, W]`, how far it saw in each direction, azimuth by elevation in cells of `cell` degrees;
-    inf where nothing came back. `clear_m` is the least of a cell and its eight neighbours, `told` how many of them had a return. `stood`
-    `[W, 3]` is where it was when it looked at an azimuth, `middle` `[3]` where it was half-way."""
+    """What one lidar saw in a sweep: `range_m` `[H, W]`, how far it saw in each direction, elevation by azimuth in cells of `cell` degrees;
+    inf where nothing came back, as in its first row and its last. `clear_m` is the least of a cell and its eight neighbours, `told` how
+    many of them had a return. Rows begin `lowest` cells above straight down. `stood` `[W, 3]` is where it was when it looked at an azimuth,
+    `middle` `[3]` where it was half-way."""
 
     range_m: np.ndarray
     clear_m: np.ndarray
     told: np.ndarray
     cell: float
+    lowest: int
     middle: np.ndarray
     stood: np.ndarray
 
@@ -44,6 +46,7 @@ class RangeImage:
         """Whether it saw through the world points `[N, 3]`, and whether it saw something where they are: bool `[N]` each."""
         _, _, column = _cells(xyz - self.middle, self.cell)
         away, row, column = _cells(xyz - self.stood[column], self.cell)
+        row = (row - self.lowest).clip(0, len(self.told) - 1)
         margin = FARTHER[0] + FARTHER[1] * away
         clear = self.clear_m[row, column]
         through = (self.told[row, column] >= 2) & (clear > away + margin)
@@ -58,15 +61,18 @@ def range_image(points: LidarPoints, ego: Trajectory, mount: np.ndarray) -> Rang
     eyes = poses[:, :3, :3] @ mount + poses[:, :3, 3]
     cell = float(np.clip(np.sqrt(PER_CELL * 360 * BAND / len(times)), *CELL))
     away, row, column = _cells(points.xyz - _at(times, knots, eyes), cell)
-    shape = int(180 / cell) + 1, int(360 / cell) + 1
+    lowest = int(row.min()) - 1
+    row = row - lowest
+    shape = int(row.max()) + 2, int(360 / cell) + 1
     seen = np.full(shape, np.inf, np.float32)
     np.minimum.at(seen, (row, column), away)
     around = {"size": 3, "mode": ("nearest", "wrap")}
-    told = np.rint(9 * ndimage.uniform_filter(np.isfinite(seen).astype(np.float32), **around))
+    told = np.rint(9 * ndimage.uniform_filter(np.isfinite(seen).astype(np.float32), **around)).astype(np.uint8)
+    told[[0, -1]] = 0
     passed, counts = np.zeros(shape[1]), np.bincount(column, minlength=shape[1])
     np.add.at(passed, column, times - knots[0])
     passed = knots[0] + np.where(counts > 0, passed / np.maximum(counts, 1), (times - knots[0]).mean())
-    return RangeImage(seen, ndimage.minimum_filter(seen, **around), told, cell, eyes[len(eyes) // 2], _at(passed, knots, eyes))
+    return RangeImage(seen, ndimage.minimum_filter(seen, **around), told, cell, lowest, eyes[len(eyes) // 2], _at(passed, knots, eyes))
 
 
 def _at(times_us: np.ndarray, knots_us: np.ndarray, eyes: np.ndarray) -> np.ndarray:

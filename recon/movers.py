@@ -41,6 +41,10 @@ SHARE = 0.4
 """Part of all points in and around an object's box that must have moved: leaves and edges seem to, in the midst of what stands."""
 
 
+TILE = 0.1
+"""Metres."""
+
+
 def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
     """The log with what moves in `sweeps` as its tracks, at the stamps of all its sweeps. `report` is called after each."""
     read = [(s, s.read()) for s in sweeps]
@@ -119,13 +123,16 @@ def clusters(sweep: Sweep, xyz: np.ndarray, images: list, eye: np.ndarray) -> li
     moved = xyz[(through >= THROUGH) & (through >= OVER * there)]
     if len(moved) < FEWEST:
         return []
-    spacing = np.radians(min(image.cell for _, image in images)) * np.linalg.norm(moved - eye, axis=1)
+    # beside the lidar thousands of points lie within a metre: one of each tile stands for them
+    _, first, tile = np.unique(np.floor(moved[:, :2] / TILE), axis=0, return_index=True, return_inverse=True)
+    places = moved[first, :2]
+    spacing = np.radians(min(image.cell for _, image in images)) * np.linalg.norm(places - eye[:2], axis=1)
     near = np.clip(NEAR[0] + NEAR[1] * spacing, None, NEAR[2])
-    pairs = cKDTree(moved[:, :2]).query_pairs(NEAR[2], output_type="ndarray")
-    apart = np.linalg.norm(moved[pairs[:, 0], :2] - moved[pairs[:, 1], :2], axis=1)
+    pairs = cKDTree(places).query_pairs(NEAR[2], output_type="ndarray")
+    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
     pairs = pairs[apart < near[pairs].min(1)]
-    joined = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(moved), len(moved)))
-    _, object_of = connected_components(joined, directed=False)
+    joined = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(places), len(places)))
+    object_of = connected_components(joined, directed=False)[1][tile.ravel()]
     order = np.argsort(object_of, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(object_of[order])) + 1)
     return [Cluster(moved[p], sweep.time_us, eye) for p in parts if len(p) >= FEWEST]
