@@ -14,7 +14,8 @@ from scenes.options import FitSize, Flag, LengthOrNone, Names, Output, Overwrite
 
 @dataclass
 class Recon:
-    """Reconstruct a recorded drive as a scene: background, movers, sky, exposure; reports its quality on held-out frames."""
+    """Reconstruct a recorded drive as a scene: background, movers (by its boxes, or found in its lidar), sky, exposure; reports its quality
+    on held-out frames."""
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
     """Folder of one drive, as pandaset/002: PandaSet, nuScenes, Argoverse 2, Waymo, KITTI or COLMAP's, or photos, or a video."""

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from recon.actors import MARGIN, SWEPT_MARGIN, inside
 from recon.boxing import boxed
 from recon.following import FEWEST, Cluster, Followed, follow
-from recon.freespace import range_image, tally
+from recon.freespace import RangeImage, range_image, tally
 from recon.ground import estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.tracks import named
@@ -40,28 +40,35 @@ NEAR = 0.45, 2.0, 1.4
 SHARE = 0.4
 """Part of all points in and around an object's box that must have moved: leaves and edges seem to, in the midst of what stands."""
 
-
 TILE = 0.1
-"""Metres."""
+"""Metres: beside the lidar thousands of points lie within one, and one of each tile of this side stands for all in it."""
 
 
 def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
     """The log with what moves in `sweeps` as its tracks, at the stamps of all its sweeps. `report` is called after each."""
-    read = [(s, s.read()) for s in sweeps]
-    ground = estimate_ground(np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for _, p in read]), log.ego)
-    images = [(s.time_us, range_image(_of(p, k), log.ego, log.lidars[k])) for s, p in read for k in _known(p, log)]
+    read = _read(sweeps)
+    ground = estimate_ground(np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for p in read.values()]), log.ego)
+    images = [(t, range_image(_of(p, k), log.ego, log.lidars[k])) for t, p in read.items() for k in _known(p, log)]
     followed: list[Followed] = []
     asked: dict[int, np.ndarray] = {}
-    for sweep, points in read:
-        asked[sweep.time_us] = candidates(log, sweep, points, ground)
-        eye = log.ego.near(sweep.time_us)[:3, 3].numpy()
-        found = clusters(sweep, asked[sweep.time_us], images, eye)
-        follow(followed, found, sweep.time_us, eye, asked[sweep.time_us])
+    for time, points in read.items():
+        asked[time] = candidates(log, time, points, ground)
+        eye = log.ego.near(time)[:3, 3].numpy()
+        follow(followed, clusters(time, asked[time], images, eye), time, eye, asked[time])
         report()
-    stamps = np.array([s.time_us for s in log.sweeps])
+    stamps = np.unique([s.time_us for s in log.sweeps])
     made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed]
     tracks = [(f, t) for f, t in made if t is not None and _moved(f.clusters, t, asked) >= SHARE]
     return replace(log, tracks=named(_apart(tracks), log.ego))
+
+
+def _read(sweeps: Sequence[Sweep]) -> dict[int, LidarPoints]:
+    """The points by time, in its order; sweeps of several lidars at one moment are one."""
+    read: dict[int, list[LidarPoints]] = {}
+    for sweep in sorted(sweeps, key=lambda s: s.time_us):
+        read.setdefault(sweep.time_us, []).append(sweep.read())
+    fields = ("xyz", "times_us", "sensor")
+    return {time: LidarPoints(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields)) for time, parts in read.items()}
 
 
 def _moved(clusters: list[Cluster], track: Track, asked: dict[int, np.ndarray]) -> float:
@@ -70,10 +77,9 @@ def _moved(clusters: list[Cluster], track: Track, asked: dict[int, np.ndarray]) 
     places = {int(t): i for i, t in enumerate(track.times_us)}
     for cluster in (c for c in clusters if c.moved):
         back = inverse(track.world_from_box[places[cluster.time_us]]).numpy()
-        for_all, own = (
-            inside(x @ back[:3, :3].T + back[:3, 3], track.size, SWEPT_MARGIN).sum() for x in (asked[cluster.time_us], cluster.xyz)
-        )
-        moved, there = moved + own, there + for_all
+        own, every = (x @ back[:3, :3].T + back[:3, 3] for x in (cluster.xyz, asked[cluster.time_us]))
+        moved += inside(own, track.size, SWEPT_MARGIN).sum()
+        there += inside(every, track.size, SWEPT_MARGIN).sum()
     return moved / max(there, 1)
 
 
@@ -105,10 +111,10 @@ def _of(points: LidarPoints, sensor: int) -> LidarPoints:
     return LidarPoints(points.xyz[mine], points.times_us[mine], points.sensor[mine])
 
 
-def candidates(log: Log, sweep: Sweep, points: LidarPoints, ground: Ground) -> np.ndarray:
+def candidates(log: Log, time_us: int, points: LidarPoints, ground: Ground) -> np.ndarray:
     """The points `[N, 3]` of a sweep that may move: over the ground, within reach, and not the recording car itself."""
     xyz = points.xyz
-    pose = log.ego.near(sweep.time_us).numpy()
+    pose = log.ego.near(time_us).numpy()
     local = (xyz - pose[:3, 3]) @ pose[:3, :3]
     height = xyz[:, 2] - ground.height(torch.from_numpy(xyz[:, :2])).numpy()
     own = (np.abs(local[:, 0]) < 2.6) & (np.abs(local[:, 1]) < 1.1)
@@ -117,13 +123,12 @@ def candidates(log: Log, sweep: Sweep, points: LidarPoints, ground: Ground) -> n
     return kept[:: max(1, -(-len(kept) // MOST))]
 
 
-def clusters(sweep: Sweep, xyz: np.ndarray, images: list, eye: np.ndarray) -> list[Cluster]:
+def clusters(time_us: int, xyz: np.ndarray, images: list[tuple[int, RangeImage]], eye: np.ndarray) -> list[Cluster]:
     """What of a sweep's points moved, one cluster an object."""
-    through, there = tally(xyz, sweep.time_us, images)
+    through, there = tally(xyz, time_us, images)
     moved = xyz[(through >= THROUGH) & (through >= OVER * there)]
     if len(moved) < FEWEST:
         return []
-    # beside the lidar thousands of points lie within a metre: one of each tile stands for them
     _, first, tile = np.unique(np.floor(moved[:, :2] / TILE), axis=0, return_index=True, return_inverse=True)
     places = moved[first, :2]
     spacing = np.radians(min(image.cell for _, image in images)) * np.linalg.norm(places - eye[:2], axis=1)
@@ -135,4 +140,4 @@ def clusters(sweep: Sweep, xyz: np.ndarray, images: list, eye: np.ndarray) -> li
     object_of = connected_components(joined, directed=False)[1][tile.ravel()]
     order = np.argsort(object_of, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(object_of[order])) + 1)
-    return [Cluster(moved[p], sweep.time_us, eye) for p in parts if len(p) >= FEWEST]
+    return [Cluster(moved[p], time_us, eye) for p in parts if len(p) >= FEWEST]

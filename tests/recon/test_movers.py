@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from made_sweeps import MOUNT, Box, drive, standing
 from recon.boxing import headings, smoothed
 from recon.build import annotated
 from recon.freespace import range_image, tally
-from recon.log import LidarPoints, Track
+from recon.log import LidarPoints, Sweep, Track
 from recon.movers import with_movers
 
 CAR = (4.4, 1.8, 1.5)
@@ -112,6 +113,21 @@ def test_sweeps_without_points_are_left_out():
     (track,) = with_movers(log, sweeps).tracks
     assert np.median(misses(track, MOVING["oncoming"])[0]) < 0.2
     assert with_movers(log, [replace(s, read=lambda: empty) for s in log.sweeps]).tracks == ()
+
+
+def test_two_lidars_that_turn_at_one_moment_see_one_thing_once():
+    log = drive([*STREET, MOVING["oncoming"]])
+    first = [replace(s, read=partial(half, s, 0)) for s in log.sweeps]
+    second = [replace(s, index=len(first) + s.index, read=partial(half, s, 1)) for s in log.sweeps]
+    both = replace(log, sweeps=(*first, *second), lidars={0: MOUNT, 1: MOUNT})
+    (track,) = with_movers(both, both.sweeps).tracks
+    assert np.median(misses(track, MOVING["oncoming"])[0]) < 0.2 and track.trajectory().covers(1_000_000)
+
+
+def half(sweep: Sweep, sensor: int) -> LidarPoints:
+    """Every other point, as seen by a lidar of that number."""
+    points = sweep.read()
+    return LidarPoints(points.xyz[sensor::2], points.times_us[sensor::2], np.full(len(points.xyz[sensor::2]), sensor))
 
 
 def test_sensors_that_stand_nowhere_known_are_not_asked():
