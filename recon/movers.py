@@ -20,6 +20,7 @@ from recon.log import LidarPoints, Log, Sweep, Track
 from recon.tracks import named
 from scenes.ground import Ground
 from scenes.poses import inverse
+from scenes.trajectory import Trajectory
 
 HEIGHTS = (0.3, 4.5)
 """Metres above the ground that are looked at."""
@@ -40,6 +41,9 @@ NEAR = 0.45, 2.0, 1.4
 SHARE = 0.4
 """Part of all points in and around an object's box that must have moved: leaves and edges seem to, in the midst of what stands."""
 
+OWN = 4.2, 1.2
+"""Metres ahead or behind and aside of the body within which what goes is the recording car's own bonnet."""
+
 TILE = 0.1
 """Metres: beside the lidar thousands of points lie within one, and one of each tile of this side stands for all in it."""
 
@@ -57,7 +61,7 @@ def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = 
         follow(followed, clusters(time, asked[time], images, eye), time, eye, asked[time])
         report()
     stamps = np.unique([s.time_us for s in log.sweeps])
-    made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed]
+    made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed and not _own(f, log.ego)]
     tracks = [(f, t) for f, t in made if t is not None and _moved(f.clusters, t, asked) >= SHARE]
     return replace(log, tracks=named(_apart(tracks), log.ego))
 
@@ -69,6 +73,13 @@ def _read(sweeps: Sequence[Sweep]) -> dict[int, LidarPoints]:
         read.setdefault(sweep.time_us, []).append(sweep.read())
     fields = ("xyz", "times_us", "sensor")
     return {time: LidarPoints(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields)) for time, parts in read.items()}
+
+
+def _own(one: Followed, ego: Trajectory) -> bool:
+    """Whether what was followed is the recording car itself, most of the time."""
+    back = inverse(torch.stack([ego.near(c.time_us) for c in one.clusters])).numpy()
+    local = np.einsum("nij,nj->ni", back[:, :2, :2], np.array(one.places)) + back[:, :2, 3]
+    return bool((np.median(np.abs(local), axis=0) < OWN).all())
 
 
 def _moved(clusters: list[Cluster], track: Track, asked: dict[int, np.ndarray]) -> float:

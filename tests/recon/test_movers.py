@@ -85,6 +85,11 @@ def test_nothing_is_found_where_nothing_moves(speed):
     assert found(speed=speed) == ()
 
 
+def test_the_recording_cars_own_bonnet_is_no_mover():
+    """It goes wherever the car goes, and others see through where it was."""
+    assert found(Box((1.3, 1.6, 1.1), lambda t: (8 * t + 3.4, 0.0, 0.0))) == ()
+
+
 def test_a_car_that_waits_before_it_goes_is_followed_as_it_goes():
     """While it waits, one moment shows its rear, another its side: it is known less well."""
     box = Box(CAR, lambda t: (22 + 2 * max(t - 1.5, 0) ** 2, -2.5, 0.0))
