@@ -325,7 +325,10 @@ def test_existing_outputs_are_replaced_with_w(door, tmp_path):
 def begin(folder: Path, desk: Path) -> subprocess.Popen:
     """Start a long render and wait until it writes."""
     words = ["render", str(desk / "street"), "--camera", "front_camera", "--size", "320x180", "--fps", "500", "-o", "out.mp4"]
-    process = subprocess.Popen([sys.executable, "-m", "sidestep", *words], cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
+    # who runs the tests in the background of a script has Ctrl-C ignored, and so would they
+    heeding = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from sidestep import main; main()"
+    command = [sys.executable, "-c", heeding, *words]
+    process = subprocess.Popen(command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not any(p.name.startswith(".out") for p in folder.iterdir()):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
