@@ -135,7 +135,7 @@ def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
         found = with_movers(log, sweeps, steps.step)
     count = len(found.tracks)
     print(f"{log.path} has no boxes: its lidar shows {count} thing{'s that move' if count != 1 else ' that moves'}", file=sys.stderr)
-    return found
+    return replace(found, meta={**log.meta, "movers": "found in lidar"})
 
 
 def choose(

@@ -151,7 +151,8 @@ def test_tracks_stand_at_all_stamps_of_the_log():
 def test_a_log_with_boxes_keeps_them(capsys):
     log = drive([*STREET, MOVING["oncoming"]], count=20)
     searched = annotated(log, log.sweeps)
-    assert len(searched.tracks) == 1 and "has no boxes: its lidar shows 1 thing that moves" in capsys.readouterr().err
+    assert len(searched.tracks) == 1 and searched.meta["movers"] == "found in lidar"
+    assert "has no boxes: its lidar shows 1 thing that moves" in capsys.readouterr().err
     assert annotated(searched, log.sweeps) is searched
     assert annotated(log, ()) is log
 
