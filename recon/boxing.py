@@ -28,9 +28,8 @@ OFF, PUSH = 0.15, 3.0
 MOST_SEEN = 0.75
 """Quantile of what was seen of a length over time that is taken for it: the largest is a neighbour's."""
 
-CAR = (4.3, 1.8)
-"""Length and width of a car of which only the other is seen (between these: `CAR_WIDE`, `CAR_LONG`)."""
-CAR_WIDE, CAR_LONG = (1.3, 2.4), (2.6, 6.0)
+CAR, CAR_WIDE, CAR_LONG = (4.3, 1.8), (1.3, 2.4), (2.6, 6.0)
+"""Length and width of a car of which only the other is seen, and between what a width and a length is a car's."""
 
 
 def boxed(clusters: Sequence[Cluster], ground: Ground, stamps_us: np.ndarray) -> Track | None:

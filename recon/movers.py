@@ -77,9 +77,14 @@ def _read(sweeps: Sequence[Sweep]) -> dict[int, LidarPoints]:
 
 def _own(one: Followed, ego: Trajectory) -> bool:
     """Whether what was followed is the recording car itself, most of the time."""
-    back = inverse(torch.stack([ego.near(c.time_us) for c in one.clusters])).numpy()
-    local = np.einsum("nij,nj->ni", back[:, :2, :2], np.array(one.places)) + back[:, :2, 3]
+    local = _seen_from(torch.stack([ego.near(c.time_us) for c in one.clusters]), np.array(one.places))
     return bool((np.median(np.abs(local), axis=0) < OWN).all())
+
+
+def _seen_from(poses: torch.Tensor, places: np.ndarray) -> np.ndarray:
+    """Places `[N, 2]` of the world in the plane of as many poses."""
+    back = inverse(poses).numpy()
+    return np.einsum("nij,nj->ni", back[:, :2, :2], places) + back[:, :2, 3]
 
 
 def _moved(clusters: list[Cluster], track: Track, asked: dict[int, np.ndarray]) -> float:
@@ -107,8 +112,7 @@ def _within(one: Followed, track: Track) -> float:
     """Part of an object's time in which its middle lies in the box of a track."""
     times = np.array([c.time_us for c in one.clusters])
     _, mine, its = np.intersect1d(times, track.times_us, return_indices=True)
-    back = inverse(track.world_from_box[its]).numpy()
-    local = np.einsum("nij,nj->ni", back[:, :2, :2], np.array(one.places)[mine]) + back[:, :2, 3]
+    local = _seen_from(track.world_from_box[its], np.array(one.places)[mine])
     return float((np.abs(local) < track.size[:2] / 2 + MARGIN).all(1).sum()) / len(times)
 
 

@@ -135,7 +135,7 @@ def half(sweep: Sweep, sensor: int) -> LidarPoints:
 
 
 def test_sensors_that_stand_nowhere_known_are_not_asked():
-    log = drive([*STREET, MOVING["oncoming"]], count=12)
+    log = drive([*STREET, MOVING["oncoming"]], count=20)
     assert with_movers(replace(log, lidars={}), log.sweeps).tracks == ()
 
 
