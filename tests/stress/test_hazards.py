@@ -17,24 +17,24 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.i
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", HAZARDS)
-def test_hazard(name, device, hazard_table):
+def test_hazard(name, device, keep_row):
     outcome = run(name, device)
-    hazard_table[f"{name} ({device})"] = outcome
+    keep_row(f"{name} ({device})", outcome)
     assert outcome.cases and not outcome.failures
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", CONDUCT)
-def test_conduct(name, device, hazard_table):
+def test_conduct(name, device, keep_row):
     outcome = run_conduct(CONDUCT[name], device)
-    hazard_table[f"{name} ({device})"] = outcome
+    keep_row(f"{name} ({device})", outcome)
     assert not outcome.failures
 
 
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_property(name, hazard_table):
+def test_property(name, keep_row):
     outcome = run_property(name)
-    hazard_table[name] = outcome
+    keep_row(name, outcome)
     assert outcome.cases and not outcome.failures
 
 
