@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from recon.actors import split_points
 from recon.carpet import carpet
+from recon.dense import cloud_from_pictures
 from recon.densify import LARGEST
 from recon.fill import unexplained
 from recon.frames import Frames, View
@@ -19,7 +20,6 @@ from recon.log import Log, Track
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from recon.skies import SkyPicture, like_sky
-from recon.sparse import cloud_from_points
 from recon.sweep import companions
 from recon.triangulate import triangulated
 from scenes.camera import RigCamera
@@ -69,7 +69,8 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     report("colouring points")
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
-        cloud, gains = cloud_from_points(log, frames, sparse, movers), np.ones((len(frames.names), 3))
+        ground = estimate_ground(sparse.xyz, log.ego)
+        cloud, gains = cloud_from_pictures(log, frames, sparse, ground, movers), np.ones((len(frames.names), 3))
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
         ground = estimate_ground(split.static, log.ego)

@@ -9,11 +9,12 @@ from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 
 from recon import open_log, reconstruct
 from recon.build import MOST, PER_PHOTO, fit_config, fit_size
+from recon.dense import cloud_from_pictures
 from recon.fit import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
 from recon.gauge import find_gauge, up_from_cameras
-from recon.sparse import cloud_from_points
+from recon.ground import estimate_ground
 from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert
@@ -79,7 +80,7 @@ def test_metres_given_twice_or_to_a_log_that_has_them_are_refused(workspace, dri
 def test_points_stand_where_their_pictures_show_them(workspace):
     log = open_log(workspace, metres_per_unit=1 / UNIT)
     frames = load_frames(log, ["camera"], ALL, (96, 54), 0)
-    cloud = cloud_from_points(log, frames, log.points, [])
+    cloud = cloud_from_pictures(log, frames, log.points, estimate_ground(log.points.xyz, log.ego), [])
     assert len(cloud.xyz) > 1000
     height = cloud.xyz[:, 2] + HEIGHT  # the road is flat and everything else above it
     assert np.quantile(height, 0.02) > -0.15 and (np.abs(height) < 0.15).mean() > 0.2

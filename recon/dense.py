@@ -1,0 +1,150 @@
+"""Seeds where there is no lidar: how far away everything in the pictures is, kept where pictures agree on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from recon.frames import Frames, View
+from recon.log import Log, SparsePoints, Track
+from recon.seed import Cloud, nearest_box, spread
+from recon.stereo import Plate, plate_of, swept
+from render.progress import Progress
+from scenes.ground import Ground
+
+VIEWS = 40
+"""Pictures a camera whose depth is found, at most."""
+
+BASELINES = (0.06, 0.2)
+"""Distances to the pictures that one is compared with, before and after it, in distances to what it shows; each by `ALLOWED` at most."""
+
+ALLOWED = 2.5
+NEARER = 0.6
+"""Part of the distance to the nearest points from which on depths are tried: between the points there may be something nearer."""
+
+TURNED = 0.8
+"""Cosine between the directions of two pictures that are compared, at least."""
+
+AGREE, AGREEING = 0.05, 2
+"""Part of its depth by which a place may differ between pictures, and in how many others it must be found."""
+
+FARTHEST = 1000.0
+"""Metres: farther is taken to be there."""
+
+DUG = 0.3
+"""Metres under the ground where things may still be found: it is not known better."""
+
+
+@dataclass(frozen=True)
+class Depths:
+    """A picture, its plate, and the depth z `[h, w]` of its pixels."""
+
+    view: View
+    plate: Plate
+    depth: np.ndarray
+
+    def points(self) -> np.ndarray:
+        """What its pixels show, `[h, w, 3]` in the world."""
+        back = np.linalg.inv(self.plate.cam_from_world)
+        return (self.plate.rays().double().numpy() * self.depth[..., None]) @ back[:3, :3].T + back[:3, 3]
+
+
+def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> Cloud:
+    """Points `[N, 3]` with colours where training pictures agree how far it is, and the sparse ones that these depths began with.
+
+    Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a point.
+    """
+    found = depths(log, frames, sparse, ground)
+    parts = [_seeds(log, frames, own, mask, movers) for own, mask in zip(found, agreed(found), strict=True)]
+    if not parts:
+        raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
+    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts]))
+
+
+def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
+    """Of `VIEWS` training pictures a camera, spread over the drive, those that show points of `sparse` and resemble others."""
+    found = []
+    for c, name in enumerate(frames.names):
+        views = frames.of(c)
+        plates = [plate_of(v.image, log.camera(name).camera(v.index, frames.width, frames.height)) for v in views]
+        chosen = spread(list(range(len(views))), VIEWS)
+        with Progress(f"depths of {name}", total=len(chosen)) as steps:
+            for i in chosen:
+                made = _of_view(i, views, plates, sparse.xyz[sparse.seen[name][views[i].index]], ground)
+                found += [made] if made is not None else []
+                steps.step()
+    return found
+
+
+def _of_view(i: int, views: list[View], plates: list[Plate], points: np.ndarray, ground: Ground) -> Depths | None:
+    z = plates[i].shown(points)[2]
+    z = z[z > 0]
+    others = companions(i, plates, float(np.median(z))) if len(z) else []
+    if not others:
+        return None
+    deepest = ground_depth(plates[i], ground)
+    near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
+    nearest = min(near, 0.95 * float(deepest.min()))
+    depth = swept(plates[i], [plates[j] for j in others], nearest, points, deepest)
+    return Depths(views[i], plates[i], np.minimum(depth, FARTHEST))
+
+
+def companions(i: int, plates: list[Plate], typical: float) -> list[int]:
+    """Which pictures one is compared with: before and after it, at about `BASELINES` of the typical depth."""
+    eyes = np.stack([-p.cam_from_world[:3, :3].T @ p.cam_from_world[:3, 3] for p in plates])
+    away = np.linalg.norm(eyes - eyes[i], axis=1) / typical
+    along = np.array([p.cam_from_world[2, :3] @ plates[i].cam_from_world[2, :3] for p in plates]) > TURNED
+    found = []
+    for side in (np.arange(len(plates)) < i, np.arange(len(plates)) > i):
+        for part in BASELINES:
+            ratio = np.abs(np.log(np.maximum(away, 1e-9) / part))
+            ratio[~(side & along)] = np.inf
+            if ratio.min(initial=np.inf) < np.log(ALLOWED):
+                found.append(int(ratio.argmin()))
+    return list(dict.fromkeys(found))
+
+
+def ground_depth(plate: Plate, ground: Ground) -> np.ndarray:
+    """Depth z `[h, w]` at which a plate's rays are `DUG` under the ground; infinite above the horizon."""
+    back = np.linalg.inv(plate.cam_from_world)
+    eye, world = back[:3, 3], plate.rays().double().numpy() @ back[:3, :3].T
+    falls = world[..., 2] < -1e-3
+    slope = np.where(falls, world[..., 2], -1.0)
+    at = np.broadcast_to(eye[:2], (*falls.shape, 2))
+    for _ in range(4):  # along the ray to the height that the ground has there
+        depth = (ground.height(torch.from_numpy(at.copy())).numpy() - DUG - eye[2]) / slope
+        depth = np.where(falls & (depth > 0), depth, np.inf)  # ground that rises above the eye hides nothing that is known
+        at = eye[:2] + world[..., :2] * np.minimum(depth, FARTHEST)[..., None]
+    return depth
+
+
+def agreed(found: list[Depths]) -> list[np.ndarray]:
+    """Masks `[h, w]` of what at least `AGREEING` other pictures find in the same place, and no more see through: the rest is guessed, or
+    moves."""
+    masks = []
+    for own in found:
+        points = own.points()
+        agree, through = np.zeros((2, *own.depth.shape), np.int64)
+        for other in found:
+            if other is own:
+                continue
+            row, column, z, inside = other.plate.shown(points)
+            there = other.depth[row, column]
+            agree += inside & (np.abs(there - z) < AGREE * z)
+            through += inside & (there > (1 + 2 * AGREE) * z)
+        masks.append((agree >= AGREEING) & (through <= agree) & own.plate.inside)
+    return masks
+
+
+def _seeds(log: Log, frames: Frames, own: Depths, mask: np.ndarray, movers: list[Track]) -> Cloud:
+    """What a picture shows where its mask `[h, w]` is set."""
+    column, row = np.floor(own.plate.at.numpy()[mask]).astype(np.int64).T
+    points, depth = own.points()[mask], own.depth[mask]
+    step = np.array(own.view.image.shape[:2]) / own.view.sky.shape
+    clear = ~own.view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+    if movers:
+        camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, frames.width, frames.height)
+        clear &= depth < nearest_box(camera, movers)[row, column]
+    return Cloud(points[clear], own.view.image.numpy()[row[clear], column[clear]] / 255)

@@ -1,0 +1,76 @@
+"""A made-up drive of two cameras without lidar towards a wall: ground and wall painted with blotches, so that every depth is known."""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from recon.colmap import CAM_FROM_BODY
+from recon.log import Log, LogCamera, Packed
+from render.rays import world_directions
+from scenes.camera import Camera
+from scenes.lenses import Pinhole
+from scenes.poses import translation, yaw
+from scenes.trajectory import Trajectory
+
+SIZE = (320, 180)
+HEIGHT, WALL = 1.5, 20.0
+"""Metres from the cameras down to the ground, and from the first one ahead to a wall."""
+
+CAMERAS = {"front": 0.0, "left": 0.5}
+"""Radians that they are turned to the left."""
+
+BOARD, AHEAD, STRIDE = 1.6, 9.0, 0.5
+"""Side of a painted board that crosses the street, how far ahead of the first camera, and its metres a picture."""
+
+
+def board_left(index: int) -> float:
+    """Where the board's right edge is when picture `index` is taken, in metres to the left of the first camera."""
+    return -3.0 + STRIDE * index
+
+
+def depth_of(camera: Camera) -> torch.Tensor:
+    """Distance along z = 1 rays, float64 `[H, W]`, to the ground and the wall."""
+    rays = world_directions(camera).double()
+    eye = camera.world_from_cam[:3, 3]
+    ground = torch.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], torch.inf)
+    wall = torch.where(rays[..., 0] > 0, (WALL - eye[0]) / rays[..., 0], torch.inf)
+    return torch.minimum(ground, wall)
+
+
+def _picture(camera: Camera, blotches: torch.Tensor, board: float | None) -> Packed:
+    """Both painted with blotches of a third of a metre, and the board, brighter, if there is one."""
+    rays, depth = world_directions(camera).double(), depth_of(camera)
+    eye = camera.world_from_cam[:3, 3]
+    at = eye + rays * depth[..., None]
+    plane = torch.where((at[..., 2] < 1e-6)[..., None], at[..., :2], at[..., 1:] + 50)
+    image = _painted(blotches, plane)
+    if board is not None:
+        at = eye + rays * ((AHEAD - eye[0]) / rays[..., 0])[..., None]
+        plane = at[..., 1:] - torch.tensor([board, 0.3])
+        hit = ((plane > 0) & (plane < BOARD)).all(-1) & (rays[..., 0] > 0) & (eye[0] < AHEAD)
+        image = torch.where(hit[..., None], 0.5 + 0.5 * _painted(blotches, plane + 20), image)
+    buffer = BytesIO()
+    Image.fromarray((image * 255).byte().numpy()).save(buffer, "png")
+    return Packed("painted", buffer.getvalue)
+
+
+def _painted(blotches: torch.Tensor, plane: torch.Tensor) -> torch.Tensor:
+    found = torch.nn.functional.grid_sample(blotches, (plane[None] / 100).float(), padding_mode="reflection", align_corners=False)
+    return found[0].permute(1, 2, 0)
+
+
+def drive(steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bool = False) -> Log:
+    """The drive whose pictures are taken after so many metres each."""
+    blotches = torch.rand(1, 3, 600, 600, generator=torch.Generator().manual_seed(0))
+    lens, times = Pinhole(160, 160, 160, 90), torch.arange(len(steps)) * 100_000
+    bodies = torch.stack([translation(x, x / 12, HEIGHT) for x in np.cumsum(steps)])
+    cameras = {}
+    for name in names:
+        poses = bodies @ yaw(CAMERAS[name]) @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+        views = [Camera(lens, *SIZE, pose) for pose in poses]
+        pictures = tuple(_picture(v, blotches, board_left(i) if board else None) for i, v in enumerate(views))
+        cameras[name] = LogCamera(name, lens, *SIZE, pictures, times, poses)
+    return Log("bare", Path("bare"), cameras, (), (), Trajectory(times, bodies), {}, names)

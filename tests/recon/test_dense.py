@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+import torch
+from painted import AHEAD, BOARD, SIZE, WALL, board_left, depth_of, drive
+
+from recon import dense, stereo
+from recon.dense import DUG, agreed, cloud_from_pictures, companions, depths, ground_depth
+from recon.frames import load_frames
+from recon.ground import estimate_ground
+from recon.log import Track
+from recon.stereo import plate_of
+from recon.triangulate import triangulated
+from scenes.camera import Camera
+from scenes.ground import Ground
+from scenes.lenses import Fisheye, OpenCV, Pinhole
+from scenes.poses import translation
+
+ALL = (0, 10**18)
+STEPS = [0.0] + [0.6] * 11
+
+pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+
+
+def _started(log):
+    frames = load_frames(log, list(log.cameras), ALL, SIZE, 8)
+    points = triangulated(log, frames)
+    return frames, points, estimate_ground(points.xyz, log.ego)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pictures():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dense, "VIEWS", 6)
+        patch.setattr(stereo, "WIDTH", 160)
+        yield
+
+
+@pytest.fixture(scope="module")
+def plain():
+    log = drive(STEPS, ("front",))
+    return log, *_started(log)
+
+
+@pytest.fixture(scope="module")
+def crossed():
+    log = drive(STEPS, ("front",), board=True)
+    return log, *_started(log)
+
+
+def _off(made, until=99):
+    """Relative errors of the depths that pictures agree on, and which part of the pixels of those before `until` that is."""
+    log, frames, points, ground = made
+    found = depths(log, frames, points, ground)
+    errors, share = [], []
+    for own, mask in zip(found, agreed(found), strict=True):
+        if own.view.index < until:
+            camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, *SIZE)
+            truth = depth_of(camera.resized(*own.depth.shape[::-1])).numpy()
+            errors.append(np.abs(own.depth / truth - 1)[mask])
+            share.append(mask.mean())
+    return np.concatenate(errors), np.array(share)
+
+
+def test_depths_are_those_of_what_pictures_show(plain):
+    errors, share = _off(plain)
+    assert np.median(errors) < 0.015 and (errors < 0.05).mean() > 0.95
+    assert len(share) == 6 and share.mean() > 0.6
+
+
+def test_a_car_that_stands_before_it_goes_learns_depth_from_where_it_went():
+    log = drive([0.0] * 6 + [0.6] * 8, ("front",))
+    errors, share = _off((log, *_started(log)), until=5)
+    assert np.median(errors) < 0.03 and len(share) >= 2 and share.mean() > 0.5
+
+
+def test_what_moves_is_no_seed_and_what_stands_behind_it_is(plain, crossed):
+    def beside(made):
+        """How many seeds stand where the board was when any picture was taken, and how many on the wall."""
+        log, frames, points, ground = made
+        cloud = cloud_from_pictures(log, frames, points, ground, [])
+        x, y, z = cloud.xyz.T
+        path = (y > board_left(0)) & (y < board_left(len(STEPS)) + BOARD)
+        board = path & (np.abs(x - AHEAD) < 0.5) & (z > 0.4) & (z < 1.8)
+        return board.sum(), (np.abs(x - WALL) < 1).sum()
+
+    board, wall = beside(crossed)
+    assert beside(plain)[0] == 0 and wall > 2_000
+    assert board < 0.003 * wall
+
+
+def test_seeds_keep_off_movers_and_the_sky(plain):
+    log, frames, points, ground = plain
+    ahead = translation(10.0, 0.0, 0.0).expand(9, 4, 4)
+    car = Track("veh_1", "car", True, np.array([4.0, 2.0, 1.5]), np.arange(9) * 100_000, ahead, np.zeros(9), ())
+    free, kept = (cloud_from_pictures(log, frames, points, ground, movers) for movers in ([], [car]))
+    assert 0.3 * len(free.xyz) < len(kept.xyz) < len(free.xyz) - 100
+    assert (free.rgb >= 0).all() and (free.rgb <= 1).all() and free.xyz[:, 2].min() > -1
+    for view in frames.views:
+        view.sky[: len(view.sky) // 3] = True
+    try:
+        assert cloud_from_pictures(log, frames, points, ground, []).xyz[:, 2].max() < free.xyz[:, 2].max() - 1
+    finally:
+        for view in frames.views:
+            view.sky[:] = False
+
+
+@pytest.mark.parametrize("lens", [OpenCV(160, 160, 160, 90, -0.2, 0.05, 1e-3, 1e-3), Fisheye(150, 150, 158, 92, 0.02)])
+def test_a_plate_undoes_its_lens(lens):
+    pose = translation(1.0, 2.0, 3.0)
+    plate = plate_of(torch.zeros(180, 320, 3, dtype=torch.uint8), Camera(lens, *SIZE, pose))
+    points = np.random.default_rng(0).uniform([-3, -2, 4], [3, 2, 9], (500, 3)) + [1.0, 2.0, 3.0]
+    row, column, z, inside = plate.shown(points)
+    assert inside.mean() > 0.8 and np.allclose(z, points[:, 2] - 3)
+    there = lens.project(torch.from_numpy(points) - pose[:3, 3]).numpy()
+    shown = plate.at.numpy()[row, column]
+    assert np.abs(shown - there)[inside & plate.inside[row, column]].max() < 2.0  # a pixel of the plate is two wide here
+
+
+def test_pictures_are_compared_with_those_before_and_after_that_stand_apart_and_look_the_same_way():
+    flat = torch.zeros(18, 32, 3, dtype=torch.uint8)
+    lens = Pinhole(30, 30, 16, 9)
+    half_turn = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    poses = [translation(0.0, 0.0, 0.5 * i) for i in range(20)] + [translation(0.0, 0.0, 6.0) @ half_turn]
+    plates = [plate_of(flat, Camera(lens, 32, 18, p)) for p in poses]
+    assert companions(10, plates, 20.0) == [8, 2, 12, 18]  # 1.2 and 4 metres
+    assert companions(0, plates, 20.0) == [2, 8]
+    assert companions(20, plates, 20.0) == []
+    assert companions(10, [plates[10]] * 20, 20.0) == []
+
+
+def test_the_ground_is_as_far_as_rays_have_to_go_to_it():
+    heights = torch.zeros(400, 400)
+    ground = Ground(heights, (-100.0, -100.0), 0.5)
+    camera = drive([0.0]).camera("front").camera(0, *SIZE)
+    found = ground_depth(plate_of(torch.zeros(180, 320, 3, dtype=torch.uint8), camera), ground)
+    rays = depth_of(camera.resized(160, 90)).numpy()
+    below = rays < WALL - 1
+    eye = float(camera.world_from_cam[2, 3])
+    np.testing.assert_allclose(found[below], rays[below] * (eye + DUG) / eye, rtol=1e-3)
+    assert np.isinf(found[:40]).all()
+    assert (found[50:] > 0).all()
