@@ -3,8 +3,9 @@
     python -m tests.bench.recon DRIVE [--cameras NAME ...] [--steps 1200] [--splats 100000] [--size 480 270] [--only PART ...] [--seed 0]
 
 The first row is the whole fit; every other one leaves one part out and says what that costs, over held-out frames while the car drives.
-The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does. "movers" is all pixels
-of all held-out frames in the recorded boxes of what moves, taller than 20 pixels, where the first row's scene without them shows nothing
+The same seed draws the same views in all of them; two runs of one row differ by 0.03 dB where only the seed does. "depth" is
+the median error of depth on lidar sweeps that no fit saw, in percent, as recorded and 2 m aside of the path. "movers" is all pixels of all
+held-out frames in the recorded boxes of what moves, taller than 20 pixels, where the first row's scene without them shows nothing
 nearer, "people" the same of who has limbs; "-" where there are none. DRIVE may be "walk": a made-up street with two people who walk
 (tests/walker.py), 192x108.
 """
@@ -24,10 +25,11 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.build import annotated, assemble, begin, choose, fit_config
+from recon.build import HELD_OUT, annotated, assemble, begin, choose, fit_config
 from recon.fit import FitConfig
 from recon.frames import Frames
-from recon.log import Log, Track
+from recon.log import Log, Sweep, Track
+from recon.offpath import held_out_sweeps, off_path_table
 from recon.report import held_out_table, read_out
 from recon.tracks import LIMBED
 from render import render_frame
@@ -74,6 +76,17 @@ for kind in FitConfig().refine:
 def boxes(log: Log, config: FitConfig) -> Setting:
     """Which are then found in its lidar."""
     return annotated(replace(log, tracks=()), log.sweeps), config
+
+
+@part
+def lidar(log: Log, config: FitConfig) -> Setting:
+    return replace(log, sweeps=()), config
+
+
+@part
+def lidar_and_boxes(log: Log, config: FitConfig) -> Setting:
+    """What is left is a video with poses."""
+    return replace(log, sweeps=(), tracks=()), config
 
 
 @part
@@ -157,6 +170,12 @@ def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int])
     return assemble(fit, start, log), fit.frames, start.rig, spent
 
 
+def depth_errors(scene: Scene, log: Log, sweeps: list[Sweep]) -> str:
+    """In percent, as recorded and 2 m aside."""
+    rows = off_path_table(scene, log, sweeps, (0.0, 2.0)) if sweeps else []
+    return " / ".join("-" if r["depth_error"] is None else f"{100 * r['depth_error']:.1f}" for r in rows) or "-"
+
+
 def opened(drive: Path) -> Log:
     if str(drive) != "walk":
         return open_log(drive)
@@ -177,13 +196,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     log = opened(asked.drive)
-    names, _ = choose(log, asked.cameras)
+    names, span = choose(log, asked.cameras)
+    unseen = held_out_sweeps(log, HELD_OUT)
+    log, whole_log = replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen)), log
+    asked_about = [s for s in unseen if span[0] <= s.time_us <= span[1]]
     config = replace(fit_config(log, names), steps=asked.steps, budget=asked.splats, seed=asked.seed)
     size = (192, 108) if str(asked.drive) == "walk" else (asked.size[0], asked.size[1])
     moving = [t for t in log.tracks if t.moving]
     counted = {"movers": moving, "people": [t for t in moving if t.label in LIMBED]}
     columns = [*names, *counted]
-    print(f"{'without':<24}" + "".join(f"{name:>22}" for name in columns) + f"{'CPU s':>8}", flush=True)
+    print(f"{'without':<24}" + "".join(f"{name:>22}" for name in columns) + f"{'depth':>14}{'CPU s':>8}", flush=True)
     whole: dict[str, float] = {}
     masks: dict[str, Masks] = {}
     for what in ("", *asked.only):
@@ -194,7 +216,8 @@ def main() -> None:
         found = told(scene, frames, rig, masks)
         whole = whole or found
         cells = ["-" if math.isnan(found[n]) else f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in columns]
-        print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in cells) + f"{spent:>8.0f}", flush=True)
+        depth = depth_errors(scene, whole_log, asked_about)
+        print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in cells) + f"{depth:>14}{spent:>8.0f}", flush=True)
 
 
 if __name__ == "__main__":
