@@ -98,10 +98,10 @@ class Render:
 
     scene: ScenePath
     """Scene folder, or a splat file or asset."""
-    camera: str
-    """Camera of the rig, as front_camera; orbit circles the splats of a file, whose z is up."""
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
+    camera: str | None = None
+    """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file, whose z is up."""
     lateral_shift: Length = 0.0
     """Metres to the left of the recorded path, as 2m; -2m is to the right."""
     insert: UseAppendAction[tuple[Insertion, ...]] = ()
@@ -142,13 +142,14 @@ class Render:
 
         check_device(self.device)
         scene, warnings = open_view(self.scene, self.drop_invalid)
-        times = clip_times(scene, self.camera, self.start, self.duration, self.fps)
-        cameras = clip_cameras(scene, self.camera, self.lateral_shift, times)
+        camera = self.camera or next(iter(scene.rig))
+        times = clip_times(scene, camera, self.start, self.duration, self.fps)
+        cameras = clip_cameras(scene, camera, self.lateral_shift, times)
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
             if not in_view(result.actor, cameras):
-                warnings.append(f"{placement.asset} is never in view of {self.camera}: X is metres forward, Y metres to the left")
+                warnings.append(f"{placement.asset} is never in view of {camera}: X is metres forward, Y metres to the left")
         warn(warnings)
         width, height = self.size or (None, None)
         stages: Stages = {}
@@ -163,7 +164,7 @@ class Render:
             stages, needs = enhancement(self.weights, self.device, references, scene)
             facts["photos"] = len(references.shots) if references else 0
         record(
-            scene, self.camera, self.output, self.lateral_shift, times, width, height, self.outputs,
+            scene, camera, self.output, self.lateral_shift, times, width, height, self.outputs,
             not self.no_shadows, stages, needs, facts, warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]

@@ -170,7 +170,7 @@ USAGE = [
     ([*SHOOT, "--insert", "car/0001"], "--insert", "write ID@X,Y"),
     ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, as 10"),
     ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
-    (["render", "street", "-o", "x.mp4"], "--camera", "required"),
+    (["render", "street"], "--output", "required"),
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
     ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
     ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
@@ -282,7 +282,7 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
 def test_splats_alone_are_rendered_from_around(door, tmp_path):
     door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.splat")])
     words = ["--size", "64x36", "--duration", "100ms", "-o", str(tmp_path / "a.mp4"), "--outputs", "alpha"]
-    door(["render", str(tmp_path / "a.splat"), "--camera", "orbit", *words])
+    door(["render", str(tmp_path / "a.splat"), *words])  # its only camera: orbit
     alpha = np.load(tmp_path / "a" / "alpha" / "000000.npy")
     assert alpha[18, 32] > 0.5 and alpha[0, 0] < 0.1
     assert "it has orbit" in door(["render", str(tmp_path / "a.splat"), "--camera", "front", *words, "-w"], 1)[1]
