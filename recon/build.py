@@ -224,7 +224,7 @@ def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)))
-    return Fit(frames, motion, start.splats, start.sky, start.exposures, limbs, config)
+    return Fit(frames, motion, start.splats, start.sky, start.exposures, limbs, config, start.measured)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

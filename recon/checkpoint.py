@@ -18,7 +18,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 5
+VERSION = 6
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -68,6 +68,7 @@ def _plain_start(start: Start) -> dict:
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
+        "measured": start.measured,
     }  # fmt: skip
 
 
@@ -94,4 +95,5 @@ def _start(plain: dict, fit: dict) -> Start:
     rig = {n: _camera(r) for n, r in plain["rig"].items()}
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
-    return Start(splats, tracks, fit["sky"], fit["exposures"], Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell), rig)
+    ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
+    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, plain["measured"])

@@ -9,9 +9,11 @@ import torch
 
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints, Track
+from recon.measured import Measured, by_pictures
 from recon.seed import Cloud, nearest_box, spread
 from recon.stereo import Plate, plate_of, swept
 from render.progress import Progress
+from scenes.camera import Camera
 from scenes.ground import Ground
 
 VIEWS = 40
@@ -51,16 +53,23 @@ class Depths:
         return (self.plate.rays().double().numpy() * self.depth[..., None]) @ back[:3, :3].T + back[:3, 3]
 
 
-def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> Cloud:
-    """Points `[N, 3]` with colours where training pictures agree how far it is, and the sparse ones that these depths began with.
+def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> tuple[Cloud, Measured]:
+    """Points `[N, 3]` with colours where training pictures agree how far it is, and these depths.
 
     Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a point.
     """
     found = depths(log, frames, sparse, ground)
-    parts = [_seeds(log, frames, own, mask, movers) for own, mask in zip(found, agreed(found), strict=True)]
+    parts: list[Cloud] = []
+    measured: Measured = {}
+    for own, mask in zip(found, agreed(found), strict=True):
+        camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, frames.width, frames.height)
+        clear = mask & _clear(own, camera, movers)
+        column, row = np.floor(own.plate.at.numpy()[clear]).astype(np.int64).T
+        parts.append(Cloud(own.points()[clear], own.view.image.numpy()[row, column] / 255))
+        measured[own.view.camera, own.view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
     if not parts:
         raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
-    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts]))
+    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts])), measured
 
 
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
@@ -69,7 +78,7 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
     for c, name in enumerate(frames.names):
         views = frames.of(c)
         plates = [plate_of(v.image, log.camera(name).camera(v.index, frames.width, frames.height)) for v in views]
-        chosen = spread(list(range(len(views))), VIEWS)
+        chosen = spread(range(len(views)), VIEWS)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
             for i in chosen:
                 made = _of_view(i, views, plates, sparse.xyz[sparse.seen[name][views[i].index]], ground)
@@ -138,13 +147,13 @@ def agreed(found: list[Depths]) -> list[np.ndarray]:
     return masks
 
 
-def _seeds(log: Log, frames: Frames, own: Depths, mask: np.ndarray, movers: list[Track]) -> Cloud:
-    """What a picture shows where its mask `[h, w]` is set."""
-    column, row = np.floor(own.plate.at.numpy()[mask]).astype(np.int64).T
-    points, depth = own.points()[mask], own.depth[mask]
+def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
+    """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
+    column, row = np.floor(own.plate.at.numpy()).astype(np.int64).transpose(2, 0, 1)
+    column, row = np.clip(column, 0, camera.width - 1), np.clip(row, 0, camera.height - 1)
     step = np.array(own.view.image.shape[:2]) / own.view.sky.shape
     clear = ~own.view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
-    if movers:
-        camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, frames.width, frames.height)
-        clear &= depth < nearest_box(camera, movers)[row, column]
-    return Cloud(points[clear], own.view.image.numpy()[row[clear], column[clear]] / 255)
+    if not movers:
+        return clear
+    depth = camera.lens.depth(own.plate.rays().double() * torch.from_numpy(own.depth)[..., None]).numpy()
+    return clear & (depth < nearest_box(camera, movers)[row, column])

@@ -19,6 +19,7 @@ from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.limbs import Limbs
 from recon.losses import PictureLoss
+from recon.measured import Measured, mistake
 from recon.model import Splats, draw, placed_groups
 from recon.motion import REFINED, Moment, Motion
 from recon.sight import Eye, in_sight
@@ -56,6 +57,8 @@ class FitConfig:
     drop: float = 0.0
     """Part of the splats in sight that a step leaves out of its picture, by lot, towards the end; the others are denser for them. Where few
     photos see a place, none may serve one photo alone (DropGaussian, Park et al. 2025)."""
+    depth_weight: float = 0.02
+    """Of depths that are not as measured (`recon/measured.py`)."""
     seed: int = 0
     """Of the order of views."""
 
@@ -99,8 +102,9 @@ class Fit:
         exposures: torch.Tensor,
         limbs: Limbs,
         config: FitConfig,
+        measured: Measured,
     ):
-        self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
+        self.frames, self.motion, self.limbs, self.config, self.measured = frames, motion, limbs, config, measured
         self.splats, self.sky, self.exposures = splats, sky, exposures
         self.first_sky = sky.clone()
         self.step_count = 0
@@ -149,12 +153,15 @@ class Fit:
         ends = self.motion.readout(view, camera)
         rates = self._rates()
         which, shown = self._in_sight(view, camera, ends, aside, rates)
-        rgb, alpha = self._render(shown, view, camera, ends)
+        known = self.measured.get((view.camera, view.index)) if self.config.depth_weight else None
+        rgb, alpha, depth = self._render(shown, view, camera, ends, known is not None)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if aside is not None:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
+        if known is not None:
+            haze = haze + self.config.depth_weight * mistake(depth, alpha, known)
         unrest = self.motion.unrest() + self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
         (loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self.descent.follow(self.splats, which, shown, rates, self.growth)
@@ -178,12 +185,12 @@ class Fit:
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         return which, self.splats.select(which, self.sh_count())
 
-    def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes."""
+    def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment], with_depth: bool) -> tuple[torch.Tensor, ...]:
+        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and its depth, or nothing."""
         placed = self._placed(self._drawn_by_lot(shown), view, camera)
-        rgb, alpha = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha")
+        rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
-        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha
+        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha, *(depth or [alpha])
 
     def _drawn_by_lot(self, shown: Splats) -> Splats:
         """Without `drop` of them, which rises over the first four fifths of the fit; the mean of all draws is as dense as all are."""

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.log import Log, Track
 from recon.project import project
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import inverse, quat_from_matrix
+
+T = TypeVar("T")
 
 OPACITY = 0.7
 THICKNESS = 0.25
@@ -68,7 +72,7 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
 
 
 def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
-    """Depth `[H, W]` of the nearest corner of the boxes around whose image rectangles a pixel lies; inf where there is none."""
+    """Depth `[H, W]`, as the lens means it, of the nearest corner of the boxes in whose image rectangles a pixel lies; inf in none."""
     depth = np.full((camera.height, camera.width), np.inf)
     from_world = inverse(camera.world_from_cam)
     for track in tracks:
@@ -85,7 +89,7 @@ def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
         low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
         high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
         part = (slice(low[1], high[1]), slice(low[0], high[0]))
-        depth[part] = np.minimum(depth[part], local[:, 2].min())
+        depth[part] = np.minimum(depth[part], camera.lens.depth(torch.from_numpy(local)).min().item())
     return depth
 
 
@@ -177,6 +181,6 @@ def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndar
     )
 
 
-def spread(views: list[View], count: int) -> list[View]:
-    """About `count` views, spread evenly over the drive."""
+def spread(views: Sequence[T], count: int) -> list[T]:
+    """About `count` of the views of a drive, or their places, spread evenly over it."""
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))]

@@ -17,6 +17,7 @@ from recon.fill import unexplained
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
+from recon.measured import Measured, by_lidar
 from recon.model import Splats, draw
 from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from recon.skies import SkyPicture, like_sky
@@ -44,7 +45,8 @@ WIDEST_SEED = 0.012
 
 @dataclass
 class Start:
-    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig."""
+    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig, and the
+    depths that were measured in views."""
 
     splats: Splats
     tracks: list[Track]
@@ -53,6 +55,7 @@ class Start:
     ego: Trajectory
     ground: Ground
     rig: dict[str, RigCamera]
+    measured: Measured
 
 
 def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_count: int, report: Callable[[str], None]) -> Start:
@@ -70,7 +73,8 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
         ground = estimate_ground(sparse.xyz, log.ego)
-        cloud, gains = cloud_from_pictures(log, frames, sparse, ground, movers), np.ones((len(frames.names), 3))
+        cloud, measured = cloud_from_pictures(log, frames, sparse, ground, movers)
+        gains = np.ones((len(frames.names), 3))
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
         ground = estimate_ground(split.static, log.ego)
@@ -80,7 +84,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
         known = np.isfinite(rgb[:, 0])
         if not known.any():
             raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
-        cloud = Cloud(split.static[known], rgb[known])
+        cloud, measured = Cloud(split.static[known], rgb[known]), by_lidar(log, frames, sweeps, movers)
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
@@ -106,7 +110,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     reach = torch.maximum(reach, filled.log_scales.exp().amax(1) / LARGEST)
     exposures = torch.zeros(len(frames.names), 3, 4)
     exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig)
+    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, measured)
 
 
 def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:

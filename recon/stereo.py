@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from scenes.camera import Camera
 from scenes.poses import inverse
 
-WIDTH = 320
+WIDTH = 256
 """Columns at which pictures are compared, at most."""
 
-PLANES = 128
+PLANES = 96
 """Inverse depths that are tried, in equal steps from 0 (the sky) on."""
 
 CHUNK = 16

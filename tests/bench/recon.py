@@ -61,6 +61,11 @@ def splats_left_out_by_lot(log: Log, config: FitConfig) -> Setting:
     return log, replace(config, drop=0.0)
 
 
+@part
+def measured_depths(log: Log, config: FitConfig) -> Setting:
+    return log, replace(config, depth_weight=0.0)
+
+
 def _unrefined(what: str) -> None:
     def leave_out(log: Log, config: FitConfig) -> Setting:
         return log, replace(config, refine=tuple(r for r in config.refine if r != what))

@@ -1,0 +1,85 @@
+"""Depth that lidar, or other pictures, measured: what a fit's own depth is held to, on a coarse grid of the views that have any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from recon.actors import split_points
+from recon.frames import Frames, View
+from recon.log import Log, Sweep, Track
+from recon.project import project
+from recon.seed import nearest_box
+from recon.stereo import WIDTH, Plate
+from scenes.camera import Camera
+from scenes.poses import inverse
+
+SOON_US = 100_000
+"""How far a sweep may be from a picture that it measures."""
+
+HIDING, AROUND = 1.1, (9, 5)
+"""How many times nearer a point within so many rows and columns must be to hide another: lidar looks over what hides it from cameras."""
+
+SLACK = 0.05
+"""Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""
+
+Measured = dict[tuple[int, int], torch.Tensor]
+"""By a view's camera and index: depth, as the view's lens means it, float16 `[h, w]`, NaN where nobody knows."""
+
+
+def grid_of(camera: Camera) -> Camera:
+    """A view's camera on the grid, as fine as plates are."""
+    return camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+
+
+def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], movers: list[Track]) -> Measured:
+    """What the sweep nearest to each training view measured of what stands still, and no mover hides."""
+    times = np.array([s.time_us for s in sweeps])
+    near: dict[int, list[View]] = {}
+    for view in frames.training() if len(times) else []:
+        k = int(np.abs(times - view.time_us).argmin())
+        if abs(int(times[k]) - view.time_us) <= SOON_US:
+            near.setdefault(k, []).append(view)
+    measured: Measured = {}
+    for k, views in near.items():
+        static = split_points(log, [sweeps[k]], movers).static
+        for view in views:
+            camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
+            row, column, found, inside = project(static, inverse(camera.world_from_cam).numpy(), camera)
+            depth = np.full((camera.height, camera.width), np.inf)
+            np.minimum.at(depth, (row[inside], column[inside]), found[inside])
+            hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > nearest_box(camera, movers))
+            measured[view.camera, view.index] = _known(np.where(hidden, np.nan, depth))
+    return measured
+
+
+def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor:
+    """A plate's depth `[h, w]`, NaN where it is not believed, on the grid of its `camera`."""
+    grid = grid_of(camera)
+    rays = grid.lens.unproject(grid.pixel_centres()).numpy()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        at = rays[..., :2] / rays[..., 2:] * plate.focal + plate.centre
+        # the plate's is z; the lens may mean the distance
+        h, w = depth.shape
+        inside = (rays[..., 2] > 0) & (at > 0).all(-1) & (at[..., 0] < w) & (at[..., 1] < h)
+        column, row = np.where(inside[..., None], at, 0).astype(np.int64).transpose(2, 0, 1)
+        return _known(np.where(inside, depth[row, column] / rays[..., 2], np.nan))
+
+
+def _known(depth: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.where(np.isfinite(depth), depth, np.nan)).half()
+
+
+def mistake(depth: torch.Tensor, alpha: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+    """What rendered depth `[H, W]` costs that is not as measured `[h, w]`, mean over what is known and drawn (the logarithm of Turkulainen
+    et al. 2024, "DN-Splatter", of relative errors): 0 for none, 0.7 at `SLACK`."""
+    (height, width), (h, w) = depth.shape, measured.shape
+    rows, columns = ((torch.arange(n) + 0.5) * (of / n) for n, of in ((h, height), (w, width)))
+    shown, solid = (m[rows.long()[:, None], columns.long()] for m in (depth, alpha.detach()))
+    measured = measured.float()
+    known = measured.isfinite() & (solid > 0.5) & shown.isfinite()
+    off = (torch.where(known, shown, 1.0) / torch.where(known, measured, 1.0) - 1).abs()
+    return torch.log1p(off / SLACK).sum() / known.sum().clamp_min(1)
