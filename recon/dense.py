@@ -16,8 +16,12 @@ from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground
 
-VIEWS = 40
-"""Pictures a camera whose depth is found, at most."""
+VIEWS, BETWEEN = (40, 150), 0.15
+"""Pictures a camera whose depth is found: from so many, where there are, up to so many, to stand no farther apart on a long way than this
+part of the distance to what they show."""
+
+OTHERS = 40
+"""Pictures, the nearest, that are asked whether they find the same."""
 
 BASELINES = (0.06, 0.2)
 """Distances to the pictures that one is compared with, before and after it, in distances to what it shows; each by `ALLOWED` at most."""
@@ -73,38 +77,51 @@ def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: 
 
 
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
-    """Of `VIEWS` training pictures a camera, spread over the drive, those that show points of `sparse` and resemble others."""
+    """Of training pictures spread over the drive (`VIEWS`), those that show points of `sparse` and resemble others."""
     found = []
     for c, name in enumerate(frames.names):
         views = frames.of(c)
         plates = [plate_of(v.image, log.camera(name).camera(v.index, frames.width, frames.height)) for v in views]
-        chosen = spread(range(len(views)), VIEWS)
+        points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
+        chosen = _chosen(plates, points)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
             for i in chosen:
-                made = _of_view(i, views, plates, sparse.xyz[sparse.seen[name][views[i].index]], ground)
-                found += [made] if made is not None else []
+                depth = _depth_of(i, plates, points[i], ground)
+                found += [Depths(views[i], plates[i], depth)] if depth is not None else []
                 steps.step()
     return found
 
 
-def _of_view(i: int, views: list[View], plates: list[Plate], points: np.ndarray, ground: Ground) -> Depths | None:
-    z = plates[i].shown(points)[2]
-    z = z[z > 0]
+def _chosen(plates: list[Plate], points: list[np.ndarray]) -> list[int]:
+    typical = [float(np.median(z)) for z in (_before(*pair) for pair in zip(plates, points, strict=True)) if len(z)]
+    if not typical:
+        return []
+    way = np.linalg.norm(np.diff([p.eye() for p in plates], axis=0), axis=1).sum()
+    return spread(range(len(plates)), int(np.clip(way / (BETWEEN * np.median(typical)), *VIEWS)))
+
+
+def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
+    """Depths z of those of the points that a plate has before it."""
+    z = plate.shown(points)[2]
+    return z[z > 0]
+
+
+def _depth_of(i: int, plates: list[Plate], points: np.ndarray, ground: Ground) -> np.ndarray | None:
+    """Depth z of one of the plates; nothing where it shows no points or resembles no other."""
+    z = _before(plates[i], points)
     others = companions(i, plates, float(np.median(z))) if len(z) else []
     if not others:
         return None
     deepest = ground_depth(plates[i], ground)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
     nearest = min(near, 0.95 * float(deepest.min()))
-    depth = swept(plates[i], [plates[j] for j in others], nearest, points, deepest)
-    return Depths(views[i], plates[i], np.minimum(depth, FARTHEST))
+    return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, points, deepest), FARTHEST)
 
 
 def companions(i: int, plates: list[Plate], typical: float) -> list[int]:
     """Which pictures one is compared with: before and after it, at about `BASELINES` of the typical depth."""
-    eyes = np.stack([-p.cam_from_world[:3, :3].T @ p.cam_from_world[:3, 3] for p in plates])
-    away = np.linalg.norm(eyes - eyes[i], axis=1) / typical
-    along = np.array([p.cam_from_world[2, :3] @ plates[i].cam_from_world[2, :3] for p in plates]) > TURNED
+    away = np.array([np.linalg.norm(p.eye() - plates[i].eye()) for p in plates]) / typical
+    along = np.array([p.axis() @ plates[i].axis() for p in plates]) > TURNED
     found = []
     for side in (np.arange(len(plates)) < i, np.arange(len(plates)) > i):
         for part in BASELINES:
@@ -136,9 +153,8 @@ def agreed(found: list[Depths]) -> list[np.ndarray]:
     for own in found:
         points = own.points()
         agree, through = np.zeros((2, *own.depth.shape), np.int64)
-        for other in found:
-            if other is own:
-                continue
+        facing = [other for other in found if other is not own and other.plate.axis() @ own.plate.axis() > 0]
+        for other in sorted(facing, key=lambda d: float(np.linalg.norm(d.plate.eye() - own.plate.eye())))[:OTHERS]:
             row, column, z, inside = other.plate.shown(points)
             there = other.depth[row, column]
             agree += inside & (np.abs(there - z) < AGREE * z)

@@ -66,6 +66,14 @@ class Plate:
         y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
         return torch.stack([(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1], torch.ones_like(x)], -1)
 
+    def eye(self) -> np.ndarray:
+        """Where it was taken, `[3]` in the world."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    def axis(self) -> np.ndarray:
+        """The direction `[3]` in which it looks."""
+        return self.cam_from_world[2, :3]
+
     def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Row, column, depth z and whether in view, each `[...]`, of world points `[..., 3]`; row and column are 0 where not in view."""
         local = points @ self.cam_from_world[:3, :3].T + self.cam_from_world[:3, 3]

@@ -4,7 +4,7 @@ import torch
 from painted import AHEAD, BOARD, SIZE, WALL, board_left, depth_of, drive
 
 from recon import dense, stereo
-from recon.dense import DUG, agreed, cloud_from_pictures, companions, depths, ground_depth
+from recon.dense import DUG, _chosen, agreed, cloud_from_pictures, companions, depths, ground_depth
 from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import Track
@@ -30,7 +30,7 @@ def _started(log):
 @pytest.fixture(scope="module", autouse=True)
 def few_pictures():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dense, "VIEWS", 6)
+        patch.setattr(dense, "VIEWS", (6, 8))
         patch.setattr(stereo, "WIDTH", 160)
         yield
 
@@ -126,6 +126,15 @@ def test_pictures_are_compared_with_those_before_and_after_that_stand_apart_and_
     assert companions(0, plates, 20.0) == [2, 8]
     assert companions(20, plates, 20.0) == []
     assert companions(10, [plates[10]] * 20, 20.0) == []
+
+
+def test_a_long_way_is_looked_at_more_often():
+    flat, lens = torch.zeros(18, 32, 3, dtype=torch.uint8), Pinhole(30, 30, 16, 9)
+    plates = [plate_of(flat, Camera(lens, 32, 18, translation(0.0, 0.0, 0.5 * i))) for i in range(41)]
+    points = [p.eye() + [[0.0, 0.0, z] for z in (5.0, 20.0, 30.0)] for p in plates]
+    assert len(_chosen(plates, points)) == 6  # 20 metres, at 20 metres
+    assert len(_chosen(plates, [(p - q.eye()) / 7 + q.eye() for p, q in zip(points, plates, strict=True)])) == 8
+    assert _chosen(plates, [np.zeros((0, 3))] * 41) == []
 
 
 def test_the_ground_is_as_far_as_rays_have_to_go_to_it():
