@@ -11,6 +11,7 @@ import torch
 
 from recon.fit import FitConfig
 from recon.log import Track
+from recon.measured import Measured
 from recon.start import Start
 from scenes.atomic import atomic_file
 from scenes.camera import RigCamera
@@ -68,7 +69,7 @@ def _plain_start(start: Start) -> dict:
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
-        "measured": start.measured,
+        "measured": [start.measured.views, start.measured.weight],
     }  # fmt: skip
 
 
@@ -96,4 +97,4 @@ def _start(plain: dict, fit: dict) -> Start:
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
-    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, plain["measured"])
+    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, Measured(*plain["measured"]))

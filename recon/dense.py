@@ -9,7 +9,7 @@ import torch
 
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints, Track
-from recon.measured import Measured, by_pictures
+from recon.measured import PICTURES, Measured, by_pictures
 from recon.seed import Cloud, nearest_box, spread
 from recon.stereo import Plate, plate_of, swept
 from render.progress import Progress
@@ -64,7 +64,7 @@ def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: 
     """
     found = depths(log, frames, sparse, ground)
     parts: list[Cloud] = []
-    measured: Measured = {}
+    measured = {}
     for own, mask in zip(found, agreed(found), strict=True):
         camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, frames.width, frames.height)
         clear = mask & _clear(own, camera, movers)
@@ -73,7 +73,7 @@ def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: 
         measured[own.view.camera, own.view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
     if not parts:
         raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
-    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts])), measured
+    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts])), Measured(measured, PICTURES)
 
 
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:

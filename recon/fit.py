@@ -57,8 +57,8 @@ class FitConfig:
     drop: float = 0.0
     """Part of the splats in sight that a step leaves out of its picture, by lot, towards the end; the others are denser for them. Where few
     photos see a place, none may serve one photo alone (DropGaussian, Park et al. 2025)."""
-    depth_weight: float = 0.02
-    """Of depths that are not as measured (`recon/measured.py`)."""
+    depth_weight: float = 1.0
+    """Of depths that are not as measured, times what suits who measured them (`recon/measured.py`)."""
     seed: int = 0
     """Of the order of views."""
 
@@ -153,7 +153,7 @@ class Fit:
         ends = self.motion.readout(view, camera)
         rates = self._rates()
         which, shown = self._in_sight(view, camera, ends, aside, rates)
-        known = self.measured.get((view.camera, view.index)) if self.config.depth_weight else None
+        known = self.measured.views.get((view.camera, view.index)) if self.config.depth_weight else None
         rgb, alpha, depth = self._render(shown, view, camera, ends, known is not None)
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
@@ -161,7 +161,7 @@ class Fit:
         if aside is not None:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
         if known is not None:
-            haze = haze + self.config.depth_weight * mistake(depth, alpha, known)
+            haze = haze + self.config.depth_weight * self.measured.weight * mistake(depth, alpha, known)
         unrest = self.motion.unrest() + self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
         (loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
         self.descent.follow(self.splats, which, shown, rates, self.growth)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,8 +27,19 @@ HIDING, AROUND = 1.1, (9, 5)
 SLACK = 0.05
 """Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""
 
-Measured = dict[tuple[int, int], torch.Tensor]
-"""By a view's camera and index: depth, as the view's lens means it, float16 `[h, w]`, NaN where nobody knows."""
+LIDAR, PICTURES = 0.005, 0.02
+"""What mistakes weigh beside a picture's loss. Lidar is where splats begin, and more would cost held-out pictures more than depth gains: on
+drive 002's front camera 0.13 dB for 2.6 % that become 1.2, and at 0.02 0.23 dB for 0.8. What pictures agree on begins farther off, and
+costs nothing."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """By a view's camera and index: depth, as the view's lens means it, float16 `[h, w]`, NaN where nobody knows; and what a mistake
+    weighs."""
+
+    views: dict[tuple[int, int], torch.Tensor]
+    weight: float
 
 
 def grid_of(camera: Camera) -> Camera:
@@ -43,7 +55,7 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], movers: list[Tra
         k = int(np.abs(times - view.time_us).argmin())
         if abs(int(times[k]) - view.time_us) <= SOON_US:
             near.setdefault(k, []).append(view)
-    measured: Measured = {}
+    measured = {}
     for k, views in near.items():
         static = split_points(log, [sweeps[k]], movers).static
         for view in views:
@@ -53,7 +65,7 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], movers: list[Tra
             np.minimum.at(depth, (row[inside], column[inside]), found[inside])
             hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > nearest_box(camera, movers))
             measured[view.camera, view.index] = _known(np.where(hidden, np.nan, depth))
-    return measured
+    return Measured(measured, LIDAR)
 
 
 def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor:

@@ -40,7 +40,7 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
         (),
     )
     sweep = _sweep(20_000, _wall(12.0, -3, 3), _wall(8.0, 0, 1), _wall(6.0, -4, -2))
-    measured = by_lidar(log, frames, [sweep], [car])
+    measured = by_lidar(log, frames, [sweep], [car]).views
     depth = measured[0, 0].float().numpy()
     known = depth[np.isfinite(depth)]
     far, near = np.abs(known - 12) < 0.05, np.abs(known - 8) < 0.05
@@ -51,10 +51,10 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     assert not (np.abs(board[np.isfinite(board)] - 12) < 0.05)[: near.sum() // 2].all()
     # a lens that sees far aside means the distance
     round_ = replace(log, cameras={"front": replace(log.cameras["front"], lens=Fisheye(100, 100, 160, 90))})
-    distance = by_lidar(round_, frames, [_sweep(20_000, _wall(12.0, -12, 12))], [])[0, 0].float().numpy()
+    distance = by_lidar(round_, frames, [_sweep(20_000, _wall(12.0, -12, 12))], []).views[0, 0].float().numpy()
     assert np.nanmax(distance) == pytest.approx(17.0, abs=0.3) and np.nanmin(distance) == pytest.approx(12.0, abs=0.1)
-    assert (0, 1) in measured and (0, 2) not in by_lidar(log, frames, [_sweep(200_000 - SOON_US - 1, _wall(12.0, -3, 3))], [])
-    assert by_lidar(log, frames, [], []) == {}
+    assert (0, 1) in measured and (0, 2) not in by_lidar(log, frames, [_sweep(200_000 - SOON_US - 1, _wall(12.0, -3, 3))], []).views
+    assert by_lidar(log, frames, [], []).views == {}
 
 
 @pytest.mark.parametrize(
