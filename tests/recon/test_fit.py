@@ -9,9 +9,10 @@ import torch
 from PIL import Image
 
 from recon import open_log, reconstruct, stopped_early
-from recon.build import _span
+from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path
 from recon.fit import Fit, FitConfig
+from recon.measured import Measured, mistake
 from recon.model import Knots, Splats, small_poses
 from render import render_frame
 from render.album import references_of
@@ -146,6 +147,32 @@ def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
         _span(log, names, 5_000_000, None)
     with pytest.raises(ValueError, match="must be positive"):
         _span(log, names, 0, -1)
+
+
+@torch.no_grad()
+def _mistakes(fit):
+    found = []
+    for view in fit.training:
+        camera = fit.motion.camera(view).resized(*SIZE)
+        shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
+        _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), True)
+        found.append(float(mistake(depth, alpha, fit.measured.views[view.camera, view.index])))
+    return np.mean(found)
+
+
+def test_depth_follows_what_was_measured(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    after = []
+    for weight in (0.0, 1.0):
+        _, fit = begin(log, names, span, SIZE, replace(CONFIG, steps=400, depth_weight=weight), 4)
+        assert len(fit.measured.views) == len(fit.training)
+        fit.measured = Measured({k: 1.15 * depth for k, depth in fit.measured.views.items()}, 0.5)
+        before = _mistakes(fit)
+        for _ in range(40):
+            fit.step()
+        after.append(_mistakes(fit) / before)
+    assert after[0] > 0.9 and after[1] < 0.8 * after[0]
 
 
 def test_a_drive_without_lidar_whose_pictures_show_no_features_is_refused(own_drive, tmp_path):
