@@ -142,7 +142,7 @@ class Render:
 
         check_device(self.device)
         scene, warnings = open_view(self.scene, self.drop_invalid)
-        camera = self.camera or next(iter(scene.rig))
+        camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)
         for placement in self.insert:

@@ -10,15 +10,17 @@ import torch
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints, Track
 from recon.measured import PICTURES, Measured, by_pictures
+from recon.project import project
 from recon.seed import Cloud, nearest_box, spread
 from recon.stereo import Plate, plate_of, swept
 from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground
+from scenes.poses import inverse
 
 VIEWS, BETWEEN = (40, 150), 0.15
 """Pictures a camera whose depth is found: from so many, where there are, up to so many, to stand no farther apart on a long way than this
-part of the distance to what they show."""
+part of the distance to what they show; on a longer one in groups."""
 
 OTHERS = 40
 """Pictures, the nearest, that are asked whether they find the same."""
@@ -39,8 +41,9 @@ AGREE, AGREEING = 0.05, 2
 FARTHEST = 1000.0
 """Metres: farther is taken to be there."""
 
-DUG = 0.3
-"""Metres under the ground where things may still be found: it is not known better."""
+DUG, BURIED = 0.3, 0.1
+"""Metres under the ground where things may still be found, since it is not known better; where more than this part of a picture's points
+are under that, it is not known at all."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,24 @@ def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: 
         column, row = np.floor(own.plate.at.numpy()[clear]).astype(np.int64).T
         parts.append(Cloud(own.points()[clear], own.view.image.numpy()[row, column] / 255))
         measured[own.view.camera, own.view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
-    if not parts:
+    if sum(len(p.xyz) for p in parts) < len(sparse.xyz):
+        parts += _points_themselves(log, frames, sparse, movers)
+    if not any(len(p.xyz) for p in parts):
         raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
     return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts])), Measured(measured, PICTURES)
+
+
+def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: list[Track]) -> list[Cloud]:
+    """The sparse points as the training pictures show them, for pictures that stand too far apart to be compared."""
+    made = []
+    for view in frames.training():
+        name = frames.names[view.camera]
+        camera = log.camera(name).camera(view.index, frames.width, frames.height)
+        points = sparse.xyz[sparse.seen[name][view.index]]
+        row, column, depth, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
+        inside &= depth < nearest_box(camera, movers)[row, column]
+        made.append(Cloud(points[inside], view.image.numpy()[row[inside], column[inside]] / 255))
+    return made
 
 
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
@@ -96,8 +114,14 @@ def _chosen(plates: list[Plate], points: list[np.ndarray]) -> list[int]:
     typical = [float(np.median(z)) for z in (_before(*pair) for pair in zip(plates, points, strict=True)) if len(z)]
     if not typical:
         return []
+    far = float(np.median(typical))
     way = np.linalg.norm(np.diff([p.eye() for p in plates], axis=0), axis=1).sum()
-    return spread(range(len(plates)), int(np.clip(way / (BETWEEN * np.median(typical)), *VIEWS)))
+    least, most = VIEWS
+    wanted = int(way / (BETWEEN * far))
+    if wanted <= most:
+        return spread(range(len(plates)), max(wanted, least))
+    # the way is too long for all to have neighbours that could agree: some, and those that they are compared with
+    return sorted({j for i in spread(range(len(plates)), most // 5) for j in (i, *companions(i, plates, far))})
 
 
 def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
@@ -113,8 +137,10 @@ def _depth_of(i: int, plates: list[Plate], points: np.ndarray, ground: Ground) -
     if not others:
         return None
     deepest = ground_depth(plates[i], ground)
+    if (points[:, 2] < ground.height(torch.from_numpy(points[:, :2])).numpy() - DUG).mean() > BURIED:
+        deepest = np.full_like(deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
-    nearest = min(near, 0.95 * float(deepest.min()))
+    nearest = min(near, max(near / 3, 0.95 * float(deepest.min())))
     return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, points, deepest), FARTHEST)
 
 
@@ -129,7 +155,9 @@ def companions(i: int, plates: list[Plate], typical: float) -> list[int]:
             ratio[~(side & along)] = np.inf
             if ratio.min(initial=np.inf) < np.log(ALLOWED):
                 found.append(int(ratio.argmin()))
-    return list(dict.fromkeys(found))
+    apart = np.where(along & (away > 0), away, np.inf)
+    # photos far apart have none at those: the nearest are better than none
+    return list(dict.fromkeys(found)) or [int(j) for j in apart.argsort()[:2] if apart[j] < 1]
 
 
 def ground_depth(plate: Plate, ground: Ground) -> np.ndarray:
@@ -159,14 +187,14 @@ def agreed(found: list[Depths]) -> list[np.ndarray]:
             there = other.depth[row, column]
             agree += inside & (np.abs(there - z) < AGREE * z)
             through += inside & (there > (1 + 2 * AGREE) * z)
-        masks.append((agree >= AGREEING) & (through <= agree) & own.plate.inside)
+        masks.append((agree >= min(AGREEING, max(1, len(facing)))) & (through <= agree) & own.plate.inside)
     return masks
 
 
 def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
     """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
-    column, row = np.floor(own.plate.at.numpy()).astype(np.int64).transpose(2, 0, 1)
-    column, row = np.clip(column, 0, camera.width - 1), np.clip(row, 0, camera.height - 1)
+    x, y = np.nan_to_num(own.plate.at.numpy()).transpose(2, 0, 1)
+    column, row = x.clip(0, camera.width - 1).astype(np.int64), y.clip(0, camera.height - 1).astype(np.int64)
     step = np.array(own.view.image.shape[:2]) / own.view.sky.shape
     clear = ~own.view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
     if not movers:

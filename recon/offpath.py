@@ -42,7 +42,7 @@ def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
 def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequence[float] = SHIFTS) -> list[dict]:
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
-    depth_error: median of |z - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, z being the expected
+    depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, d being the expected
     depth; points: how many those are. holes: share of pixels below the horizon with alpha under 0.9. flicker: mean absolute
     difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
     """

@@ -89,7 +89,11 @@ def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
         low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
         high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
         part = (slice(low[1], high[1]), slice(low[0], high[0]))
-        depth[part] = np.minimum(depth[part], camera.lens.depth(torch.from_numpy(local)).min().item())
+        eye = -pose[:3, :3].T @ pose[:3, 3]
+        away = float(np.linalg.norm(eye - eye.clip(track.size * [-0.5, -0.5, 0], track.size * [0.5, 0.5, 1])))
+        # z is least at a corner; the distance, which some lenses mean by depth, need not be
+        least = float(camera.lens.depth(torch.from_numpy(local)).min())
+        depth[part] = np.minimum(depth[part], min(least, max(away, 0.2)))
     return depth
 
 

@@ -42,8 +42,11 @@ UNSEEN = 0.7
 PINNED = 1.0
 """What it costs the pixel of a known point to be elsewhere."""
 
-UNDERGROUND = 2.0
-"""What it costs to be under the ground."""
+UNDERGROUND, ON_LIMIT = 2.0, 0.25
+"""What it costs to be under the ground, and how many inverse depths above the limit nothing is believed."""
+
+BEYOND = 0.5
+"""Inverse depths up to which things are too far to be told from what moves with the camera."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def plate_of(image: torch.Tensor, camera: Camera) -> Plate:
 
 
 def swept(plate: Plate, others: list[Plate], nearest: float, points: np.ndarray, deepest: np.ndarray) -> np.ndarray:
-    """Depth z `[h, w]` of a plate's pixels as `others`, of its size, tell it; NaN where none of them shows it.
+    """Depth z `[h, w]` of a plate's pixels as `others`, of its size, tell it; NaN where they do not.
 
     nearest: metres to the nearest depth that is tried; points: world points `[N, 3]` that it is known to show; deepest: depth `[h, w]` of
     the ground, infinite above the horizon.
@@ -113,17 +116,16 @@ def swept(plate: Plate, others: list[Plate], nearest: float, points: np.ndarray,
     nowhere = cost == UNSEEN
     _pin(cost, plate, points, step)
     floor = torch.from_numpy(1 / deepest).float() / step
-    under = torch.arange(PLANES) < (floor[..., None] - 1.0)
-    cost += UNDERGROUND * under
-    nowhere |= under
+    cost += UNDERGROUND * (torch.arange(PLANES) < (floor[..., None] - 1.0))
     cost = _smoothed(cost, plate.grey)
     best = cost.argmin(2)
     middle = best.clamp(1, PLANES - 2)
     before, here, after = (cost.gather(2, (middle + d)[..., None])[..., 0] for d in (-1, 0, 1))
     bend = (before + after - 2 * here).clamp_min(1e-6)
     between = torch.where(best == middle, middle + (0.5 * (before - after) / bend).clamp(-0.5, 0.5), best.float())
-    depth = 1 / (between * step).clamp_min(1e-6)
-    return torch.where(nowhere.gather(2, best[..., None])[..., 0], torch.nan, depth).numpy()
+    # what would rather be under the ground lies on the limit in all pictures, and what moves with the camera seems infinitely far in all
+    known = ~nowhere.gather(2, best[..., None])[..., 0] & (between > floor + ON_LIMIT) & (between > BEYOND)
+    return torch.where(known, 1 / (between * step).clamp_min(1e-6), torch.nan).numpy()
 
 
 def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ from recon import dense, stereo
 from recon.dense import DUG, _chosen, agreed, cloud_from_pictures, companions, depths, ground_depth
 from recon.frames import load_frames
 from recon.ground import estimate_ground
-from recon.log import Track
+from recon.log import SparsePoints, Track
 from recon.stereo import plate_of
 from recon.triangulate import triangulated
 from scenes.camera import Camera
@@ -30,7 +30,7 @@ def _started(log):
 @pytest.fixture(scope="module", autouse=True)
 def few_pictures():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dense, "VIEWS", (6, 8))
+        patch.setattr(dense, "VIEWS", (6, 10))
         patch.setattr(stereo, "WIDTH", 160)
         yield
 
@@ -133,7 +133,8 @@ def test_a_long_way_is_looked_at_more_often():
     plates = [plate_of(flat, Camera(lens, 32, 18, translation(0.0, 0.0, 0.5 * i))) for i in range(41)]
     points = [p.eye() + [[0.0, 0.0, z] for z in (5.0, 20.0, 30.0)] for p in plates]
     assert len(_chosen(plates, points)) == 6  # 20 metres, at 20 metres
-    assert len(_chosen(plates, [(p - q.eye()) / 7 + q.eye() for p, q in zip(points, plates, strict=True)])) == 8
+    # 20 metres, at 3 metres: the ends, and what they are compared with
+    assert _chosen(plates, [(p - q.eye()) / 7 + q.eye() for p, q in zip(points, plates, strict=True)]) == [0, 1, 39, 40]
     assert _chosen(plates, [np.zeros((0, 3))] * 41) == []
 
 
@@ -148,3 +149,50 @@ def test_the_ground_is_as_far_as_rays_have_to_go_to_it():
     np.testing.assert_allclose(found[below], rays[below] * (eye + DUG) / eye, rtol=1e-3)
     assert np.isinf(found[:40]).all()
     assert (found[50:] > 0).all()
+
+
+def _exact(log, frames):
+    """As if structure from motion had found points all over the first plates: what the painted drive really shows."""
+    seen, xyz = {}, []
+    for name in frames.names:
+        seen[name] = [np.zeros(0, np.int64)] * len(log.camera(name))
+        for view in frames.training():
+            camera = log.camera(name).camera(view.index, 32, 18)
+            depth = depth_of(camera)
+            rays = camera.lens.unproject(camera.pixel_centres()) * depth[..., None]
+            pose = camera.world_from_cam
+            points = (rays.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3])[depth.flatten() < 100].numpy()
+            seen[name][view.index] = sum(map(len, xyz)) + np.arange(len(points))
+            xyz.append(points)
+    return SparsePoints(np.concatenate(xyz), {name: tuple(of) for name, of in seen.items()})
+
+
+def test_a_ground_that_is_wrong_makes_no_depths():
+    log = drive(STEPS, ("front",))
+    frames = load_frames(log, ["front"], ALL, SIZE, 8)
+    points = _exact(log, frames)
+    few = SparsePoints(points.xyz, {"front": tuple(s[(points.xyz[s, 2] > 0.2)] for s in points.seen["front"])})  # none on the ground
+    for up, shown in ((0.5, few), (0.9, points), (30.0, points)):
+        errors, share = _off((log, frames, shown, Ground(torch.full((400, 400), up), (-100.0, -100.0), 0.5)))
+        assert (errors < 0.1).mean() > 0.95 and share.mean() > 0.15, up
+
+
+def test_what_moves_with_the_camera_is_not_believed():
+    log = drive(STEPS, ("front",))
+    frames = load_frames(log, ["front"], ALL, SIZE, 8)
+    stamp = torch.randint(0, 255, (40, 80, 3), generator=torch.Generator().manual_seed(2), dtype=torch.uint8)
+    for view in frames.views:
+        view.image[:40, 120:200] = stamp
+    points = _exact(log, frames)
+    found = depths(log, frames, points, estimate_ground(points.xyz, log.ego))
+    believed = np.mean([mask[2:18, 62:98] for mask in agreed(found)])
+    assert believed < 0.1
+
+
+def test_pictures_far_apart_and_few_begin_with_what_there_is():
+    for steps in ([0.0, 8.0], [0.0, 0.8], [0.0, 9.0, 9.0]):
+        log = drive(steps, ("front",))
+        frames = load_frames(log, ["front"], ALL, SIZE, 0)
+        points = _exact(log, frames)
+        cloud, _ = cloud_from_pictures(log, frames, points, estimate_ground(points.xyz, log.ego), [])
+        assert len(cloud.xyz) >= 300, steps
