@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 
 from recon.actors import split_points
@@ -88,9 +89,8 @@ def _known(depth: np.ndarray) -> torch.Tensor:
 def mistake(depth: torch.Tensor, alpha: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
     """What rendered depth `[H, W]` costs that is not as measured `[h, w]`, mean over what is known and drawn (the logarithm of Turkulainen
     et al. 2024, "DN-Splatter", of relative errors): 0 for none, 0.7 at `SLACK`."""
-    (height, width), (h, w) = depth.shape, measured.shape
-    rows, columns = ((torch.arange(n) + 0.5) * (of / n) for n, of in ((h, height), (w, width)))
-    shown, solid = (m[rows.long()[:, None], columns.long()] for m in (depth, alpha.detach()))
+    # unlike indexing, whose gradients several threads add up in any order where a picture is smaller than the grid
+    shown, solid = F.interpolate(torch.stack([depth, alpha.detach()])[None], measured.shape, mode="nearest-exact")[0]
     measured = measured.float()
     known = measured.isfinite() & (solid > 0.5) & shown.isfinite()
     off = (torch.where(known, shown, 1.0) / torch.where(known, measured, 1.0) - 1).abs()
