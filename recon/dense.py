@@ -25,10 +25,10 @@ part of the distance to what they show; on a longer one in groups."""
 OTHERS = 40
 """Pictures, the nearest, that are asked whether they find the same."""
 
-BASELINES = (0.06, 0.2)
-"""Distances to the pictures that one is compared with, before and after it, in distances to what it shows; each by `ALLOWED` at most."""
+BASELINES, ALLOWED = (0.06, 0.2), 2.5
+"""Distances to the pictures that one is compared with, before and after it, in distances to what it shows; and how many times more or less
+is allowed."""
 
-ALLOWED = 2.5
 NEARER = 0.6
 """Part of the distance to the nearest points from which on depths are tried: between the points there may be something nearer."""
 
@@ -195,8 +195,7 @@ def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
     """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
     x, y = np.nan_to_num(own.plate.at.numpy()).transpose(2, 0, 1)
     column, row = x.clip(0, camera.width - 1).astype(np.int64), y.clip(0, camera.height - 1).astype(np.int64)
-    step = np.array(own.view.image.shape[:2]) / own.view.sky.shape
-    clear = ~own.view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+    clear = ~own.view.is_sky(row, column)
     if not movers:
         return clear
     depth = camera.lens.depth(own.plate.rays().double() * torch.from_numpy(own.depth)[..., None]).numpy()

@@ -160,7 +160,7 @@ class Fit:
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if aside is not None:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
-        if known is not None:
+        if known is not None and depth is not None:
             haze = haze + self.config.depth_weight * self.measured.weight * mistake(depth, alpha, known)
         unrest = self.motion.unrest() + self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
         (loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
@@ -185,12 +185,14 @@ class Fit:
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         return which, self.splats.select(which, self.sh_count())
 
-    def _render(self, shown: Splats, view: View, camera: Camera, ends: list[Moment], with_depth: bool) -> tuple[torch.Tensor, ...]:
-        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and its depth, or nothing."""
+    def _render(
+        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], with_depth: bool
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted."""
         placed = self._placed(self._drawn_by_lot(shown), view, camera)
         rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
-        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha, *(depth or [alpha])
+        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha, depth[0] if depth else None
 
     def _drawn_by_lot(self, shown: Splats) -> Splats:
         """Without `drop` of them, which rises over the first four fifths of the fit; the mean of all draws is as dense as all are."""

@@ -43,6 +43,11 @@ class View:
     held_out: bool
     sky: torch.Tensor
 
+    def is_sky(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Whether pixels of the image are surely sky, bool of the shape of `row` and `column`."""
+        step = np.array(self.image.shape[:2]) / self.sky.shape
+        return self.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+
 
 @dataclass(frozen=True)
 class Frames:

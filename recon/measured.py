@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy import ndimage
 
-from recon.actors import split_points
+from recon.actors import Split
 from recon.frames import Frames, View
 from recon.log import Log, Sweep, Track
 from recon.project import project
@@ -48,8 +48,8 @@ def grid_of(camera: Camera) -> Camera:
     return camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
 
 
-def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], movers: list[Track]) -> Measured:
-    """What the sweep nearest to each training view measured of what stands still, and no mover hides."""
+def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split, movers: list[Track]) -> Measured:
+    """What the sweep nearest to each training view measured of what stands still, and no mover hides; split: the sweeps' points."""
     times = np.array([s.time_us for s in sweeps])
     near: dict[int, list[View]] = {}
     for view in frames.training() if len(times) else []:
@@ -58,7 +58,7 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], movers: list[Tra
             near.setdefault(k, []).append(view)
     measured = {}
     for k, views in near.items():
-        static = split_points(log, [sweeps[k]], movers).static
+        static = split.static[split.static_sweep == sweeps[k].index]
         for view in views:
             camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
             row, column, found, inside = project(static, inverse(camera.world_from_cam).numpy(), camera)

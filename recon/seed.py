@@ -65,8 +65,7 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
             if movers:
                 seen &= z <= nearest_box(cam, movers)[row, column]
             # a point whose pixel is sky stands on an edge that the pixel misses
-            step = np.array(view.image.shape[:2]) / view.sky.shape
-            seen &= ~view.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+            seen &= ~view.is_sky(row, column)
             out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
     return out
 

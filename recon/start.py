@@ -84,7 +84,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
         known = np.isfinite(rgb[:, 0])
         if not known.any():
             raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
-        cloud, measured = Cloud(split.static[known], rgb[known]), by_lidar(log, frames, sweeps, movers)
+        cloud, measured = Cloud(split.static[known], rgb[known]), by_lidar(log, frames, sweeps, split, movers)
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())

@@ -132,13 +132,13 @@ def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> t
     """1 - correlation `[h, w, D]`, the mean of the better half of the others (they may not see the place); `UNSEEN` where none shows it."""
     h, w = plate.grey.shape
     rays = plate.rays().contiguous()
+    motions = [torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float() for other in others]
+    rays_there = [(rays @ motion[:3, :3].T).movedim(2, 0) for motion in motions]
     mean, spread = _moments(plate.grey[None])
     costs = torch.empty(h, w, len(inverse_depths))
     for k, part in enumerate(inverse_depths.split(CHUNK)):
         best = second = torch.full((len(part), h, w), 2.0)
-        for other in others:
-            motion = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
-            turned = (rays @ motion[:3, :3].T).movedim(2, 0)
+        for other, motion, turned in zip(others, motions, rays_there, strict=True):
             x, y, z = (turned[axis] + part[:, None, None] * motion[axis, 3] for axis in range(3))
             behind = 1 / z.clamp_min(1e-3)
             u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
