@@ -162,7 +162,7 @@ def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
 
 def view(tensor: torch.Tensor, dtype) -> object:
     """A torch tensor as a Warp array of `dtype`, no copy, no Python object: what `run` takes."""
-    return wp.from_torch(tensor.detach(), dtype=_WARP_TYPES.get(dtype, dtype), return_ctype=True)
+    return wp.from_torch(tensor.detach(), dtype=_WARP_TYPES.get(dtype, dtype), requires_grad=False, return_ctype=True)
 
 
 def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int) -> None:

@@ -6,17 +6,18 @@ any light passes. Keys are as on the CPU (`ray_rows.py`): a place as a whole num
 the list's own places are the keys, and a round begins where the one before it ended.
 
 Backward peels from the back and leaves each entry's weight and derivative at each pixel in memory of the block's, a segment of the list at
-a time; then the block sums them up entry by entry, as in the tiles' order. How many rounds pay against how many registers only a GPU can
-tell: HELD was never measured on one.
+a time; then the block sums them up by groups of entries, as in the tiles' order.
 """
 
 from functools import cache
 
 import warp as wp
 
-from render.kernels.pixel_sight import OPTIONS, Behind, gradient_sums, pixel_functions, pixel_layers, pixel_of, pixel_unlayering
+from render.kernels.block_sums import channel_sums, gradient_sums
+from render.kernels.pixel_sight import OPTIONS, Behind, pixel_functions, pixel_layers, pixel_of, pixel_unlayering, warp_of
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import OPACITY, Wanted, Window, Z
+from render.kernels.warps import ballot, record_of
 
 HELD = wp.constant(16)
 MOST_SPLATS = 1 << 25
@@ -53,7 +54,7 @@ def next_entries(ray: bool, eyes: bool):
         while k < count:
             n = wp.where(way > 0, k, count - 1 - k)
             i = ids[start + n]
-            e = faded(records, frames, rays, i, x, y)
+            e = faded(record_of(records, i), frames, rays, i, x, y)
             if e > 0.0:
                 place = wp.int64(0)
                 if settled == 0:
@@ -120,7 +121,8 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
                 if p.t < termination:
                     break
                 i = ids[start + entry_of(keys[m])]
-                p = lay(p, i, wp.min(records[i, OPACITY] * fades[m], alpha_max), records, features, channels, planes, px, py)
+                r = record_of(records, i)
+                p = lay(p, r, i, wp.min(r[OPACITY] * fades[m], alpha_max), features, channels, planes, px, py)
                 drawn = keys[m]
             if settled[tile] == 0:
                 k = int(0)
@@ -135,7 +137,9 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
     """The backward kernel; arguments as of `composite_blocks_gradient`, `blocks` blocks in all."""
     pixel = pixel_of(tile_size)
     take_off = pixel_unlayering(wanted)
-    add_up = gradient_sums(wanted, ray, eyes)
+    lanes, _, _ = warp_of(tile_size)
+    lay_down, write = gradient_sums(wanted, ray, eyes, tile_size)
+    write_channels = channel_sums(wanted)
     find = next_entries(ray, eyes)
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
@@ -168,17 +172,28 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
                     keys, fades, held, k = find(k, beyond, -1, start, count, settled[tile], far, x, y, ids, records, frames, rays)
                     for m in range(held):
                         n = entry_of(-keys[m])
-                        b = take_off(b, ids[start + n], fades[m], alpha_max, records, features, channels, grads, px, py)
+                        i = ids[start + n]
+                        b = take_off(b, record_of(records, i), i, fades[m], alpha_max, features, channels, grads, px, py)
                         if n >= first and n < first + segment:
                             pushes[block, n - first, thread] = wp.vec2(b.w, b.de)
                         beyond = keys[m]
                     if settled[tile] == 0:
                         k = int(0)
-                for n in range(here):
-                    push = pushes[block, n, thread]
-                    add_up(
-                        ids[start + first + n], slot_of[start + first + n], thread, x, y, px, py, push[0], push[1],
-                        records, frames, rays, channels, grads, slots, channel_slots, frame_slots, g_rays,
-                    )  # fmt: skip
+                for group in range(0, here, wp.static(lanes)):
+                    entries = wp.min(here - group, wp.static(lanes))
+                    seen = int(0)
+                    for entry in range(entries):
+                        push = pushes[block, group + entry, thread]
+                        if ballot(push[0] != 0.0 or push[1] != 0.0) != 0:
+                            seen = seen | (1 << entry)
+                            i = ids[start + first + group + entry]
+                            r = record_of(records, i)
+                            lay_down(entry, i, r, thread, x, y, px, py, push[0], push[1], frames, rays, grads, g_rays)
+                    at = start + first + group
+                    write(seen, at, at + entries, thread, slot_of, slots, frame_slots)
+                    if wp.static(wanted.channels):
+                        for entry in range(entries):
+                            push = pushes[block, group + entry, thread]
+                            write_channels(push[0], slot_of[at + entry], thread, px, py, channels, grads, channel_slots)
 
     return order_blocks_backward

@@ -1,28 +1,18 @@
 """What one pixel sees of a splat, for CUDA, where a thread is a pixel: as `ray_rows.py` has it for a row.
 
-A tile's size is a parameter of all that is made here and in `composite_cuda.py`, `composite_cuda_order.py`: with tiles of one pixel and
-blocks of one thread the same kernels run on the CPU, where the tests hold them against the lane kernels and the oracle.
+A warp's threads are a patch of 8 x 4 pixels, so that few warps have to do with a small splat. A tile's size is a parameter of all that is
+made here and in `composite_cuda.py`, `composite_cuda_order.py`: with tiles of one pixel and blocks of one thread the same kernels run on
+the CPU, where the tests hold them against the lane kernels and the oracle.
 """
 
 from functools import cache
 
 import warp as wp
 
-from render.kernels.canonical import CENTRE, GROUP, MOVED
+from render.kernels.canonical import GROUP, MOVED
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     BLUE,
-    G_BLUE,
-    G_GREEN,
-    G_H,
-    G_K,
-    G_M,
-    G_OPACITY,
-    G_RED,
-    G_X,
-    G_Y,
-    G_Z,
-    GRADIENTS,
     GREEN,
     INSTANCE,
     MEDIAN,
@@ -41,24 +31,32 @@ from render.kernels.types import (
     Y,
     Z,
 )
+from render.kernels.warps import LANES, vec_record
 
 OPTIONS = {"enable_backward": False}
 NONE = wp.constant(wp.float64(0.0))
 FRAME_GRADIENTS = 12
 """Of A row major and p."""
+EDGE = wp.constant(0.05)  # pixels: a patch is widened by this, so that rounding never drops a pixel that the exponent admits
 
-vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float32)
-vec_frame = wp.types.vector(length=FRAME_GRADIENTS, dtype=wp.float64)
+
+def warp_of(tile_size: int) -> tuple[int, int, int]:
+    """Threads of a warp, and columns and rows of its patch of a tile."""
+    return (LANES, 8, 4) if tile_size > 1 else (1, 1, 1)
 
 
 @cache
 def pixel_of(tile_size: int):
     """The function that says where a thread's pixel lies: column and row in its window, and its centre in the image."""
+    lanes, wide, high = warp_of(tile_size)
 
     @wp.func
     def pixel(window: Window, tile: int, thread: int):
-        px = (tile % window.tiles_x) * wp.static(tile_size) + thread % wp.static(tile_size)
-        py = (tile // window.tiles_x) * wp.static(tile_size) + thread // wp.static(tile_size)
+        warp = thread // wp.static(lanes)
+        lane = thread % wp.static(lanes)
+        across = wp.static(tile_size // wide)  # patches
+        px = (tile % window.tiles_x) * wp.static(tile_size) + warp % across * wp.static(wide) + lane % wp.static(wide)
+        py = (tile // window.tiles_x) * wp.static(tile_size) + warp // across * wp.static(high) + lane // wp.static(wide)
         x = float(window.left * wp.static(tile_size) + px) + 0.5
         y = float(window.top * wp.static(tile_size) + py) + 0.5
         return px, py, x, y
@@ -67,10 +65,43 @@ def pixel_of(tile_size: int):
 
 
 @wp.func
-def from_ridge(records: wp.array2d[float], i: int, x: float, y: float):
+def from_ridge(r: vec_record, x: float, y: float):
     """dx - M dy and dy of the pixel centre x, y."""
-    dy = (y - records[i, Y]) - records[i, Y_REST]
-    return (x - records[i, X]) - records[i, X_REST] - records[i, M] * dy, dy
+    dy = (y - r[Y]) - r[Y_REST]
+    return (x - r[X]) - r[X_REST] - r[M] * dy, dy
+
+
+@cache
+def patch_meets(tile_size: int):
+    """The function that says whether a splat's conic, which bounds it along rays, too, reaches the patch of pixels whose first is centred
+    on x, y: the least of a convex s over a rectangle, which is at its middle or on an edge."""
+    _, wide, high = warp_of(tile_size)
+
+    @wp.func
+    def meets(r: vec_record, x: float, y: float):
+        left = x - r[X] - EDGE
+        top = y - r[Y] - EDGE
+        right = left + wp.static(wide - 1.0) + 2.0 * EDGE
+        bottom = top + wp.static(high - 1.0) + 2.0 * EDGE
+        k2 = r[K] * r[K]
+        m = r[M]
+        h = r[H]
+        least = float(0.0)
+        if left > 0.0 or right < 0.0 or top > 0.0 or bottom < 0.0:
+            above = wp.clamp(m * top, left, right) - m * top
+            below = wp.clamp(m * bottom, left, right) - m * bottom
+            slope = k2 * m / (k2 * m * m + h)
+            dy_left = wp.clamp(slope * left, top, bottom)
+            dy_right = wp.clamp(slope * right, top, bottom)
+            on_left = left - m * dy_left
+            on_right = right - m * dy_right
+            least = wp.min(
+                wp.min(k2 * above * above + h * top * top, k2 * below * below + h * bottom * bottom),
+                wp.min(k2 * on_left * on_left + h * dy_left * dy_left, k2 * on_right * on_right + h * dy_right * dy_right),
+            )
+        return not least > r[S_MAX]  # what is no number is looked at
+
+    return meets
 
 
 @wp.func
@@ -107,7 +138,7 @@ def pixel_functions(ray: bool, eyes: bool):
         return a * ray_at(rays, group, 0, x, y), q
 
     @wp.func
-    def faded(records: wp.array2d[float], frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], i: int, x: float, y: float):
+    def faded(r: vec_record, frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], i: int, x: float, y: float):
         s = float(0.0)
         if wp.static(ray):
             u, q = canonical(frames, rays, i, x, y)
@@ -115,14 +146,14 @@ def pixel_functions(ray: bool, eyes: bool):
             m = q - (along / wp.max(wp.dot(u, u), LEAST)) * u
             s = float(wp.dot(m, m) * wp.float64(0.5))
             # neither behind the ray's begin, nor on the other side of an image that closes on itself
-            if not (along > NONE and wp.abs(x - records[i, X]) < records[i, X_REST]):
-                s = records[i, S_MAX]
+            if not (along > NONE and wp.abs(x - r[X]) < r[X_REST]):
+                s = r[S_MAX]
         else:
-            offset, dy = from_ridge(records, i, x, y)
-            u = offset * records[i, K]
-            s = u * u + records[i, H] * dy * dy
+            offset, dy = from_ridge(r, x, y)
+            u = offset * r[K]
+            s = u * u + r[H] * dy * dy
         e = float(0.0)
-        if s < records[i, S_MAX]:
+        if s < r[S_MAX]:
             e = wp.exp(-s)
         return e
 
@@ -158,13 +189,13 @@ def pixel_layers(wanted: Wanted):
 
     @wp.func
     def lay(
-        p: Pixel, i: int, a: float, records: wp.array2d[float], features: wp.array2d[float], channels: int,
+        p: Pixel, r: vec_record, i: int, a: float, features: wp.array2d[float], channels: int,
         planes: wp.array3d[float], px: int, py: int,
     ):  # fmt: skip
         w = p.t * a
-        p.colour += w * wp.vec3(records[i, RED], records[i, GREEN], records[i, BLUE])
+        p.colour += w * wp.vec3(r[RED], r[GREEN], r[BLUE])
         if wp.static(wanted.depth):
-            p.z += w * records[i, Z]
+            p.z += w * r[Z]
             p.weights += w
         if wp.static(wanted.channels):
             for c in range(channels):
@@ -172,11 +203,11 @@ def pixel_layers(wanted: Wanted):
                 planes[k, py, px] = planes[k, py, px] + w * features[i, c]
         if wp.static(wanted.median):  # noqa: SIM102 - a static branch and a dynamic one
             if p.t >= 0.5 and p.t - w < 0.5:
-                p.median = records[i, Z]
+                p.median = r[Z]
         if wp.static(wanted.instance):  # noqa: SIM102 - a static branch and a dynamic one
             if w > p.most:
                 p.most = w
-                p.who = records[i, INSTANCE]
+                p.who = r[INSTANCE]
         p.t -= w
         return p
 
@@ -214,95 +245,23 @@ def pixel_unlayering(wanted: Wanted):
 
     @wp.func
     def take_off(
-        b: Behind, i: int, e: float, alpha_max: float, records: wp.array2d[float], features: wp.array2d[float], channels: int,
+        b: Behind, r: vec_record, i: int, e: float, alpha_max: float, features: wp.array2d[float], channels: int,
         grads: wp.array3d[float], px: int, py: int,
     ):  # fmt: skip
         """e: its exp(-s). With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j: dL/da_i = T_i d_i - rest_i / (1 - a_i)."""
-        full = records[i, OPACITY] * e
+        full = r[OPACITY] * e
         a = wp.min(full, alpha_max)
         inverse = 1.0 / (1.0 - a)
         b.t = b.t * inverse
         b.w = b.t * a
-        d = grads[1, py, px] * records[i, RED] + grads[2, py, px] * records[i, GREEN] + grads[3, py, px] * records[i, BLUE]
+        d = grads[1, py, px] * r[RED] + grads[2, py, px] * r[GREEN] + grads[3, py, px] * r[BLUE]
         if wp.static(wanted.channels):
             for c in range(channels):
                 d += grads[wp.static(wanted.first_channel) + c, py, px] * features[i, c]
         if wp.static(wanted.depth):
-            d += grads[4, py, px] * records[i, Z] + grads[5, py, px]
+            d += grads[4, py, px] * r[Z] + grads[5, py, px]
         b.de = wp.where(full < alpha_max, (b.t * d - b.rest * inverse) * e, 0.0)
         b.rest += b.w * d
         return b
 
     return take_off
-
-
-@cache
-def gradient_sums(wanted: Wanted, ray: bool, eyes: bool):
-    """The function with which a block sums an entry's gradient over its pixels, and its first thread writes it to the entry's slot: no
-    atomics, so the same bits every time. All threads of the block must call it, whether or not their pixel saw the splat."""
-    canonical, _ = pixel_functions(ray, eyes)
-
-    @wp.func
-    def add_up(
-        i: int, slot: int, thread: int, x: float, y: float, px: int, py: int, w: float, de: float,
-        records: wp.array2d[float], frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], channels: int, grads: wp.array3d[float],
-        slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array4d[wp.float64],
-    ):  # fmt: skip
-        """w: the splat's weight at this pixel; de: d loss / d alpha times exp(-s), 0 where alpha is clamped."""
-        ds = -records[i, OPACITY] * de
-        sums = vec_gradients()
-        sums[G_OPACITY] = de
-        sums[G_RED] = w * grads[1, py, px]
-        sums[G_GREEN] = w * grads[2, py, px]
-        sums[G_BLUE] = w * grads[3, py, px]
-        if wp.static(wanted.depth):
-            sums[G_Z] = w * grads[4, py, px]
-        if wp.static(ray):
-            # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
-            u, q = canonical(frames, rays, i, x, y)
-            t = wp.dot(u, q) / wp.max(wp.dot(u, u), LEAST)
-            m = wp.float64(ds) * (q - t * u)
-            pushed = wp.transpose(frame_of(frames, i)) * m
-            group = int(0)
-            missed = wp.vec3d(frames[i, CENTRE], frames[i, CENTRE + 1], frames[i, CENTRE + 2])
-            if wp.static(eyes):
-                group = int(frames[i, GROUP])
-                missed = missed - ray_at(rays, group, 3, x, y)
-            missed = missed - t * ray_at(rays, group, 0, x, y)
-            row = int(y)
-            column = int(x)
-            of_frame = vec_frame()
-            for c in range(3):
-                for r in range(3):
-                    of_frame[3 * r + c] = m[r] * missed[c]
-                of_frame[CENTRE + c] = pushed[c]
-                if ds != 0.0 and row < rays.shape[2] and column < rays.shape[3]:  # a pixel's rays are its thread's alone
-                    g_rays[group, c, row, column] = g_rays[group, c, row, column] - t * pushed[c]
-                    if wp.static(eyes):
-                        g_rays[group, 3 + c, row, column] = g_rays[group, 3 + c, row, column] - pushed[c]
-            frame_total = wp.tile_sum(wp.tile(of_frame, preserve_type=True))[0]
-            if thread == 0:
-                for c in range(wp.static(FRAME_GRADIENTS)):
-                    frame_slots[slot, c] = float(frame_total[c])
-        else:
-            k = records[i, K]
-            m = records[i, M]
-            h = records[i, H]
-            offset, dy = from_ridge(records, i, x, y)
-            sums[G_X] = -2.0 * k * k * offset * ds
-            sums[G_Y] = (2.0 * k * k * m * offset - 2.0 * h * dy) * ds
-            sums[G_K] = 2.0 * k * offset * offset * ds
-            sums[G_M] = -2.0 * k * k * offset * dy * ds
-            sums[G_H] = dy * dy * ds
-        # reading a tile's sum is a barrier of the whole block: it must not stand where only some threads come by
-        total = wp.tile_sum(wp.tile(sums, preserve_type=True))[0]
-        if thread == 0:
-            for c in range(wp.static(GRADIENTS)):
-                slots[slot, c] = total[c]
-        if wp.static(wanted.channels):
-            for c in range(channels):
-                of_channel = wp.tile_sum(wp.tile(w * grads[wp.static(wanted.first_channel) + c, py, px]))[0]
-                if thread == 0:
-                    channel_slots[slot, c] = of_channel
-
-    return add_up

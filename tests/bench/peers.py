@@ -2,8 +2,9 @@
 
     python -m tests.bench.peers [--only NAME,NAME] [--drive FOLDER] [--lund FOLDER] [--repeat 30] [--json FILE]
 
-Peers that cannot be imported are left out, with the reason. gsplat and gswarp are given opacities, scales and quaternions as they take
-them, so that what turns ours into those (exp, sigmoid, normalising) counts for us alone. "ours, recorded" replays a CUDA graph.
+Each library runs in a process of its own, so that a crash is its own; what cannot be imported says why in its row. gsplat and gswarp are
+given opacities, scales and quaternions as they take them, so that what turns ours into those (exp, sigmoid, normalising) counts for us
+alone. "ours, recorded" replays a CUDA graph.
 
 Error is against our own kernels with a budget of 1/4096 and every pixel's own order, of the same projection and response: mean absolute
 and 99.9th percentile of colour. Nothing here asserts a time.
@@ -15,7 +16,9 @@ import argparse
 import json
 import math
 import statistics
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -170,16 +173,17 @@ def step(way: Way, weights: torch.Tensor) -> None:
         leaf.grad = None
 
 
-def measure(name: str, preset: Preset, repeat: int) -> list[dict]:
+def measure(name: str, preset: Preset, library: str, repeat: int) -> Iterator[dict]:
+    """Rows of one library's ways."""
     g, camera = whole(preset), replace(preset.camera, world_from_cam_end=None, shutter="global")
     if not isinstance(camera.lens, Pinhole):
         camera = replace(camera, lens=Pinhole(camera.lens.fx, camera.lens.fy, camera.lens.cx, camera.lens.cy))
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0)).cuda()
     truths: dict[SplatModel, torch.Tensor] = {}
-    rows = []
     for way_name, make in WAYS.items():
+        if way_name.split(",")[0] != library:
+            continue
         row: dict = {"preset": name, "splats": len(g), "size": f"{camera.width}x{camera.height}", "way": way_name}
-        rows.append(row)
         try:
             way = make(g, camera)
             rgb = way.forward()
@@ -196,8 +200,7 @@ def measure(name: str, preset: Preset, repeat: int) -> list[dict]:
             row["memory"] = torch.cuda.max_memory_allocated() - held
         except Exception as error:  # noqa: BLE001 - a peer's failure is a row of the table
             row["missing"] = f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"[:160]
-        torch.cuda.empty_cache()
-    return rows
+        yield row
 
 
 def table(rows: list[dict]) -> str:
@@ -222,16 +225,28 @@ def main() -> None:
     parser.add_argument("--lund", type=Path, help="a scene folder of lund")
     parser.add_argument("--repeat", type=int, default=30)
     parser.add_argument("--json", type=Path, help="write all rows here")
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if not torch.cuda.is_available():
         raise SystemExit("this benchmark needs a CUDA GPU; python -m tests.bench.speed measures on the CPU")
-    rows: list[dict] = []
     makers = presets(args.drive, args.lund)
-    for name in args.only.split(",") if args.only else makers:
-        try:
-            rows += measure(name, makers[name](), args.repeat)
-        except Missing as missing:
-            print(f"{name}: {missing}")
+    names = args.only.split(",") if args.only else list(makers)
+    if args.worker:
+        for name in names:
+            try:
+                for row in measure(name, makers[name](), args.worker, args.repeat):
+                    print(json.dumps(row), flush=True)
+            except Missing as missing:
+                print(f"{name}: {missing}", file=sys.stderr)
+        return
+    rows: list[dict] = []
+    for library in dict.fromkeys(way.split(",")[0] for way in WAYS):
+        command = [sys.executable, "-m", "tests.bench.peers", *sys.argv[1:], "--worker", library]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        rows += [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+        if done.returncode:
+            print(f"{library} broke off with exit code {done.returncode}; what stood on stderr says why")
+    rows.sort(key=lambda row: (names.index(row["preset"]), list(WAYS).index(row["way"])))
     card, driver = torch.cuda.get_device_name(), torch.version.cuda
     print(f"{card}, CUDA {driver}, torch {torch.__version__}, median of {args.repeat} single frames\n\n{table(rows)}")
     if args.json:

@@ -10,7 +10,7 @@ import warp as wp
 from recon.kernels import descent as descent_kernels
 from recon.kernels import develop as develop_kernels
 from recon.kernels import sight as sight_kernels
-from render import block_compositing, compositing, rasterize
+from render import block_compositing, rasterize
 from render.block_compositing import draw_blocks, draw_blocks_backward
 from render.bridge import Rasterize
 from render.canonical import canonical_frames
@@ -223,19 +223,6 @@ def drawn(way: str, device: str):
     frame = rasterize(placed, CAMERA, ("rgb", "alpha", "depth", "instance"), model=model, config=config)
     frame.rgb.square().sum().backward()
     return frame, [t.grad.cpu() for p in placed for t in p.gaussians.tensors().values()]
-
-
-@pytest.mark.parametrize("way", ["by tile", "along rays by pixel"])
-def test_blocks_of_a_tiles_threads_draw_what_lanes_draw(way, monkeypatch):
-    """256 threads a block, barriers and all, which Warp runs on the CPU as fibers: what a GPU would do, but for its own rounding."""
-    here, g_here = drawn(way, "cpu")
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setattr(compositing, "by_blocks", lambda device: True)
-    (there, g_there), (_, again) = drawn(way, "cpu"), drawn(way, "cpu")
-    assert all(torch.equal(a, b) for a, b in zip(g_there, again, strict=True)), "not the same bits twice"
-    assert (here.rgb - there.rgb).abs().max() < 1e-3 and (here.rgb - there.rgb).abs().mean() < 1e-5
-    for a, b in zip(g_here, g_there, strict=True):
-        assert (a - b).abs().max() < 1e-3 * a.abs().max()
 
 
 @ON_A_GPU

@@ -58,8 +58,9 @@ def a_render_interrupted_at_any_stage(device: str) -> list[str]:
     def fail(*_arguments, **_more):
         raise KeyboardInterrupt
 
+    backward = "draw_blocks_backward" if compositing.by_blocks(torch.device(device)) else "_composite_backward"
     stages = [(bridge, "run_each"), (bridge, "depth_order"), (compositing, "tile_lists"), (compositing, "_composite")]
-    for room, stage in [*stages, (compositing, "_composite_backward"), (compositing, "_of_part")]:
+    for room, stage in [*stages, (compositing, backward), (compositing, "_of_part")]:
         kept = getattr(room, stage)
         setattr(room, stage, fail)
         try:
