@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.canonical import CENTRE, GROUP
-from render.kernels.pixel_sight import FRAME_GRADIENTS, frame_of, from_ridge, pixel_functions, ray_at, warp_of
+from render.kernels.pixel_sight import FRAME_GRADIENTS, Behind, frame_of, from_ridge, pixel_functions, ray_at, warp_of
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     G_BLUE,
@@ -59,19 +59,18 @@ def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
 
     @wp.func
     def lay_down(
-        entry: int, i: int, r: vec_record, thread: int, x: float, y: float, px: int, py: int, w: float, de: float,
-        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], grads: wp.array3d[float], g_rays: wp.array4d[wp.float64],
+        entry: int, i: int, r: vec_record, thread: int, x: float, y: float, b: Behind,
+        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], g_rays: wp.array4d[wp.float64],
     ):  # fmt: skip
-        """entry: its number in the group; w: the splat's weight at this pixel; de: d loss / d alpha times exp(-s), 0 where alpha is
-        clamped."""
-        ds = -r[OPACITY] * de
+        """entry: its number in the group; b: of this pixel, from which the splat was taken off."""
+        ds = -r[OPACITY] * b.de
         sums = vec_sums()
-        sums[G_OPACITY] = de
-        sums[G_RED] = w * grads[1, py, px]
-        sums[G_GREEN] = w * grads[2, py, px]
-        sums[G_BLUE] = w * grads[3, py, px]
+        sums[G_OPACITY] = b.de
+        sums[G_RED] = b.w * b.g[0]
+        sums[G_GREEN] = b.w * b.g[1]
+        sums[G_BLUE] = b.w * b.g[2]
         if wp.static(wanted.depth):
-            sums[G_Z] = w * grads[4, py, px]
+            sums[G_Z] = b.w * b.g_z
         if wp.static(ray):
             # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
             u, q = canonical(frames, rays, i, x, y)

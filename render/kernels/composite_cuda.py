@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.block_sums import channel_sums, gradient_sums
-from render.kernels.pixel_sight import OPTIONS, Behind, patch_meets, pixel_functions, pixel_layers, pixel_of, pixel_unlayering, warp_of
+from render.kernels.pixel_sight import OPTIONS, patch_meets, pixel_functions, pixel_layers, pixel_of, pixel_unlayering, warp_of
 from render.kernels.types import OPACITY, Wanted, Window
 from render.kernels.warps import LANES, ballot, highest_bit, largest_of_warp, lowest_bit, of_lane, record_of
 
@@ -84,7 +84,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
     lanes, _, _ = warp_of(tile_size)
     pixel, reached = pixel_of(tile_size), reached_of(tile_size)
     _, faded = pixel_functions(ray, eyes)
-    take_off = pixel_unlayering(wanted)
+    behind, take_off = pixel_unlayering(wanted)
     lay_down, write = gradient_sums(wanted, ray, eyes, tile_size)
     write_channels = channel_sums(wanted)
 
@@ -100,9 +100,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
         px, py, x, y = pixel(window, tile, thread)
         start = tile_starts[tile]
         stop = tile_starts[tile + 1]
-        b = Behind()
-        b.t = planes[0, py, px]
-        b.rest = grads[0, py, px]
+        b = behind(planes, grads, px, py)
         end = last[py, px]
         end_of_warp = largest_of_warp(end)
         groups = (stop - start + wp.static(lanes - 1)) // wp.static(lanes)
@@ -126,7 +124,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
                     if e > 0.0:
                         b = take_off(b, r, i, e, alpha_max, features, channels, grads, px, py)
                     seen = seen | bit
-                    lay_down(entry, i, r, thread, x, y, px, py, b.w, b.de, frames, rays, grads, g_rays)
+                    lay_down(entry, i, r, thread, x, y, b, frames, rays, g_rays)
                     if wp.static(wanted.channels):
                         shares[entry] = b.w
             write(seen, first, stop, thread, slot_of, slots, frame_slots)

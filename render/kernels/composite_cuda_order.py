@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.block_sums import channel_sums, gradient_sums
-from render.kernels.pixel_sight import OPTIONS, Behind, pixel_functions, pixel_layers, pixel_of, pixel_unlayering, warp_of
+from render.kernels.pixel_sight import OPTIONS, pixel_functions, pixel_layers, pixel_of, pixel_unlayering, warp_of
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import OPACITY, Wanted, Window, Z
 from render.kernels.warps import ballot, record_of
@@ -136,7 +136,7 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
 def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     """The backward kernel; arguments as of `composite_blocks_gradient`, `blocks` blocks in all."""
     pixel = pixel_of(tile_size)
-    take_off = pixel_unlayering(wanted)
+    behind, take_off = pixel_unlayering(wanted)
     lanes, _, _ = warp_of(tile_size)
     lay_down, write = gradient_sums(wanted, ray, eyes, tile_size)
     write_channels = channel_sums(wanted)
@@ -162,9 +162,7 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
                 here = wp.min(count - first, segment)
                 for n in range(here):
                     pushes[block, n, thread] = wp.vec2(0.0)
-                b = Behind()
-                b.t = planes[0, py, px]
-                b.rest = grads[0, py, px]
+                b = behind(planes, grads, px, py)
                 beyond = -last[py, px] - wp.int64(1)
                 held = int(HELD)
                 k = int(0)
@@ -187,8 +185,9 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
                         if ballot(push[0] != 0.0 or push[1] != 0.0) != 0:
                             seen = seen | (1 << entry)
                             i = ids[start + first + group + entry]
-                            r = record_of(records, i)
-                            lay_down(entry, i, r, thread, x, y, px, py, push[0], push[1], frames, rays, grads, g_rays)
+                            b.w = push[0]
+                            b.de = push[1]
+                            lay_down(entry, i, record_of(records, i), thread, x, y, b, frames, rays, g_rays)
                     at = start + first + group
                     write(seen, at, at + entries, thread, slot_of, slots, frame_slots)
                     if wp.static(wanted.channels):

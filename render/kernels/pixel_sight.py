@@ -231,17 +231,31 @@ def pixel_layers(wanted: Wanted):
 @wp.struct
 class Behind:
     """Of a pixel in backward: the light in front of the last splat that was taken off, and dL/dT of all that lies behind it, times T; then
-    that splat's weight and d loss / d alpha times its exp(-s)."""
+    that splat's weight and d loss / d alpha times its exp(-s). g, g_z, g_weights: dL/d colour, sum of w z, sum of w."""
 
     t: float
     rest: float
     w: float
     de: float
+    g: wp.vec3
+    g_z: float
+    g_weights: float
 
 
 @cache
 def pixel_unlayering(wanted: Wanted):
-    """The function that takes the pixel's last splat off, back to front."""
+    """The pixel's state when nothing is taken off yet, and the function that takes its last splat off, back to front."""
+
+    @wp.func
+    def behind(planes: wp.array3d[float], grads: wp.array3d[float], px: int, py: int):
+        b = Behind()
+        b.t = planes[0, py, px]
+        b.rest = grads[0, py, px]
+        b.g = wp.vec3(grads[1, py, px], grads[2, py, px], grads[3, py, px])
+        if wp.static(wanted.depth):
+            b.g_z = grads[4, py, px]
+            b.g_weights = grads[5, py, px]
+        return b
 
     @wp.func
     def take_off(
@@ -254,14 +268,14 @@ def pixel_unlayering(wanted: Wanted):
         inverse = 1.0 / (1.0 - a)
         b.t = b.t * inverse
         b.w = b.t * a
-        d = grads[1, py, px] * r[RED] + grads[2, py, px] * r[GREEN] + grads[3, py, px] * r[BLUE]
+        d = b.g[0] * r[RED] + b.g[1] * r[GREEN] + b.g[2] * r[BLUE]
         if wp.static(wanted.channels):
             for c in range(channels):
                 d += grads[wp.static(wanted.first_channel) + c, py, px] * features[i, c]
         if wp.static(wanted.depth):
-            d += grads[4, py, px] * r[Z] + grads[5, py, px]
+            d += b.g_z * r[Z] + b.g_weights
         b.de = wp.where(full < alpha_max, (b.t * d - b.rest * inverse) * e, 0.0)
         b.rest += b.w * d
         return b
 
-    return take_off
+    return behind, take_off

@@ -109,17 +109,25 @@ def record_of(records: wp.array2d[float], i: int) -> vec_record:
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 const int lane = threadIdx.x & 31;
+float v[16];
 #pragma unroll
-for (int half = 8; half >= 1; half >>= 1) {
-    const bool upper = lane & half;
-    #pragma unroll
-    for (int k = 0; k < half; ++k) {
-        const float sent = upper ? values[k] : values[k + half];
-        const float kept = upper ? values[k + half] : values[k];
-        values[k] = kept + __shfl_xor_sync(0xffffffffu, sent, half);
-    }
+for (int k = 0; k < 16; ++k) v[k] = values[k];
+// written out four times: a loop over `half` would keep v in memory, where it can be indexed
+#define HALVE(half) {                                                                 \\
+    const bool upper = lane & half;                                                   \\
+    _Pragma("unroll")                                                                 \\
+    for (int k = 0; k < half; ++k) {                                                  \\
+        const float sent = upper ? v[k] : v[k + half];                                \\
+        const float kept = upper ? v[k + half] : v[k];                                \\
+        v[k] = kept + __shfl_xor_sync(0xffffffffu, sent, half);                       \\
+    }                                                                                 \\
 }
-return values[0] + __shfl_xor_sync(0xffffffffu, values[0], 16);
+HALVE(8)
+HALVE(4)
+HALVE(2)
+HALVE(1)
+#undef HALVE
+return v[0] + __shfl_xor_sync(0xffffffffu, v[0], 16);
 #else
 return values[at];
 #endif

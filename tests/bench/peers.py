@@ -242,10 +242,13 @@ def main() -> None:
     rows: list[dict] = []
     for library in dict.fromkeys(way.split(",")[0] for way in WAYS):
         command = [sys.executable, "-m", "tests.bench.peers", *sys.argv[1:], "--worker", library]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-        rows += [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-        if done.returncode:
-            print(f"{library} broke off with exit code {done.returncode}; what stood on stderr says why")
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as worker:
+            assert worker.stdout is not None
+            for line in worker.stdout:
+                rows.append(json.loads(line))
+                print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+        if worker.returncode:
+            print(f"{library} broke off with exit code {worker.returncode}; what stood on stderr says why")
     rows.sort(key=lambda row: (names.index(row["preset"]), list(WAYS).index(row["way"])))
     card, driver = torch.cuda.get_device_name(), torch.version.cuda
     print(f"{card}, CUDA {driver}, torch {torch.__version__}, median of {args.repeat} single frames\n\n{table(rows)}")
