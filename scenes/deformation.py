@@ -31,7 +31,7 @@ class Lattice:
 
     def at(self, points: torch.Tensor) -> torch.Tensor:
         """How far points `[N, 3]` move, `[N, 3]`. Differentiable in the nodes; where the points are counts as given."""
-        low, high = self.corners.to(points)
+        low, high = self.corners.to(points, non_blocking=True)  # the host need not wait for what it has said
         places = (2 * (points.detach() - low) / (high - low) - 1).flip(-1)  # grid_sample's first coordinate is that of the last axis
         grid = self.nodes.to(points).permute(3, 0, 1, 2)[None]
         return F.grid_sample(grid, places[None, None, None], align_corners=True, padding_mode="border")[0, :, 0, 0].T
