@@ -58,7 +58,7 @@ def refits(
 ) -> list[Refit]:
     """The reconstructions of one of REFITS of a `scene` that was made from `log`; kept in `folder`, and read there where they are already.
 
-    A fit takes some minutes on a CPU; it runs on `device`, and there its scene is. Raises ValueError where the rig has too few cameras or frames.
+    A fit takes some minutes; it runs on `device`, and there its scene is. Raises ValueError where the rig has too few cameras or frames.
     """
     log = as_reconstructed(log, scene)
     made = []

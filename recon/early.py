@@ -28,7 +28,7 @@ def stopped_early(
 ) -> list[Path]:
     """Fit once and write the scene at each of `shares` of the schedule to `<folder>/<percent>`; returns those folders.
 
-    cameras: as `reconstruct`. size: width and height of the pictures that are fitted. device: where. Scenes that are there already are kept: an
+    cameras, device: as `reconstruct`. size: width and height of the pictures that are fitted. Scenes that are there already are kept: an
     interrupted call begins the fit again, which takes minutes, but writes only what is missing.
     """
     if not shares or not all(0 < share <= 1 for share in shares):

@@ -309,7 +309,7 @@ class Fit:
     def restore(self, state: dict) -> None:
         """Go on from `tensors()` of another run, on whichever device: the same steps follow as would have followed there."""
         self.splats = Splats(state["fields"], state["sizes"], state["reach"]).to(self.device)
-        self.growth, self.descent = (made(**self._here(state[name])) for made, name in ((Growth, "growth"), (Descent, "descent")))
+        self.growth, self.descent = Growth(**self._here(state["growth"])), Descent(**self._here(state["descent"]))
         self.sky, self.first_sky, self.exposures = self._here({k: state[k] for k in ("sky", "first_sky", "exposures")}).values()
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])

@@ -78,9 +78,7 @@ class Limb:
 class Limbs:
     """The limbs of all actors that are seen to move some, by group; none where nobody is, which costs nothing."""
 
-    def __init__(
-        self, strides: Mapping[int, float], tracks: Sequence[Track], span_us: tuple[int, int], device: torch.device | str = "cpu"
-    ):
+    def __init__(self, strides: Mapping[int, float], tracks: Sequence[Track], span_us: tuple[int, int], device: torch.device | str = "cpu"):
         """strides: metres, by group; tracks: those of the groups from 1 on; span_us: of the pictures; device: of the splats."""
         self.of = {group: Limb(tracks[group - 1], span_us, stride, device) for group, stride in strides.items()}
         groups = [{"params": [limb.modes for limb in self.of.values()]}, {"params": [limb.added for limb in self.of.values()]}]
