@@ -14,6 +14,8 @@ from scenes.gaussians import Placed
 from scenes.lenses import Orthographic
 from scenes.poses import interpolate, inverse
 
+HOST = torch.device("cpu")
+
 
 def camera_rays(camera: Camera) -> torch.Tensor:
     """float32 `[H, W, 3]` directions of depth 1 in the camera through the pixel centres; shared, not to be written to.
@@ -28,9 +30,6 @@ def camera_origins(camera: Camera) -> torch.Tensor:
     if not isinstance(camera.lens, Orthographic):
         return torch.zeros(3)
     return camera.lens.origins(camera.pixel_centres()).detach().to(torch.float32)
-
-
-HOST = torch.device("cpu")
 
 
 def world_directions(camera: Camera, device: torch.device = HOST) -> torch.Tensor:
