@@ -42,10 +42,13 @@ def scene_time(scene: Scene, camera: str, time_us: int) -> int:
 
 
 class Clip:
-    """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there."""
+    """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there. Scenes are rendered on `device`;
+    photos, scenes and what comes of them are on the host."""
 
-    def __init__(self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, rights: dict):
-        self.scene, self.start = scene, start
+    def __init__(
+        self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, rights: dict, device: torch.device | str = "cpu"
+    ):
+        self.scene, self.start, self.device = scene, start, device
         height = round(config.width * camera.height / camera.width)
         self.indices = range(start, min(start + config.frames, len(camera)))
         # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
@@ -69,7 +72,11 @@ class Clip:
         return self.photos[t].float() / 255
 
     def render(self, scene: Scene, *outputs: str, shadows: bool = True) -> list[Frame]:
-        """What a scene shows to the clip's cameras."""
+        """What a scene shows to the clip's cameras, on the host."""
+        return [frame.to("cpu") for frame in self.draw(scene.to(self.device), *outputs, shadows=shadows)]
+
+    def draw(self, scene: Scene, *outputs: str, shadows: bool = True) -> list[Frame]:
+        """The same where the scene is."""
         with torch.no_grad():
             return [render_frame(scene, camera, outputs, shadows=shadows) for camera in self.cameras]
 
@@ -83,11 +90,12 @@ class Clip:
 
     def _geometry_of(self, scene: Scene) -> dict[str, torch.Tensor]:
         instances, depths, flows, seen, last = [], [], [], [], None
+        scene = scene.to(self.device)
         for t, camera in enumerate(self.cameras):
             after = self.cameras[t + 1] if t + 1 < len(self.cameras) else None
             wanted = ["instance", "depth"] + ["flow_prev"] * (t > 0) + ["flow_next"] * (after is not None)
             with torch.no_grad():
-                frame = render_frame(scene, camera, tuple(wanted), self.cameras[t - 1] if t else None, after)
+                frame = render_frame(scene, camera, tuple(wanted), self.cameras[t - 1] if t else None, after).to("cpu")
             assert frame.instance is not None and frame.depth is not None
             none = torch.full((camera.height, camera.width, 2), torch.nan)
             flow = none if frame.flow_prev is None else frame.flow_prev

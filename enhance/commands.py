@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from scenes import units
-from scenes.opening import UsageError, fresh
+from scenes.opening import UsageError, check_device, fresh
 from scenes.options import Flag, Names, Output, Overwrite, written
 
 
@@ -36,6 +36,8 @@ class Pairs:
     """Folders of images, and videos, of places never trained on: pairs of single frames with a region in other colours."""
     size: Annotated[int, arg(metavar="PIXELS")] = 640
     """Width of the frames."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to fit and render."""
     seed: int = 0
     """Same seed, same pairs."""
 
@@ -50,18 +52,19 @@ class Pairs:
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
         check_kinds(self.kinds or ())
+        check_device(self.device)
         for path, data in zip(self.scenes, self.data, strict=True):
             scene, log = open_reconstruction(path), open_log(data)
             kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
-            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank)
+            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device)
             with Progress(f"pairs {path.name}") as steps:
 
                 def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
                     steps.total = total
                     steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, kinds, self.cameras, self.seed, say, sources, PairConfig(width=self.size))
+                make_pairs(scene, log, out, kinds, self.cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
         make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 

@@ -57,7 +57,7 @@ def put_in(
             continue
         there = replace(scene, actors=(*scene.actors, actor))
         mine = len(there.actors)
-        if _share(there, clip.cameras[len(clip.cameras) // 2], mine) < SMALLEST:
+        if _share(there.to(clip.device), clip.cameras[len(clip.cameras) // 2], mine) < SMALLEST:
             continue
         bare, shaded, region = [], [], []
         for t, frame in enumerate(clip.render(there, "depth", "instance", "instance_alpha")):

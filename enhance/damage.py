@@ -81,7 +81,7 @@ def _underfit(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
         what = {"underfit": "stopped early", "scene": str(references.recorded.meta.get("name", pick))}
     else:
         how = random_underfit(rng)
-        references = References(sources.shots, unfinish(clip.scene, how, int(rng.integers(2**31))))
+        references = References(sources.shots, unfinish(clip.scene, how, int(rng.integers(2**31))).to(clip.device))
         what = {"underfit": vars(how)}
     return _rendered(clip, references, what)
 
@@ -100,9 +100,9 @@ def _refitted(kind: str) -> Callable[[Clip, np.random.Generator, Sources], Damag
 
 def _rendered(clip: Clip, references: References, what: dict) -> Damage:
     """What a scene shows, and what the pictures that it was made from say of it, but never the photo that is the target."""
-    frames = list(references.along(clip.render(references.recorded, *READS), clip.cameras))
-    rgb, reference = (torch.stack([to_bytes(getattr(f, name)) for f in frames]) for name in ("rgb", "reference"))
-    trust = torch.stack([f.trust for f in frames if f.trust is not None])
+    frames = list(references.along(clip.draw(references.recorded, *READS), clip.cameras))
+    rgb, reference = (torch.stack([to_bytes(getattr(f, name)) for f in frames]).cpu() for name in ("rgb", "reference"))
+    trust = torch.stack([f.trust for f in frames if f.trust is not None]).cpu()
     return Damage(rgb, clip.photos, torch.ones(clip.photos.shape[:3]), what, reference=reference, trust=trust)
 
 

@@ -39,11 +39,13 @@ def make_pairs(
     progress: Callable[[int, int, str], None] | None = None,
     sources: Sources | None = None,
     config: PairConfig | None = None,
+    device: str = "cpu",
 ) -> Path:
     """Make the pairs of a scene in the folder `out`; returns it. Scene and recording may be given loaded.
 
     Every clip of every camera, with each of `kinds` (enhance/damage.py), and with flow, visibility, depth and instances of what it shows.
     `sources` is what the damage is made from (`prepare_sources`); without any, the kinds ANYWHERE can be made.
+    Scenes are rendered on `device`.
 
     The same seed makes the same pairs. A run that was broken off goes on where it stopped, and kinds may be added later. `progress` is
     called with clips done, clips in all, and the last one's name. A contact sheet of each kind, `<kind>.png`, stands beside the clips.
@@ -68,7 +70,7 @@ def make_pairs(
     for done, (camera, start) in enumerate(starts):
         name = f"{camera.name}_{start:04d}"
         missing = [kind for kind in kinds if not (out / kind / f"{name}.json").exists()]
-        clip = Clip(scene, camera, start, config, seed, rights) if missing else None
+        clip = Clip(scene, camera, start, config, seed, rights, device) if missing else None
         for kind in missing:
             assert clip is not None
             _write(out / kind / f"{name}.safetensors", kind, clip, make(kind, clip, sources))
@@ -86,16 +88,17 @@ def prepare_sources(
     kinds: Sequence[str] = KINDS,
     skies: Sequence[str | Path] = (),
     databank: str | Path | None = None,
+    device: str = "cpu",
 ) -> Sources:
-    """What `kinds` are made from: reconstructions, kept in `folder` (some minutes each, once), assets cut out of the scene and those of a
-    databank, and .hdr skies. Raises ValueError for an unknown kind, and where the rig has too few cameras for one."""
+    """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once), assets cut out of the
+    scene and those of a databank, and .hdr skies. Raises ValueError for an unknown kind, and where the rig has too few cameras for one."""
     check_kinds(kinds)
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
-    early = stopped_early(log, folder / "early", names) if "underfit" in kinds else []
+    early = stopped_early(log, folder / "early", names, device=device) if "underfit" in kinds else []
     shots = shots_of(as_reconstructed(log, scene), scene) if "underfit" in kinds else []
-    unfinished = [Refit(References(shots, s), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
-    made = {kind: refits(kind, scene, log, folder / "refits") for kind in REFITS if kind in kinds}
+    unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
+    made = {kind: refits(kind, scene, log, folder / "refits", device=device) for kind in REFITS if kind in kinds}
     found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
     own = {c.track: c.asset for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS}
     bank = Databank(databank) if databank is not None else None

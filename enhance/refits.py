@@ -47,21 +47,29 @@ class Refit:
     cameras: tuple[str, ...]
 
 
-def refits(kind: str, scene: Scene, log: Log, folder: str | Path, config: FitConfig = SHORT, size: tuple[int, int] = SIZE) -> list[Refit]:
+def refits(
+    kind: str,
+    scene: Scene,
+    log: Log,
+    folder: str | Path,
+    config: FitConfig = SHORT,
+    size: tuple[int, int] = SIZE,
+    device: str = "cpu",
+) -> list[Refit]:
     """The reconstructions of one of REFITS of a `scene` that was made from `log`; kept in `folder`, and read there where they are already.
 
-    A fit takes some minutes. Raises ValueError where the rig has too few cameras or frames.
+    A fit takes some minutes; it runs on `device`, and there its scene is. Raises ValueError where the rig has too few cameras or frames.
     """
     log = as_reconstructed(log, scene)
     made = []
-    for name, part, shown in _parts(kind, scene, log, Path(folder), size):
+    for name, part, shown in _parts(kind, scene.to(device), log, Path(folder), size):
         path = Path(folder) / f"{name}_scene"
         if not is_scene(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _fit(part, path, config, size)
+            _fit(part, path, config, size, device)
         loaded = load(path)
         assert isinstance(loaded, Scene)
-        made.append(Refit(References(shots_of(part, scene), loaded), shown))
+        made.append(Refit(References(shots_of(part, scene), loaded.to(device)), shown))
     return made
 
 
@@ -137,7 +145,7 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, size: tuple[int, int]) 
                     with torch.no_grad():
                         frame = render_frame(scene, view.resized(*size))
                     assert frame.rgb is not None
-                    write_image(file, frame.rgb)
+                    write_image(file, frame.rgb.cpu())
                 steps.step()
             lens = camera.lens.scaled(size[0] / camera.width, size[1] / camera.height)
             poses = torch.stack([v.world_from_cam for v in views])
@@ -145,9 +153,9 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, size: tuple[int, int]) 
     return replace(log, ego=ego, cameras=cameras)
 
 
-def _fit(log: Log, path: Path, config: FitConfig, size: tuple[int, int]) -> None:
+def _fit(log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
     names, span = choose(log, list(log.cameras))
-    start, fit = begin(log, names, span, size, config, held_out=0)
+    start, fit = begin(log, names, span, size, config, held_out=0, device=device)
     with Progress(f"fit {path.name}", total=config.steps) as steps:
         while fit.step_count < config.steps:
             fit.step()

@@ -48,11 +48,12 @@ def at_once(scene: Scene, camera: Camera, rig: RigCamera, photo: torch.Tensor) -
     (first, last), backs = readout_ends(scene, camera, rig)
     frame = render_frame(scene, camera, ("depth", "instance"))
     assert frame.depth is not None and frame.instance is not None
-    sky = frame.depth.isinf() | (frame.instance < 0)
+    depth, instance = frame.depth.cpu(), frame.instance.cpu()
+    sky = depth.isinf() | (instance < 0)
     rays = camera_rays(camera)
-    points = rays * torch.where(sky, FAR, frame.depth)[..., None]
+    points = rays * torch.where(sky, FAR, depth)[..., None]
     moved = points.clone()
-    instance = torch.where(sky, 0, frame.instance)
+    instance = torch.where(sky, 0, instance)
     seen = set(instance.unique().tolist())
     for p in (p for p in scene.placed(camera.time_us) if p.instance in seen):
         mine = instance == p.instance

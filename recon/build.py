@@ -69,6 +69,7 @@ def reconstruct(
     config: FitConfig | None = None,
     half: bool = False,
     overwrite: bool = False,
+    device: str = "cpu",
 ) -> Scene:
     """Fit a scene to a log's images and write it to the folder `output`.
 
@@ -78,6 +79,7 @@ def reconstruct(
     beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the
     same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
+    device: where the fit runs and what is reported is rendered; one that was interrupted may go on elsewhere.
 
     The folder keeps the photos that were fitted to, too: the enhancer looks detail up there.
 
@@ -99,7 +101,7 @@ def reconstruct(
     unseen = held_out_sweeps(log, held_out)
     seen = tuple(s for s in log.sweeps if s not in unseen)
     log = annotated(log, replace(log, sweeps=seen).sweeps_within(span))
-    start, fit = begin(replace(log, sweeps=seen), names, span, size, config, held_out, saved[0] if saved else None)
+    start, fit = begin(replace(log, sweeps=seen), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
@@ -112,17 +114,18 @@ def reconstruct(
         run(fit, keep, lambda f: steps.step(note=f"loss {f.recent_loss:.4f}  {len(f.splats)} splats"))
     keep()  # the report and the writing below may be interrupted too
     scene = assemble(fit, start, log, {"options": options})
-    rows = held_out_table(scene, fit.frames, start.rig)
+    there = scene.to(device)
+    rows = held_out_table(there, fit.frames, start.rig)
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
     print(table_text(rows), file=sys.stderr)
     within = [s for s in unseen if span[0] <= s.time_us <= span[1]]
     if within:
-        scene.meta["off_path"] = off_path_table(scene, log, within)
+        scene.meta["off_path"] = off_path_table(there, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     save(scene, output, overwrite, half)
     with Progress("photos", total=len(fit.frames.training())) as steps:
-        keep_album(scene, fit.frames, start.rig, output, steps.step)
+        keep_album(there, fit.frames, start.rig, output, steps.step)
     checkpoint.unlink(missing_ok=True)
     return scene
 
@@ -187,15 +190,16 @@ def begin(
     config: FitConfig,
     held_out: int = HELD_OUT,
     start: Start | None = None,
+    device: str = "cpu",
 ) -> tuple[Start, Fit]:
-    """What a fit starts from, prepared unless it is given, and the fit before its first step."""
+    """What a fit starts from, prepared unless it is given, and the fit on a device before its first step."""
     with Progress("images") as steps:
         frames = load_frames(log, names, span, size, held_out, steps.step)
     if start is None:
         with Progress("prepare") as steps:
             coefficients = (config.sh_degree + 1) ** 2
             start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))
-    return start, _fit(frames, start, config)
+    return start, _fit(frames, start, config, device)
 
 
 def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) -> tuple[int, int]:
@@ -215,7 +219,7 @@ def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) ->
     return first - slack, max(last, first) + slack
 
 
-def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
+def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
     actors = [Knots(t.trajectory()) for t in start.tracks]
     boxes = [t.size for t in start.tracks]
     trained = torch.tensor([v.time_us for v in frames.of(0)])
@@ -223,18 +227,18 @@ def _fit(frames: Frames, start: Start, config: FitConfig) -> Fit:
     limbed = [(i + 1, t) for i, t in enumerate(start.tracks) if t.label in LIMBED and "limbs" in config.refine]
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
-    limbs = Limbs(strides, start.tracks, (min(times), max(times)))
-    return Fit(frames, motion, start.splats, start.sky, start.exposures, limbs, config, start.measured)
+    limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
+    return Fit(frames, motion, start.splats.to(device), start.sky, start.exposures, limbs, config, start.measured)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
-    """The scene that a fit's present state stands for."""
-    groups = [g.detach() for g in fit.splats.groups(fit.sh_count())]
+    """The scene that a fit's present state stands for, on the host."""
+    groups = [g.detach().to("cpu") for g in fit.splats.groups(fit.sh_count())]
     rig = {}
     for c, name in enumerate(fit.frames.names):
         mount, times = fit.motion.mounted(c, [v.time_us for v in fit.frames.views if v.camera == c])
         r = start.rig[name]
-        rig[name] = RigCamera(r.lens, r.width, r.height, mount, fit.exposures[c].detach().clone(), times)
+        rig[name] = RigCamera(r.lens, r.width, r.height, mount, fit.exposures[c].detach().cpu().clone(), times)
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
@@ -248,11 +252,11 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         for t in log.tracks
         if not t.moving and t.name.startswith("veh")
     ]
-    sky = Sky(linear_from_srgb(fit.sky.detach().clamp(0, 1)))
+    sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, 1)))
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
     scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
-    return replace(scene, sky=seen_sky(scene))
+    return replace(scene, sky=seen_sky(scene.to(fit.device)))
 
 
 def middle_pose(track: Track) -> torch.Tensor:

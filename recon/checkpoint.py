@@ -39,7 +39,7 @@ def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:
     if not path.is_file():
         raise FileNotFoundError(f"nothing to resume: {path} does not exist; run without --resume")
     try:
-        data = torch.load(path, weights_only=True)
+        data = torch.load(path, map_location="cpu", weights_only=True)  # it may go on where there is no GPU
         version, saved = data["version"], data["options"]
     except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError) as problem:
         raise ValueError(f"{path} is not a fit that can go on ({problem}); delete it and run without --resume") from None

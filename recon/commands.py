@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from scenes.opening import fresh
+from scenes.opening import check_device, fresh
 from scenes.options import FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 
 
@@ -33,6 +33,8 @@ class Recon:
     """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
     metres_per_unit: Ratio = None
     """The same for a COLMAP folder by number: metres that one unit of its model has."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to fit."""
     resume: Flag = False
     """Go on from where an interrupted run of the same command stopped."""
     overwrite: Overwrite = False
@@ -48,11 +50,12 @@ class Recon:
         fresh(self.output, self.overwrite)
         if self.output.exists() and not is_scene(self.output):
             raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
+        check_device(self.device)
         log = open_log(self.data, self.camera_height, self.metres_per_unit)
         try:
             reconstruct(
                 log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
-                size=self.size, resume=self.resume, overwrite=self.overwrite,
+                size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
             )  # fmt: skip
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None

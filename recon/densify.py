@@ -34,8 +34,8 @@ class Growth:
     seen: torch.Tensor
 
     @staticmethod
-    def none(count: int) -> Growth:
-        return Growth(torch.zeros(count), torch.zeros(count))
+    def none(count: int, device: torch.device | str = "cpu") -> Growth:
+        return Growth(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         return {"pull": self.pull, "seen": self.seen}
@@ -54,14 +54,14 @@ def grow(
     keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
     pull = torch.where(keep & (growth.seen > 0), growth.pull / growth.seen.clamp_min(1), torch.zeros_like(growth.pull))
     count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((pull > 0).sum()))
-    parents = pull.topk(count).indices if count else torch.zeros(0, dtype=torch.long)
+    parents = pull.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=pull.device)
 
     scales = fields["log_scales"][parents]
     axis = scales.argmax(1)
     direction = _axes(fields["quats"][parents], axis)
     offset = direction * (0.5 * scales.exp().amax(1))[:, None]
     smaller = scales - 0.1
-    smaller[torch.arange(count), axis] = scales.amax(1) + float(np.log(0.6))
+    smaller[torch.arange(count, device=axis.device), axis] = scales.amax(1) + float(np.log(0.6))
     children = {k: fields[k][parents] for k in FIELDS}
     children["means"] = fields["means"][parents] - offset
     children["log_scales"] = smaller
@@ -82,7 +82,8 @@ def grow(
 
 def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -> torch.Tensor:
     """Mask of splats that stand in their actor's box; the background has none."""
-    half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)[group] + BOX_MARGIN
+    half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)
+    half = half.to(group.device)[group] + BOX_MARGIN
     return (means[:, :2].abs() <= half[:, :2]).all(1) & (means[:, 2] <= half[:, 2]) & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
 
 

@@ -31,7 +31,8 @@ class Descent:
     @staticmethod
     def begin(splats: Splats) -> Descent:
         count = sum(field[:1].numel() for field in splats.fields.values())
-        return Descent(torch.zeros(len(splats), 2, count), torch.zeros(len(splats)))
+        device = splats.reach.device
+        return Descent(torch.zeros(len(splats), 2, count, device=device), torch.zeros(len(splats), device=device))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         return {"moments": self.moments, "last": self.last}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 import warp as wp
 
 from recon.kernels.develop import SKY_STEP, develop, develop_backward
-from render.launch import run, stage, view
+from render.launch import run, stage, upload, view
+from render.rays import on_device
 from scenes.camera import Camera
 from scenes.sky import sample_equirect
 
@@ -20,11 +22,35 @@ def developed(rgb: torch.Tensor, alpha: torch.Tensor, sky: torch.Tensor, exposur
     The sky is smooth, and a lookup a pixel would cost as much as the splats: it is sampled every `SKY_STEP` pixels, at others with every
     `shift` (rows and columns, below `SKY_STEP`), or those between would never learn.
     """
-    sides = (camera.height, camera.width)
-    y, x = (SKY_STEP * (torch.arange(n // SKY_STEP + 2) + 0.5) - s for n, s in zip(sides, shift, strict=True))
-    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double()
-    rays = camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].detach().T
-    return Develop.apply(rgb, alpha, sample_equirect(sky, rays), exposure, shift)
+    rays = on_device(_sample_rays(camera.lens.key(), camera.width, camera.height, tuple(shift)), rgb.device)
+    samples = sample_equirect(sky, rays @ upload(camera.world_from_cam[:3, :3].detach(), rgb.device).T)
+    if rgb.device.type == "cuda":
+        return developed_by_matrices(rgb, alpha, samples, exposure, shift)
+    return Develop.apply(rgb, alpha, samples, exposure, shift)
+
+
+@lru_cache(maxsize=512)
+def _sample_rays(key: tuple, width: int, height: int, shift: tuple[int, int]) -> torch.Tensor:
+    """float64 `[h, w, 3]` directions in the camera of the sky's samples; shared, not to be written to."""
+    lens_type, *numbers = key
+    y, x = (SKY_STEP * (torch.arange(n // SKY_STEP + 2) + 0.5) - s for n, s in zip((height, width), shift, strict=True))
+    return lens_type(*numbers).unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double())
+
+
+def developed_by_matrices(rgb: torch.Tensor, alpha: torch.Tensor, samples: torch.Tensor, exposure: torch.Tensor, shift: Sequence[int]):
+    """As `Develop`, for a GPU, which would stand idle with a thread for each row of samples."""
+    down, across = (_between(n, s, rgb.device) for n, s in zip(alpha.shape, shift, strict=True))
+    behind = (down @ samples.permute(2, 0, 1) @ across.T).permute(1, 2, 0)
+    # row by row, or the exposure's gradient would be one sum over all pixels
+    return (rgb + (1 - alpha)[..., None] * behind) @ exposure[:, :3].T.expand(len(rgb), 3, 3) + exposure[:, 3]
+
+
+@lru_cache(maxsize=64)
+def _between(pixels: int, shift: int, device: torch.device) -> torch.Tensor:
+    """`[pixels, samples]`: what each sample along a side adds to each pixel; shared, not to be written to."""
+    samples = pixels // SKY_STEP + 2
+    place = ((torch.arange(pixels) + shift + 0.5) / SKY_STEP - 0.5).clamp(0, samples - 1)
+    return (1 - (place[:, None] - torch.arange(samples)).abs()).clamp_min(0).to(device)
 
 
 class Develop(torch.autograd.Function):

@@ -24,10 +24,11 @@ def stopped_early(
     shares: Sequence[float] = SHARES,
     size: tuple[int, int] = SIZE,
     config: FitConfig = SHORT,
+    device: str = "cpu",
 ) -> list[Path]:
     """Fit once and write the scene at each of `shares` of the schedule to `<folder>/<percent>`; returns those folders.
 
-    cameras: as `reconstruct`. size: width and height of the pictures that are fitted. Scenes that are there already are kept: an
+    cameras, device: as `reconstruct`. size: width and height of the pictures that are fitted. Scenes that are there already are kept: an
     interrupted call begins the fit again, which takes minutes, but writes only what is missing.
     """
     if not shares or not all(0 < share <= 1 for share in shares):
@@ -39,7 +40,7 @@ def stopped_early(
     folder.mkdir(parents=True, exist_ok=True)
     names, span = choose(log, cameras)
     log = annotated(log, log.sweeps_within(span))
-    start, fit = begin(log, names, span, size, config)
+    start, fit = begin(log, names, span, size, config, device=device)
     with Progress(f"fit {folder.name}", total=max(paths)) as steps:
         while fit.step_count < max(paths):
             fit.step()

@@ -23,6 +23,7 @@ from recon.measured import Measured, mistake
 from recon.model import Splats, draw, placed_groups
 from recon.motion import REFINED, Moment, Motion
 from recon.sight import Eye, in_sight
+from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -91,7 +92,11 @@ RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "colo
 
 
 class Fit:
-    """The state of a fit: step it, checkpoint it with `state`, go on with `restore`."""
+    """The state of a fit: step it, checkpoint it with `tensors`, go on with `restore`.
+
+    It runs on the device of its splats, with sky, exposures, limbs, pictures and measured depths; poses stay on the host, and so does the
+    generator, so that the same views are drawn on every device.
+    """
 
     def __init__(
         self,
@@ -104,13 +109,14 @@ class Fit:
         config: FitConfig,
         measured: Measured,
     ):
-        self.frames, self.motion, self.limbs, self.config, self.measured = frames, motion, limbs, config, measured
-        self.splats, self.sky, self.exposures = splats, sky, exposures
-        self.first_sky = sky.clone()
+        self.device = splats.reach.device
+        self.frames, self.motion, self.limbs, self.config, self.measured = frames, motion, limbs, config, measured.to(self.device)
+        self.splats, self.sky, self.exposures = splats, sky.to(self.device), exposures.to(self.device)
+        self.first_sky = self.sky.clone()
         self.step_count = 0
-        self.training = frames.training()
+        self.training = [view.to(self.device) for view in frames.training()]
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.growth, self.descent = Growth.none(len(splats)), Descent.begin(splats)
+        self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
@@ -162,12 +168,14 @@ class Fit:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
         if known is not None and depth is not None:
             haze = haze + self.config.depth_weight * self.measured.weight * mistake(depth, alpha, known)
-        unrest = self.motion.unrest() + self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
-        (loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())).backward()
+        unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
+        whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
+        # beside one another, not added up: the poses' unrest is on the host
+        torch.autograd.backward([cost for cost in (whole, self.motion.unrest()) if cost.requires_grad])
+        value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self._follow()
         self.step_count += 1
-        value = float(loss.detach())
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
 
@@ -200,7 +208,7 @@ class Fit:
         if share == 0:
             return shown
         opacity = torch.sigmoid(shown.fields["logits"])
-        stays = torch.rand(opacity.shape, generator=self.generator) >= share
+        stays = upload(torch.rand(opacity.shape, generator=self.generator) >= share, opacity.device)
         denser = torch.where(stays, opacity / (1 - share), 0.0).clamp(1e-5, 0.999)
         return Splats(shown.fields | {"logits": torch.logit(denser)}, shown.sizes, shown.reach)
 
@@ -212,7 +220,7 @@ class Fit:
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
-        return (world_directions(small)[..., 2] < 0) & ~view.sky
+        return (world_directions(small, self.device)[..., 2] < 0) & ~view.sky
 
     def _aside(self, view: View, camera: Camera) -> Camera:
         """A small picture's camera up to `ASIDE` metres to the left or right of a view."""
@@ -225,7 +233,7 @@ class Fit:
         """Mean of 1 - alpha below the horizon as a camera sees a view's moment."""
         placed = self._placed(shown, view, camera)
         (alpha,) = draw(placed, camera, "alpha")
-        return ((1 - alpha) * (world_directions(camera)[..., 2] < HORIZON)).mean()
+        return ((1 - alpha) * (world_directions(camera, self.device)[..., 2] < HORIZON)).mean()
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
@@ -275,7 +283,7 @@ class Fit:
         """Split where the gradient pulls, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
-        self.growth, self.descent = Growth.none(len(self.splats)), Descent(**carried)
+        self.growth, self.descent = Growth.none(len(self.splats), self.device), Descent(**carried)
 
     # ---- checkpoints
 
@@ -299,10 +307,10 @@ class Fit:
         }
 
     def restore(self, state: dict) -> None:
-        """Go on from `tensors()` of another run: the same steps follow as would have followed there."""
-        self.splats = Splats(state["fields"], state["sizes"], state["reach"])
-        self.growth, self.descent = Growth(**state["growth"]), Descent(**state["descent"])
-        self.sky, self.first_sky, self.exposures = state["sky"], state["first_sky"], state["exposures"]
+        """Go on from `tensors()` of another run, on whichever device: the same steps follow as would have followed there."""
+        self.splats = Splats(state["fields"], state["sizes"], state["reach"]).to(self.device)
+        self.growth, self.descent = Growth(**self._here(state["growth"])), Descent(**self._here(state["descent"]))
+        self.sky, self.first_sky, self.exposures = self._here({k: state[k] for k in ("sky", "first_sky", "exposures")}).values()
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])
         self._optimise()
@@ -310,6 +318,10 @@ class Fit:
             optimiser.load_state_dict(saved)
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
+
+    def _here(self, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Tensors on the fit's device."""
+        return {name: tensor.to(self.device) for name, tensor in tensors.items()}
 
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:

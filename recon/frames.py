@@ -43,6 +43,10 @@ class View:
     held_out: bool
     sky: torch.Tensor
 
+    def to(self, device: torch.device | str) -> View:
+        """The same view with its picture on a device."""
+        return replace(self, image=self.image.to(device), sky=self.sky.to(device))
+
     def is_sky(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Whether pixels of the image are surely sky, bool of the shape of `row` and `column`."""
         step = np.array(self.image.shape[:2]) / self.sky.shape

@@ -41,17 +41,17 @@ class Limb:
     """One actor's lattice: modes `[B, X, Y, Z, 3]` in `UNIT`s, and what is added `[T, B]` to the weights of an even gait: cosine and sine
     of the phase of its strides, and of twice that."""
 
-    def __init__(self, track: Track, span_us: tuple[int, int], stride: float):
-        """span_us: of the pictures; stride: its length in metres."""
+    def __init__(self, track: Track, span_us: tuple[int, int], stride: float, device: torch.device | str = "cpu"):
+        """span_us: of the pictures; stride: its length in metres; device: of modes and weights. Corners and times stay on the host."""
         half = torch.from_numpy(track.size[:2]).float() / 2 + MARGIN
         high = float(track.size[2]) + MARGIN
         self.corners = torch.tensor([[-half[0], -half[1], -MARGIN], [half[0], half[1], high]])
         counts = ((self.corners[1] - self.corners[0]) / CELL).round().long().clamp(1, 16) + 1
         self.path, self.metres2 = track.trajectory(), float(track.size[:2].max() * track.size[2])
-        self.modes = torch.zeros(MODES, *counts.tolist(), 3).requires_grad_()
+        self.modes = torch.zeros(MODES, *counts.tolist(), 3, device=device).requires_grad_()
         first, last = max(int(track.times_us[0]), span_us[0]), min(int(track.times_us[-1]), span_us[1])
         self.times_us = torch.from_numpy(np.linspace(first, last, max(1, (last - first) // STEP_US) + 1).round().astype(np.int64))
-        self.gait = waves(phase(gone(track.trajectory(), self.times_us), self.times_us, stride), MODES).float()
+        self.gait = waves(phase(gone(track.trajectory(), self.times_us), self.times_us, stride), MODES).float().to(device)
         self.added = torch.zeros_like(self.gait).requires_grad_()
 
     def at(self, time_us: int) -> Lattice:
@@ -68,18 +68,19 @@ class Limb:
         return share * (EVEN * apart + STEADY * self.added.diff(n=2, dim=0).square().sum())
 
     def deformation(self) -> Deformation | None:
-        """What was found; None where no picture showed the actor."""
+        """What was found, on the host; None where no picture showed the actor."""
         if not self.modes.any():
             return None
-        return Deformation(self.corners, UNIT * self.modes.detach(), self.times_us, (self.gait + self.added).detach())
+        weights = (self.gait + self.added).detach()
+        return Deformation(self.corners, UNIT * self.modes.detach().cpu(), self.times_us, weights.cpu())
 
 
 class Limbs:
     """The limbs of all actors that are seen to move some, by group; none where nobody is, which costs nothing."""
 
-    def __init__(self, strides: Mapping[int, float], tracks: Sequence[Track], span_us: tuple[int, int]):
-        """strides: metres, by group; tracks: those of the groups from 1 on; span_us: of the pictures."""
-        self.of = {group: Limb(tracks[group - 1], span_us, stride) for group, stride in strides.items()}
+    def __init__(self, strides: Mapping[int, float], tracks: Sequence[Track], span_us: tuple[int, int], device: torch.device | str = "cpu"):
+        """strides: metres, by group; tracks: those of the groups from 1 on; span_us: of the pictures; device: of the splats."""
+        self.of = {group: Limb(tracks[group - 1], span_us, stride, device) for group, stride in strides.items()}
         groups = [{"params": [limb.modes for limb in self.of.values()]}, {"params": [limb.added for limb in self.of.values()]}]
         self._adam = torch.optim.Adam(groups, lr=RATE, eps=1e-12) if self.of else None
 

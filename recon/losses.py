@@ -6,6 +6,8 @@ window, and only the terms of the gradient that are not the recorded picture's.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 import torch.nn.functional as F
 
@@ -16,14 +18,34 @@ C1, C2 = 0.01**2, 0.03**2
 
 def _blur(maps: torch.Tensor) -> torch.Tensor:
     """Gaussian window over `[H, W, C]`, zero beyond the edge; its own adjoint."""
+    if maps.device.type == "cuda":
+        return _blur_by_matrices(maps)
     count = maps.shape[-1]
-    x = torch.arange(WINDOW, dtype=maps.dtype) - WINDOW // 2
-    k = torch.exp(-x * x / (2 * SIGMA * SIGMA))
-    k = (k / k.sum()).expand(count, 1, 1, WINDOW).contiguous()
+    k = _taps(maps.dtype).expand(count, 1, 1, WINDOW).contiguous()
     # channels last with one group a channel takes oneDNN's direct path, 30x faster than planes; the batch axis has to lead
     # before the permutation, or its stride is not the one that oneDNN asks for
     planes = F.conv2d(maps[None].permute(0, 3, 1, 2), k, padding=(0, WINDOW // 2), groups=count)
     return F.conv2d(planes, k.transpose(2, 3).contiguous(), padding=(WINDOW // 2, 0), groups=count).permute(0, 2, 3, 1)[0]
+
+
+def _blur_by_matrices(maps: torch.Tensor) -> torch.Tensor:
+    """The same for a GPU, which is slow at many channels of a filter each, and fast at matrices that are mostly 0."""
+    down, across = (_band(n, maps.dtype, maps.device) for n in maps.shape[:2])
+    return (down @ maps.permute(2, 0, 1) @ across).permute(1, 2, 0)
+
+
+@lru_cache(maxsize=8)
+def _band(size: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """The window as a symmetric matrix `[size, size]`; shared, not to be written to."""
+    away = torch.arange(size)[:, None] - torch.arange(size) + WINDOW // 2
+    near = (away >= 0) & (away < WINDOW)
+    return torch.where(near, _taps(dtype)[away.clamp(0, WINDOW - 1)], 0.0).to(device)
+
+
+def _taps(dtype: torch.dtype) -> torch.Tensor:
+    x = torch.arange(WINDOW, dtype=dtype) - WINDOW // 2
+    k = torch.exp(-x * x / (2 * SIGMA * SIGMA))
+    return k / k.sum()
 
 
 def similarity(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -42,6 +42,10 @@ class Measured:
     views: dict[tuple[int, int], torch.Tensor]
     weight: float
 
+    def to(self, device: torch.device | str) -> Measured:
+        """The same depths on a device."""
+        return Measured({which: depth.to(device) for which, depth in self.views.items()}, self.weight)
+
 
 def grid_of(camera: Camera) -> Camera:
     """A view's camera on the grid, as fine as plates are."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from render import rasterize
+from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import interpolate
@@ -37,6 +38,10 @@ class Splats:
     def __len__(self) -> int:
         return len(self.reach)
 
+    def to(self, device: torch.device | str) -> Splats:
+        """The same splats on a device."""
+        return Splats({k: v.to(device) for k, v in self.fields.items()}, self.sizes, self.reach.to(device))
+
     def groups(self, sh_count: int) -> list[Gaussians]:
         """The splats of each group with the first `sh_count` coefficients; gradients flow back through one split a field."""
         *rest, sh = (self.fields[name] for name in FIELDS)
@@ -46,12 +51,12 @@ class Splats:
     def select(self, which: torch.Tensor, sh_count: int) -> Splats:
         """Copies of the splats at rising indices `which`, with the first `sh_count` coefficients, for a step to differentiate."""
         fields = {k: (v[:, :sh_count] if k == "sh" else v).detach().index_select(0, which).requires_grad_() for k, v in self.fields.items()}
-        ends = torch.searchsorted(which, torch.tensor(self.sizes).cumsum(0))
+        ends = torch.searchsorted(which, upload(torch.tensor(self.sizes).cumsum(0), which.device))
         return Splats(fields, ends.diff(prepend=ends.new_zeros(1)).tolist(), self.reach.index_select(0, which))
 
     def group_of(self) -> torch.Tensor:
         """Group index `[N]` of every splat."""
-        return torch.repeat_interleave(torch.arange(len(self.sizes)), torch.tensor(self.sizes))
+        return torch.repeat_interleave(torch.arange(len(self.sizes)), torch.tensor(self.sizes)).to(self.reach.device)
 
 
 def small_poses(deltas: torch.Tensor) -> torch.Tensor:

@@ -60,10 +60,11 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 with torch.no_grad():
                     frame = render_frame(scene, camera, ("alpha", "depth"))
                 assert frame.alpha is not None and frame.depth is not None
+                alpha, depth = frame.alpha.cpu(), frame.depth.cpu()
                 ground = world_directions(camera)[..., 2] < 0
                 below += int(ground.sum())
-                open_ += int((ground & (frame.alpha < SOLID)).sum())
-                errors.append(depth_errors(frame.depth.numpy(), points, camera))
+                open_ += int((ground & (alpha < SOLID)).sum())
+                errors.append(depth_errors(depth.numpy(), points, camera))
         found = np.concatenate(errors) if errors else np.zeros(0)
         row = {"shift_m": shift, "depth_error": float(np.median(found)) if len(found) else None, "points": len(found)}
         rows.append(row | {"holes": open_ / below if below else None, "flicker": flicker_along(scene, shift)})

@@ -38,6 +38,7 @@ def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> l
                 camera = scene.camera(name, began[view.index])
                 rgb = render_frame(read_out(scene, camera, rig[name]), camera).rgb
             assert rgb is not None
+            rgb = rgb.cpu()
             scored.append((view, psnr(rgb, recorded), ssim(rgb, recorded), psnr(mean, recorded), ssim(mean, recorded)))
         rows += [_row(name, "all", scored), _row(name, "driving", [s for s in scored if _driving(scene, s[0])])]
     return [r for r in rows if r is not None]

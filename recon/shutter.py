@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import torch
 
+from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 
@@ -30,11 +31,11 @@ def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: 
 def readout_shift(points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> torch.Tensor:
     """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`."""
     middle, travel = (0.5 * (first + last)).float(), (last - first).float()
+    middle, local = (upload(m, points.device) for m in (middle, middle[:3, :3].T @ travel[:3]))
     seen = points @ middle[:3, :3].T + middle[:3, 3]
     ahead = seen[:, 2:] > NEAR
     axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
     share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
     # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
     share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
-    local = middle[:3, :3].T @ travel[:3]
     return share * (points @ local[:, :3].T + local[:, 3])

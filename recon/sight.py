@@ -10,7 +10,7 @@ import warp as wp
 from recon.kernels.sight import mark
 from recon.model import MODEL, Splats
 from render.cull import view_sides
-from render.launch import run, stage, view
+from render.launch import run, stage, upload, view
 from scenes.camera import Camera
 from scenes.lenses import OpenCV, Pinhole
 
@@ -23,7 +23,7 @@ def in_sight(splats: Splats, eyes: Sequence[Eye], actors: Sequence[int]) -> torc
     still, device = splats.sizes[0], splats.reach.device
     seen = torch.zeros(len(splats), dtype=torch.uint8, device=device)
     if all(isinstance(camera.lens, Pinhole | OpenCV) for camera, *_ in eyes):
-        sides = torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes]).to(device)
+        sides = upload(torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes]), device)
         with stage(device):
             fields = [view(splats.fields[name], wp.vec3) for name in ("means", "log_scales")]
             run(mark, still, [*fields, view(sides, wp.vec4), view(seen, wp.uint8)], device)

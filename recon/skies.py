@@ -105,7 +105,7 @@ def seen_sky(scene: Scene) -> Sky:
             alpha = render_frame(scene, camera, ("alpha",)).alpha
             assert alpha is not None
             np.add.at(looks, _cells(np.ones(alpha.shape, bool), camera, len(own)), 1)
-            np.add.at(free, _cells((alpha < 0.5).numpy(), camera, len(own)), 1)
+            np.add.at(free, _cells((alpha < 0.5).cpu().numpy(), camera, len(own)), 1)
     picture = SkyPicture(len(own))
     picture.count = np.where(free > FREE * looks, free, 0)
     picture.sum = own * picture.count[..., None]

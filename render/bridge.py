@@ -133,6 +133,6 @@ class Rasterize(torch.autograd.Function):
         fields = [f for gradients in outputs for f in gradients]
         if not any(ctx.needs_input_grad[2:4]):
             return None, None, None, None, *more, *fields
-        of_pose = torch.stack([g.sum(0, dtype=torch.float64).cpu() for g in uniform])
+        of_pose = torch.stack([g.sum(0, dtype=torch.float64) for g in uniform]).cpu()
         g_lens = ways.lens_gradient(of_pose, len(ctx.like_lens))
         return None, None, ways.pose_gradient(of_pose).to(ctx.like_poses), g_lens.to(ctx.like_lens), *more, *fields

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 
@@ -77,6 +77,11 @@ class Frame:
     need: torch.Tensor | None = None
     reference: torch.Tensor | None = None
     trust: torch.Tensor | None = None
+
+    def to(self, device: torch.device | str) -> Frame:
+        """The same frame on a device."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "camera"}
+        return replace(self, **{name: t.to(device) for name, t in tensors.items() if t is not None})
 
     def outputs(self) -> dict[str, torch.Tensor]:
         """The outputs that were computed, by name."""

@@ -8,10 +8,13 @@ from functools import lru_cache
 import torch
 
 from render.kept import kept_beside
+from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.lenses import Orthographic
 from scenes.poses import interpolate, inverse
+
+HOST = torch.device("cpu")
 
 
 def camera_rays(camera: Camera) -> torch.Tensor:
@@ -29,9 +32,9 @@ def camera_origins(camera: Camera) -> torch.Tensor:
     return camera.lens.origins(camera.pixel_centres()).detach().to(torch.float32)
 
 
-def world_directions(camera: Camera) -> torch.Tensor:
+def world_directions(camera: Camera, device: torch.device = HOST) -> torch.Tensor:
     """float32 `[H, W, 3]` directions in the world through the pixel centres, of any length, each as the camera stood when it saw it."""
-    rays, ways = camera_rays(camera), turns(camera).to(torch.float32)
+    rays, ways = on_device(camera_rays(camera), device), upload(turns(camera).to(torch.float32), device)
     if len(ways) == 1:
         return rays @ ways[0].T
     return torch.einsum("hwj,hij->hwi" if camera.shutter == "rows" else "hwj,wij->hwi", rays, ways)

@@ -31,10 +31,23 @@ class Lattice:
 
     def at(self, points: torch.Tensor) -> torch.Tensor:
         """How far points `[N, 3]` move, `[N, 3]`. Differentiable in the nodes; where the points are counts as given."""
-        low, high = self.corners.to(points)
+        low, high = self.corners.to(points, non_blocking=True)  # the host need not wait for what it has said
         places = (2 * (points.detach() - low) / (high - low) - 1).flip(-1)  # grid_sample's first coordinate is that of the last axis
+        if points.device.type == "cuda" and self.nodes.requires_grad:
+            return self._by_hats(places.flip(-1))
         grid = self.nodes.to(points).permute(3, 0, 1, 2)[None]
         return F.grid_sample(grid, places[None, None, None], align_corners=True, padding_mode="border")[0, :, 0, 0].T
+
+    def _by_hats(self, places: torch.Tensor) -> torch.Tensor:
+        """The same at places `[N, 3]`, -1 to 1 between the corners, as one product of matrices: where points share a node, a GPU would add
+        up their gradients in any order."""
+        nodes, hats = self.nodes, []
+        for count, along in zip(nodes.shape[:3], places.unbind(-1), strict=True):
+            at = (0.5 * (along + 1) * (count - 1)).clamp(0, count - 1)
+            hats.append((1 - (at[:, None] - torch.arange(count, device=at.device)).abs()).clamp_min(0))
+        x, y, z = hats
+        weights = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).flatten(1)
+        return weights @ nodes.flatten(0, 2)
 
     @torch.no_grad()
     def origin(self, points: torch.Tensor) -> torch.Tensor:

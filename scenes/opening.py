@@ -25,6 +25,14 @@ def fresh(path: Path, overwrite: bool) -> Path:
     return path
 
 
+def check_device(device: str) -> None:
+    """ValueError where the machine has no such device."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
+
+
 def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
     """The scene of a folder, and what was dropped from it. ValueError where it is something else, empty, or not finite."""
     from scenes import Scene

@@ -226,8 +226,9 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_a_device_that_is_not_there_is_refused(door):
-    assert "leave --device cuda out" in door([*SHOOT, "--device", "cuda"], 1)[1]
+@pytest.mark.parametrize("command", [SHOOT, ["recon", "drive", "-o", "new"], ["pairs", "s1", "--data", "drive", "-o", "pairs"]])
+def test_a_device_that_is_not_there_is_refused(door, command):
+    assert "leave --device cuda out" in door([*command, "--device", "cuda"], 1)[1]
 
 
 def test_an_empty_scene_is_refused(door, tmp_path):

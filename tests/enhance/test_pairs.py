@@ -97,6 +97,23 @@ def test_what_is_put_back_leaves_the_photo_as_the_target(folder):
         assert (w.region[torch.isin(w.instance, torch.tensor(shard.meta["instances"], dtype=torch.int16))] > 0.6).all()
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_pairs_made_on_a_gpu_are_alike(street, recording, sources, folder, tmp_path):
+    refits = {
+        kind: [replace(r, references=References(sources.shots, r.references.recorded.to("cuda"))) for r in made]
+        for kind, made in sources.refits.items()
+    }
+    there = replace(sources, refits=refits)
+    out = make_pairs(street, recording, tmp_path / "pairs", KINDS, seed=1, sources=there, config=CONFIG, device="cuda")
+    pairs = PairSet(folder).shards, PairSet(out).shards
+    for here, other in zip(*pairs, strict=True):
+        a, b = here.window(), other.window()
+        assert here.path.relative_to(folder) == other.path.relative_to(out) and here.meta == other.meta
+        for name in ("input", "target", "region", "reference", "trust"):
+            assert (getattr(a, name) - getattr(b, name)).abs().mean() < 0.01, (here.path, name)
+        assert (a.instance != b.instance).float().mean() < 0.01
+
+
 def test_depth_is_kept_beside_the_frames(folder):
     from safetensors import safe_open
 

@@ -62,7 +62,7 @@ def test_a_refit_lies_where_the_scene_lies_and_is_kept(log, street, tmp_path, mo
 
 
 def test_each_half_of_the_rig_shows_the_other_halfs_views(log, street, tmp_path, monkeypatch):
-    monkeypatch.setattr("enhance.refits._fit", lambda part, path, config, size: _instead(street, path))
+    monkeypatch.setattr("enhance.refits._fit", lambda part, path, config, size, device: _instead(street, path))
     made = refits("crossref", street, log, tmp_path, QUICK, SIZE)
     assert {r.cameras for r in made} == {("front_camera",), ("left_camera",)}
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]})

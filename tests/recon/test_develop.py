@@ -1,7 +1,8 @@
+import pytest
 import torch
 import torch.nn.functional as F
 
-from recon.develop import Develop, developed
+from recon.develop import Develop, developed, developed_by_matrices
 from recon.kernels.develop import SKY_STEP
 from scenes import Camera, Pinhole
 from scenes.poses import yaw
@@ -22,11 +23,12 @@ def plainly(rgb, alpha, samples, exposure, shift):
     return (rgb + (1 - alpha)[..., None] * behind) @ exposure[:, :3].T + exposure[:, 3]
 
 
-def test_it_is_the_sum_that_torch_computes_and_so_are_its_gradients():
+@pytest.mark.parametrize("way", [Develop.apply, developed_by_matrices])
+def test_it_is_the_sum_that_torch_computes_and_so_are_its_gradients(way):
     for shift in ((0, 0), (7, 7), (3, 5)):
         ours, theirs = parts(), parts()
         weights = torch.rand(21, 37, 3, generator=torch.Generator().manual_seed(1))
-        one, other = Develop.apply(*ours, shift), plainly(*theirs, shift)
+        one, other = way(*ours, shift), plainly(*theirs, shift)
         torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
         (one * weights).sum().backward()
         (other * weights).sum().backward()

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from recon.losses import PictureLoss, similarity
+from recon.losses import PictureLoss, _blur, _blur_by_matrices, similarity
 from render.compare import ssim
 
 
@@ -21,6 +21,11 @@ def test_similarity_is_the_reported_metrics():
     # the borders differ: zeros here, reflection there
     a, b = pictures(120, 160, torch.float32)
     assert abs(float(similarity(a, b)[0]) - ssim(a, b)) < 0.01
+
+
+def test_matrices_blur_as_windows_do():
+    maps = torch.cat(pictures(23, 41, torch.float32), -1)
+    torch.testing.assert_close(_blur_by_matrices(maps), _blur(maps), atol=1e-6, rtol=1e-5)
 
 
 def test_equal_pictures_lose_nothing():

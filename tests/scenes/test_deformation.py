@@ -35,6 +35,14 @@ def bending() -> Scene:
     return replace(scene, actors=(replace(scene.actors[0], deformation=sways()), Actor(car("van"), scene.actors[0].trajectory, "veh_2")))
 
 
+def test_a_lattice_on_a_gpu_is_the_same():
+    dice = torch.Generator().manual_seed(5)
+    lattice = Lattice(CORNERS, torch.randn(2, 3, 4, 3, generator=dice))
+    points = CORNERS[0] + torch.rand(200, 3, generator=dice) * 1.4 * (CORNERS[1] - CORNERS[0]) - 0.5
+    places = 2 * (points - CORNERS[0]) / (CORNERS[1] - CORNERS[0]) - 1
+    torch.testing.assert_close(lattice._by_hats(places), lattice.at(points), atol=1e-5, rtol=1e-5)
+
+
 def test_a_lattice_is_linear_between_nodes_and_held_beyond():
     points = torch.tensor([[0.3, 0.2, 0.5], [-2.0, 0.9, 2.0], [9.0, -4.0, 7.0], [0.0, 0.0, -3.0]])
     moved = Lattice(CORNERS, leaning()).at(points)
