@@ -39,7 +39,7 @@ class Pairs:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit and render."""
     seed: int = 0
-    """Same seed, same pairs."""
+    """Same seed, same pairs; another leaves out other frames and fits longer or shorter, with more or fewer splats."""
 
     def run(self) -> None:
         from enhance.clips import PairConfig
@@ -57,7 +57,7 @@ class Pairs:
             scene, log = open_reconstruction(path), open_log(data)
             kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
-            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device)
+            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device, self.seed)
             with Progress(f"pairs {path.name}") as steps:
 
                 def say(done: int, total: int, name: str, steps: Progress = steps) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,10 +12,11 @@ from torch.nn import functional as F
 
 from enhance.clips import Clip, PairConfig
 from enhance.damage import Damage, Sources, make
-from enhance.refits import REFITS, Refit, as_reconstructed, refits, shots_of
+from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, refits, shots_of
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.assets import FEWEST_SPLATS, candidates
+from recon.early import SHORT as EARLY
 from recon.log import Log
 from render.references import References
 from scenes.atomic import atomic_file
@@ -89,16 +91,20 @@ def prepare_sources(
     skies: Sequence[str | Path] = (),
     databank: str | Path | None = None,
     device: str = "cpu",
+    seed: int = 0,
 ) -> Sources:
-    """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once), assets cut out of the
-    scene and those of a databank, and .hdr skies. Raises ValueError for an unknown kind, and where the rig has too few cameras for one."""
+    """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once; each seed leaves out other
+    things), assets cut out of the scene and those of a databank, and .hdr skies. Raises ValueError for an unknown kind, and where the rig
+    has too few cameras for one."""
     check_kinds(kinds)
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
-    early = stopped_early(log, folder / "early", names, device=device) if "underfit" in kinds else []
+    less = Less.drawn(seed)
+    half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
+    early = stopped_early(log, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []
     shots = shots_of(as_reconstructed(log, scene), scene) if "underfit" in kinds else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
-    made = {kind: refits(kind, scene, log, folder / "refits", device=device) for kind in REFITS if kind in kinds}
+    made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
     found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
     own = {c.track: c.asset for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS}
     bank = Databank(databank) if databank is not None else None

@@ -1,6 +1,6 @@
 """Reconstructions from less than was recorded: what they get wrong is the damage that the enhancer learns to undo.
 
-sparse    every fifth frame of every camera: views between are guessed
+sparse    some frames of every camera: views between are guessed
 cycle     pictures rendered from a path beside the recorded one: the recorded views are then what is off the path
 crossref  every other camera, by direction: each half of the rig is seen through the other half's reconstruction
 
@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from enhance.clips import scene_time
@@ -28,15 +29,31 @@ from scenes.scene import Scene
 from scenes.usd_scene import is_scene
 
 REFITS = ("sparse", "cycle", "crossref")
-SPARSE = 5
-"""Every how many frames one is kept; cars drive some 3 metres meanwhile."""
-
-ASIDE = 1.5
-"""Metres to the left of the recorded path from which the cycle's pictures are rendered."""
-
 NEVER = 2.0
 SHORT = FitConfig(steps=1500, budget=80_000, poses_from=NEVER)
 SIZE = (480, 270)
+
+
+@dataclass(frozen=True)
+class Less:
+    """How much less is fitted, and how."""
+
+    every: int = 5
+    """Of sparse: every how many frames one is kept; cars drive some 3 metres meanwhile."""
+    aside: float = 1.5
+    """Of cycle: metres to the left of the recorded path from which its pictures are rendered."""
+    fit: FitConfig = SHORT
+
+    @staticmethod
+    def drawn(seed: int) -> Less:
+        """By a seed; 0 gives the defaults. Others leave out more or less, and fit longer or shorter, with more or fewer splats: a network
+        that has only seen one fit learns that fit's mistakes."""
+        if seed == 0:
+            return Less()
+        rng = np.random.default_rng([seed, 11])
+        aside = float(rng.choice([-1, 1]) * rng.uniform(0.7, 3.0))
+        steps, budget = int(1500 * 2 ** rng.uniform(-0.7, 1.2)), int(80_000 * 2 ** rng.uniform(-1.0, 1.3))
+        return Less(int(rng.choice([3, 4, 5, 7, 10])), aside, replace(SHORT, steps=steps, budget=budget, seed=seed))
 
 
 @dataclass(frozen=True)
@@ -52,7 +69,7 @@ def refits(
     scene: Scene,
     log: Log,
     folder: str | Path,
-    config: FitConfig = SHORT,
+    less: Less = Less(),  # noqa: B008 - frozen
     size: tuple[int, int] = SIZE,
     device: str = "cpu",
 ) -> list[Refit]:
@@ -62,11 +79,11 @@ def refits(
     """
     log = as_reconstructed(log, scene)
     made = []
-    for name, part, shown in _parts(kind, scene.to(device), log, Path(folder), size):
+    for name, part, shown in _parts(kind, scene.to(device), log, Path(folder), less, size):
         path = Path(folder) / f"{name}_scene"
         if not is_scene(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _fit(part, path, config, size, device)
+            _fit(part, path, less.fit, size, device)
         loaded = load(path)
         assert isinstance(loaded, Scene)
         made.append(Refit(References(shots_of(part, scene), loaded.to(device)), shown))
@@ -100,14 +117,14 @@ def as_reconstructed(log: Log, scene: Scene) -> Log:
     return replace(log, ego=scene.ego, cameras=cameras, tracks=tuple(map(corrected, log.tracks)), front=())
 
 
-def _parts(kind: str, scene: Scene, log: Log, folder: Path, size: tuple[int, int]) -> list[tuple[str, Log, tuple[str, ...]]]:
+def _parts(kind: str, scene: Scene, log: Log, folder: Path, less: Less, size: tuple[int, int]) -> list[tuple[str, Log, tuple[str, ...]]]:
     """Name, recording to fit, and cameras to render, of each reconstruction of a kind."""
     everyone = tuple(log.cameras)
     if kind == "sparse":
-        few = {name: thinned(camera, SPARSE) for name, camera in log.cameras.items()}
+        few = {name: thinned(camera, less.every) for name, camera in log.cameras.items()}
         return [("sparse", replace(log, cameras=few), everyone)]
     if kind == "cycle":
-        return [("cycle", rendered_aside(scene, log, folder / "cycle_views", size), everyone)]
+        return [("cycle", rendered_aside(scene, log, folder / "cycle_views", less.aside, size), everyone)]
     halves = by_turns(log)
     if not all(halves):
         raise ValueError(f"crossref pairs need two cameras at least, and {log.name} has {', '.join(everyone)}; leave out that kind")
@@ -131,9 +148,9 @@ def by_turns(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(order[::2]), tuple(order[1::2])
 
 
-def rendered_aside(scene: Scene, log: Log, folder: Path, size: tuple[int, int]) -> Log:
-    """A recording of the scene from ASIDE metres to the left, its pictures rendered into `folder`."""
-    ego = scene.ego.shifted(lateral=ASIDE)
+def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tuple[int, int]) -> Log:
+    """A recording of the scene from so many metres to the left, its pictures rendered into `folder`."""
+    ego = scene.ego.shifted(lateral=metres)
     cameras = {}
     with Progress("cycle views", total=sum(map(len, log.cameras.values()))) as steps:
         for name, camera in log.cameras.items():

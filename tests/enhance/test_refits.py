@@ -6,7 +6,7 @@ import pytest
 import torch
 from made_drive import write_drive
 
-from enhance.refits import ASIDE, SHORT, SPARSE, as_reconstructed, by_turns, refits, rendered_aside, thinned
+from enhance.refits import SHORT, Less, as_reconstructed, by_turns, refits, rendered_aside, thinned
 from recon import open_log
 from recon.fit import Fit
 from render import render_frame
@@ -14,7 +14,7 @@ from render.compare import psnr
 from scenes.poses import inverse
 
 SIZE = (96, 54)
-QUICK = replace(SHORT, steps=25, budget=4000)
+QUICK = Less(fit=replace(SHORT, steps=25, budget=4000))
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +24,8 @@ def log(street, tmp_path_factory):
 
 def test_every_fifth_frame_is_kept_with_its_moment(log):
     camera = log.camera("front_camera")
-    few = thinned(camera, SPARSE)
-    assert len(few) == 2 and few.times_us.tolist() == camera.times_us[::SPARSE].tolist() and few.files == camera.files[::SPARSE]
+    few = thinned(camera, 5)
+    assert len(few) == 2 and few.times_us.tolist() == camera.times_us[::5].tolist() and few.files == camera.files[::5]
 
 
 def test_neighbouring_cameras_fall_into_different_halves(log):
@@ -41,12 +41,12 @@ def test_a_recording_gets_the_scenes_poses(log, street):
 
 
 def test_the_cycles_pictures_are_taken_from_beside_the_path(log, street, tmp_path):
-    aside = rendered_aside(street, as_reconstructed(log, street), tmp_path, SIZE)
+    aside = rendered_aside(street, as_reconstructed(log, street), tmp_path, 1.5, SIZE)
     for name, camera in aside.cameras.items():
         there = street.camera(name, int(camera.times_us[2]))
         body = street.ego.at(int(camera.times_us[2]))
         moved = inverse(body)[:3, :3] @ (camera.world_from_cam[2] - there.world_from_cam)[:3, 3]
-        assert torch.allclose(moved, torch.tensor([0.0, ASIDE, 0.0], dtype=torch.float64), atol=1e-6)
+        assert torch.allclose(moved, torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64), atol=1e-6)
         assert camera.image(2).shape == (SIZE[1], SIZE[0], 3)
 
 
@@ -74,3 +74,11 @@ def _instead(street, path):
     from scenes.files import save
 
     save(street, path)
+
+
+def test_seeds_leave_out_other_things():
+    assert Less.drawn(0) == Less() and Less.drawn(3) == Less.drawn(3)
+    drawn = [Less.drawn(seed) for seed in range(1, 9)]
+    assert len({less.every for less in drawn}) > 2 and {less.aside > 0 for less in drawn} == {True, False}
+    assert len({less.fit.budget for less in drawn}) == len({less.fit.steps for less in drawn}) == len(drawn)
+    assert all(0.7 <= abs(less.aside) <= 3 and 900 < less.fit.steps < 3500 and 40_000 <= less.fit.budget < 200_000 for less in drawn)
