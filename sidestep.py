@@ -24,7 +24,7 @@ from recon.commands import Assets, Recon
 from render.outputs import check_outputs
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
-from scenes.opening import UsageError, fresh, open_scene, open_view, warn
+from scenes.opening import UsageError, check_device, fresh, open_scene, open_view, warn
 from scenes.options import (
     Angle,
     Csv,
@@ -169,14 +169,6 @@ class Render:
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")
-
-
-def check_device(device: str) -> None:
-    """ValueError where the machine has no such device."""
-    import torch
-
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
 
 
 DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
 from enhance.objects import Box, Evidence, boxes, evidence, spots, whole_of
@@ -26,7 +27,7 @@ RIGHT = 0.35  # how often an object is right as it is
 
 
 @dataclass(frozen=True)
-class Objects:
+class Objects(Batch):
     """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
 
     evidence: Evidence

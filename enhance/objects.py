@@ -16,6 +16,7 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.shade import DOWN, SEEN, ShadeNet, at_most
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
@@ -30,7 +31,7 @@ LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(Batch):
     """What is read of B objects: colours are -1..1, places -1..1 in the object's box.
 
     seam    `[B, SEAM, 8, 4]`: colours from REACH pixels inside to REACH outside, and whether each is in the object

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.isp import alter, random_isp, random_pipeline
 from enhance.masks import random_mask
 from enhance.object_samples import Objects, ObjectSampler
@@ -33,7 +34,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclass(frozen=True)
-class Sample:
+class Sample(Batch):
     """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (objects' ids from 1, NaN where not told), flow,
     visible."""
 
@@ -43,6 +44,13 @@ class Sample:
     mask: torch.Tensor
     flow: torch.Tensor
     visible: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Images(Batch):
+    """Pictures `[B, 3, h, w]`."""
+
+    rgb: torch.Tensor
 
 
 class Photos:
@@ -97,13 +105,13 @@ class Sampler:
     def rng(self, step: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, step])
 
-    def images(self, step: int, count: int, size: int) -> torch.Tensor:
-        """Crops for the autoencoder `[count, 3, size, size]`: targets and inputs, some with other colours."""
+    def images(self, step: int, count: int, size: int) -> Images:
+        """Crops for the autoencoder: targets and inputs, some with other colours."""
         rng = self.rng(step)
         kinds = [*AFRESH, *(k for k in RENDERED if self.shards[k])]
         windows = [self._window(rng, kinds[rng.integers(len(kinds))], 1, size) for _ in range(count)]
         images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
-        return torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images])
+        return Images(torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images]))
 
     def batch(self, step: int, count: int, frames: int, size: int, kind: str | None = None) -> Sample:
         """`count` clips of `frames` frames, of one kind of damage or of all."""

@@ -84,3 +84,11 @@ def _kind(thing: Asset | Gaussians | Scene) -> str:
 def warn(lines: Sequence[str]) -> None:
     for line in lines:
         print(f"sidestep: warning: {line}", file=sys.stderr)
+
+
+def check_device(device: str) -> None:
+    """ValueError where the machine has no such device."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
