@@ -59,12 +59,13 @@ class Isp:
         gains = torch.tensor(
             [2.0 ** (self.exposure + self.red), 2.0**self.exposure, 2.0 ** (self.exposure + self.blue)], dtype=x.dtype, device=x.device
         )
-        x = x * gains[:, None, None]
-        luma = (x * torch.tensor(LUMA, dtype=x.dtype, device=x.device)[:, None, None]).sum(-3, keepdim=True)
-        x = luma + self.saturation * (x - luma)
+        # gains, and saturation about the luma that they leave, as one matrix: colours take most of the time in which a GPU waits for samples
+        grey = torch.tensor(LUMA, dtype=x.dtype, device=x.device).expand(3, 3)
+        mixed = (self.saturation * torch.eye(3, dtype=x.dtype, device=x.device) + (1 - self.saturation) * grey) * gains
+        x = (mixed @ x.flatten(-2)).view_as(x)
         x = (x + self.sharpen * (x - _blurred(x)) if self.sharpen else x).clamp(0, 1)
         x = x.clamp_min(1e-8) ** self.gamma if self.gamma != 1 else x
-        x = x * (1 + self.tone) / (1 + self.tone * x)
+        x = x * (1 + self.tone) / (1 + self.tone * x) if self.tone else x
         return linear_rgb_to_rgb(x).clamp(0, 1)
 
 

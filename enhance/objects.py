@@ -109,12 +109,21 @@ def boxes(instance: torch.Tensor) -> dict[int, Box]:
     return found
 
 
+def grid_of(rgb: torch.Tensor) -> torch.Tensor:
+    """Evenly spaced pixels of a frame `[3, H, W]`: `[3, ROWS, COLUMNS]`, of which the grid is all of them again."""
+    y, x = _grid(rgb.device)
+    return rgb[:, (y * rgb.shape[1]).long()[:, None], (x * rgb.shape[2]).long()]
+
+
 def whole_of(rgb: torch.Tensor) -> torch.Tensor:
-    """A grid of a frame's `[3, H, W]` pixels as Evidence has it, `[1, ROWS * COLUMNS, 5]`."""
-    y, x = ((torch.arange(n, device=rgb.device) + 0.5) / n for n in (ROWS, COLUMNS))
-    colours = rgb[:, (y * rgb.shape[1]).long()[:, None], (x * rgb.shape[2]).long()]
-    places = torch.stack(torch.meshgrid(y, x, indexing="ij")) * 2 - 1
-    return torch.cat([colours * 2 - 1, places]).flatten(1).T[None]
+    """`grid_of` a frame `[3, H, W]` as Evidence has it, `[1, ROWS * COLUMNS, 5]`."""
+    places = torch.stack(torch.meshgrid(*_grid(rgb.device), indexing="ij")) * 2 - 1
+    return torch.cat([grid_of(rgb) * 2 - 1, places]).flatten(1).T[None]
+
+
+def _grid(device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Rows and columns of the grid, from 0 to 1."""
+    return tuple((torch.arange(n, device=device) + 0.5) / n for n in (ROWS, COLUMNS))
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,8 @@ class Sampler:
         weights = np.array([KIND_WEIGHTS[k] for k in kinds])
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
-        w = w if kind == "isp_frame" else _regraded(rng, w)  # which knows its colours by those of right pictures alone
+        if kind != "isp_frame":  # which knows its colours by those of right pictures alone
+            w = _regraded(rng, w, made=kind in AFRESH)
         objects = w.instance.clamp_min(0).float()
         if kind == "isp":
             region = self._moving_mask(rng, w)
@@ -208,15 +209,20 @@ def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed:
     )
 
 
-def _regraded(rng: np.random.Generator, w: Window) -> Window:
+def _regraded(rng: np.random.Generator, w: Window, made: bool) -> Window:
     """Now and then the whole picture in other colours, damage and target alike: the network must compare within a picture.
 
-    Without this it learns what the few training places look like, and does harm in any other light.
+    Without this it learns what the few training places look like, and does harm in any other light. Of kinds that are `made` of the target
+    nothing else is used, and colours take most of a sample's time.
     """
     if rng.random() < 0.35:
         return w
     grade = random_isp(rng, 0.7)
-    return replace(w, target=grade(w.target), input=grade(w.input), reference=grade(w.reference))
+    target = grade(w.target)
+    if made:
+        return replace(w, target=target)
+    given = grade(w.input)
+    return replace(w, target=target, input=given, reference=grade(w.reference) if w.trust.any() else given)
 
 
 def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:

@@ -65,7 +65,7 @@ def train(
 ) -> Path:
     """Train on pairs and further photos; returns `out/enhancer.safetensors`.
 
-    minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly.
+    minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly, on a CPU.
     seed      of the first weights and of every sample drawn
     out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
     photos    folders of images and videos, for the autoencoder, objects' colours and clean frames
