@@ -59,7 +59,7 @@ class Isp:
         gains = torch.tensor(
             [2.0 ** (self.exposure + self.red), 2.0**self.exposure, 2.0 ** (self.exposure + self.blue)], dtype=x.dtype, device=x.device
         )
-        # gains, and saturation about the luma that they leave, as one matrix: colours take most of the time in which a GPU waits for samples
+        # gains, and saturation about the luma that they leave, as one matrix: a GPU waits for samples while colours are made
         grey = torch.tensor(LUMA, dtype=x.dtype, device=x.device).expand(3, 3)
         mixed = (self.saturation * torch.eye(3, dtype=x.dtype, device=x.device) + (1 - self.saturation) * grey) * gains
         x = (mixed @ x.flatten(-2)).view_as(x)

@@ -228,6 +228,8 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 def test_a_device_that_is_not_there_is_refused(door):
     assert "leave --device cuda out" in door([*SHOOT, "--device", "cuda"], 1)[1]
+    assert "leave --device cuda out" in door(["enhance", "clip.mp4", "-o", "x.mp4", "--device", "cuda"], 1)[1]
+    assert "leave --device cuda out" in door(["train", "pairs", "-o", "x", "--device", "cuda"], 1)[1]
 
 
 def test_an_empty_scene_is_refused(door, tmp_path):
