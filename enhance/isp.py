@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.filters import gaussian_blur2d
 
 LUMA = (0.2126, 0.7152, 0.0722)
 FLOOR = 0.02
@@ -50,8 +52,6 @@ class Isp:
 
     def __call__(self, rgb: torch.Tensor) -> torch.Tensor:
         """sRGB `[..., 3, H, W]` in 0..1 through these settings, clipped to 0..1 as a camera clips; each picture has its own noise."""
-        from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-
         x = rgb_to_linear_rgb(rgb.clamp(0, 1))
         if self.noise:
             drawn = torch.randn(x.shape, generator=torch.Generator().manual_seed(self.seed)).to(x)
@@ -101,8 +101,6 @@ def random_pipeline(rng: np.random.Generator, strength: float = 1.0) -> Isp:
 
 
 def _blurred(x: torch.Tensor) -> torch.Tensor:
-    from kornia.filters import gaussian_blur2d
-
     return gaussian_blur2d(x.reshape(-1, *x.shape[-3:]), (5, 5), (1.0, 1.0)).reshape(x.shape)
 
 

@@ -94,7 +94,7 @@ class Run:
         self.device = torch.device(device)
         self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
         self.autoencoder = channels_last(Autoencoder().to(self.device))
-        self.average = Net(net.config).to(self.device)
+        self.average = channels_last(Net(net.config).to(self.device))
         self.average.load_state_dict(net.state_dict())
         self.time = Time(net.config.width).to(self.device)
         self.net = channels_last(net.to(self.device))
