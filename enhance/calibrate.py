@@ -43,14 +43,15 @@ def repair_gain(net: Net, pairs: Sequence[Shard]) -> list[float]:
     are put right: without a mask and with one. 0 where there are no pairs."""
     gains = []
     for knowing in (0, 1):
-        errors = [torch.zeros(2)]
+        errors = [net.shut.new_zeros(2)]
         for shard in _spread(pairs):
             window, rgb, told = _picture(shard, knowing)
+            rgb, told, target = rgb.to(net.shut.device), told.to(net.shut.device), window.target.to(net.shut.device)
             mask = torch.where(told[:, 1:] > 0, told[:, :1], torch.nan)
             rgb = corrected(net.objects, rgb, mask)
             with autocast(rgb.device):
                 out = net(rgb, mask)
-            right = F.pad(window.target, (0, rgb.shape[-1] - shard.width, 0, rgb.shape[-2] - shard.height), mode="replicate")
+            right = F.pad(target, (0, rgb.shape[-1] - shard.width, 0, rgb.shape[-2] - shard.height), mode="replicate")
             errors.append(torch.stack([(x.clamp(0, 1) - right).square().mean() for x in (rgb, out.rgb)]))
         before, after = torch.stack(errors).sum(0).clamp_min(1e-12).tolist()
         gains.append(10 * math.log10(before / after))
@@ -62,6 +63,7 @@ def _choose(pair: torch.Tensor, clean: Sequence[Shard], changed: Changed, least:
     for knowing in range(len(pair)):
         errors = []
         for rgb, told in _pictures(clean, knowing):
+            rgb, told = rgb.to(pair.device), told.to(pair.device)
             make = changed(rgb, told)
             errors.append(torch.stack([(make(shut) - rgb).square().mean() for shut in SHUTS]))
         if errors:

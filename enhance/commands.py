@@ -87,6 +87,8 @@ class Train:
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
     """What of objects, shade, enhancer to train further; the rest of the weights stays as it is."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to train; the weights run on either."""
     resume: Flag = False
     """Go on from the folder's checkpoint."""
 
@@ -97,6 +99,7 @@ class Train:
 
         if not self.pairs:
             raise UsageError("give at least one folder of pairs; sidestep pairs makes them")
+        check_device(self.device)
         pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:
             say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
@@ -111,6 +114,7 @@ class Train:
                     photos=self.photos,
                     start=self.start,
                     only=self.only,
+                    device=self.device,
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
@@ -127,6 +131,8 @@ class Enhance:
     """The enhanced video, as clean.mp4."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to enhance."""
     overwrite: Overwrite = False
     """Replace an existing file."""
 
@@ -136,6 +142,7 @@ class Enhance:
         from render.progress import Progress
         from render.video import read_video
 
+        check_device(self.device)
         with Progress(f"enhance {self.clip.name}", read_video(self.clip).count) as steps:
-            count = enhance_video(self.clip, self.output, load_saying(self.weights), lambda done, total: steps.step())
+            count = enhance_video(self.clip, self.output, load_saying(self.weights, self.device), lambda done, total: steps.step())
         print(f"wrote {self.output}, {count} frames")

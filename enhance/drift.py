@@ -45,6 +45,7 @@ def drift(enhancer: Steps, pictures: Sequence[Frame | torch.Tensor], frames: int
         assert rgb is not None
         everywhere = torch.ones(rgb.shape[:2], dtype=torch.bool)
         better, memory = enhancer.step(frame, memory)
+        better = better.cpu()
         before, after = rgb.mean((0, 1)), better.mean((0, 1))
         colour = (after / after.mean()) / (before / before.mean())
         sharp = sharpness(better, everywhere) / max(sharpness(rgb, everywhere), 1e-9)

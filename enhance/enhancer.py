@@ -112,7 +112,8 @@ class Enhancer:
             rgb = torch.lerp(rgb, reference.clamp(0, 1), (trust * tiles.pixels().to(trust))[..., None])
         corrections: Corrections = {}
         if given.instance is not None:
-            planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), given.instance, memory.objects if memory else {})
+            instance = given.instance.to(self.device)
+            planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), instance, memory.objects if memory else {})
             rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
         told = given.instance is not None
         if not self.repairs[told]:

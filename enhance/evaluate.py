@@ -24,6 +24,7 @@ from render.compare import psnr, ssim
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
+from scenes.opening import check_device
 
 HIGHEST = 60.0
 """PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""
@@ -88,7 +89,7 @@ def evaluate(
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
     """
-    features, rows, others = shipped_features(), [], dict(beside or {})
+    features, rows, others = shipped_features(enhancer.device), [], dict(beside or {})
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
         some = (PUT_IN,) if shards and all("instances" in s.meta for s in shards) else ()
@@ -111,10 +112,10 @@ def spread(shards: Sequence[Shard], most: int | None) -> Sequence[Shard]:
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
 
 
-def shipped_features() -> Features:
-    """Those of the shipped autoencoder."""
-    encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False)
-    return lambda rgb: encoder.features(rgb)[:2]
+def shipped_features(device: str | torch.device = "cpu") -> Features:
+    """Those of the shipped autoencoder, computed on a device from pictures on the CPU, where they come back to."""
+    encoder = load_net(BUILTIN)[0].encoder.eval().requires_grad_(False).to(device)
+    return lambda rgb: [x.cpu() for x in encoder.features(rgb.to(device))[:2]]
 
 
 def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features) -> Row:
@@ -137,6 +138,7 @@ def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, f
                 better = torch.lerp(window.input[t], window.reference[t], window.trust[t]).permute(1, 2, 0)
             else:
                 better, memory = enhancer.step(frame, memory)
+            better = better.cpu()  # which waits for a GPU: only then was the time all spent
             times.append(1000 * (time.perf_counter() - start))
             _measure(found, better, window, t, features)
             error = None if previous is None else warp_error(better, previous, window.flow[t], window.visible[t])
@@ -223,11 +225,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--beside", default=[], action="append", help="a public model's checkpoint as a further row; may be repeated")
     parser.add_argument("--limit", type=int, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="where to enhance")
     parser.add_argument("--rollout", type=Path, help="a video; it and told clean frames of the pairs, back and forth for 500: what drifts?")
     options = parser.parse_args(arguments)
     try:
-        pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights)
-        others = {Path(path).name: Enhancer.load(path) for path in options.beside}
+        check_device(options.device)
+        pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights, options.device)
+        others = {Path(path).name: Enhancer.load(path, options.device) for path in options.beside}
         beside = {f"{one.about.get('model', 'weights')} ({name})": one for name, one in others.items()}
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))

@@ -16,5 +16,5 @@ def shrink_flow(flow: torch.Tensor, size: tuple[int, ...]) -> torch.Tensor:
     size = (size[0], size[1])
     share = F.adaptive_avg_pool2d(known, size)
     mean = F.adaptive_avg_pool2d(torch.nan_to_num(flow.float(), 0, 0, 0) * known, size) / share
-    scale = mean.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])[:, None, None]
-    return torch.where(share > 0, mean * scale, torch.nan)
+    mean = torch.stack([mean[:, 0] * (size[1] / flow.shape[-1]), mean[:, 1] * (size[0] / flow.shape[-2])], 1)
+    return torch.where(share > 0, mean, torch.nan)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.filters import gaussian_blur2d
 
 LUMA = (0.2126, 0.7152, 0.0722)
 FLOOR = 0.02
@@ -50,8 +52,6 @@ class Isp:
 
     def __call__(self, rgb: torch.Tensor) -> torch.Tensor:
         """sRGB `[..., 3, H, W]` in 0..1 through these settings, clipped to 0..1 as a camera clips; each picture has its own noise."""
-        from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-
         x = rgb_to_linear_rgb(rgb.clamp(0, 1))
         if self.noise:
             drawn = torch.randn(x.shape, generator=torch.Generator().manual_seed(self.seed)).to(x)
@@ -59,12 +59,13 @@ class Isp:
         gains = torch.tensor(
             [2.0 ** (self.exposure + self.red), 2.0**self.exposure, 2.0 ** (self.exposure + self.blue)], dtype=x.dtype, device=x.device
         )
-        x = x * gains[:, None, None]
-        luma = (x * torch.tensor(LUMA, dtype=x.dtype, device=x.device)[:, None, None]).sum(-3, keepdim=True)
-        x = luma + self.saturation * (x - luma)
+        # gains, and saturation about the luma that they leave, as one matrix: a GPU waits for samples while colours are made
+        grey = torch.tensor(LUMA, dtype=x.dtype, device=x.device).expand(3, 3)
+        mixed = (self.saturation * torch.eye(3, dtype=x.dtype, device=x.device) + (1 - self.saturation) * grey) * gains
+        x = (mixed @ x.flatten(-2)).view_as(x)
         x = (x + self.sharpen * (x - _blurred(x)) if self.sharpen else x).clamp(0, 1)
         x = x.clamp_min(1e-8) ** self.gamma if self.gamma != 1 else x
-        x = x * (1 + self.tone) / (1 + self.tone * x)
+        x = x * (1 + self.tone) / (1 + self.tone * x) if self.tone else x
         return linear_rgb_to_rgb(x).clamp(0, 1)
 
 
@@ -100,8 +101,6 @@ def random_pipeline(rng: np.random.Generator, strength: float = 1.0) -> Isp:
 
 
 def _blurred(x: torch.Tensor) -> torch.Tensor:
-    from kornia.filters import gaussian_blur2d
-
     return gaussian_blur2d(x.reshape(-1, *x.shape[-3:]), (5, 5), (1.0, 1.0)).reshape(x.shape)
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
-from enhance.objects import Box, Evidence, boxes, evidence, spots, whole_of
+from enhance.objects import Box, Evidence, boxes, evidence, grid_of, spots, whole_of
 from enhance.shards import RENDERED, Shard
 
 PIXELS = 384
@@ -26,7 +27,7 @@ RIGHT = 0.35  # how often an object is right as it is
 
 
 @dataclass(frozen=True)
-class Objects:
+class Objects(Batch):
     """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
 
     evidence: Evidence
@@ -70,7 +71,7 @@ class ObjectSampler:
         ids = [i for i in found if some is None or i in some]
         if not ids:
             return []
-        areas = np.array([float((instance == i).sum()) for i in ids]) ** 0.5
+        areas = np.bincount(instance.numpy().ravel(), minlength=256)[ids] ** 0.5
         pick = ids[rng.choice(len(ids), p=areas / areas.sum())]
         return self._altered(rng, given, wanted, instance, pick, found[pick], fresh)
 
@@ -107,13 +108,14 @@ class ObjectSampler:
         judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
         y, x = torch.cat([at.yx, judged]).unbind(1)
         strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]
-        thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1).float() / 255
+        thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1)
+        grid = grid_of(thin).float() / 255
         soft = F.avg_pool2d(mask[None].float(), 3, 1, 1)[0] if rng.random() < 0.7 else mask.float()
         others = ((ids > 0) & (ids < 255) & ~mask)[y, x][None, None].float()
         height = box.placed(judged[:, 0] + box.outer_rows.start, judged[:, 1] + box.outer_columns.start)[:, 0]
         drawn = []
         for _ in range(VARIANTS):
-            (seen, target), whole = strips, thin
+            (seen, target), whole = strips, grid
             if rng.random() < 0.65 and not mask.all():  # the whole picture in another light: what counts is the difference within it
                 grade = random_isp(rng, 0.7)
                 seen, target, whole = grade(seen), grade(target), grade(whole)

@@ -16,6 +16,7 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.shade import DOWN, SEEN, ShadeNet, at_most
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
@@ -30,7 +31,7 @@ LUMA = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(Batch):
     """What is read of B objects: colours are -1..1, places -1..1 in the object's box.
 
     seam    `[B, SEAM, 8, 4]`: colours from REACH pixels inside to REACH outside, and whether each is in the object
@@ -108,12 +109,21 @@ def boxes(instance: torch.Tensor) -> dict[int, Box]:
     return found
 
 
+def grid_of(rgb: torch.Tensor) -> torch.Tensor:
+    """Evenly spaced pixels of a frame `[3, H, W]`: `[3, ROWS, COLUMNS]`, of which the grid is all of them again."""
+    y, x = _grid(rgb.device)
+    return rgb[:, (y * rgb.shape[1]).long()[:, None], (x * rgb.shape[2]).long()]
+
+
 def whole_of(rgb: torch.Tensor) -> torch.Tensor:
-    """A grid of a frame's `[3, H, W]` pixels as Evidence has it, `[1, ROWS * COLUMNS, 5]`."""
-    y, x = ((torch.arange(n, device=rgb.device) + 0.5) / n for n in (ROWS, COLUMNS))
-    colours = rgb[:, (y * rgb.shape[1]).long()[:, None], (x * rgb.shape[2]).long()]
-    places = torch.stack(torch.meshgrid(y, x, indexing="ij")) * 2 - 1
-    return torch.cat([colours * 2 - 1, places]).flatten(1).T[None]
+    """`grid_of` a frame `[3, H, W]` as Evidence has it, `[1, ROWS * COLUMNS, 5]`."""
+    places = torch.stack(torch.meshgrid(*_grid(rgb.device), indexing="ij")) * 2 - 1
+    return torch.cat([grid_of(rgb) * 2 - 1, places]).flatten(1).T[None]
+
+
+def _grid(device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Rows and columns of the grid, from 0 to 1."""
+    return tuple((torch.arange(n, device=device) + 0.5) / n for n in (ROWS, COLUMNS))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class Time(nn.Module):
         self.embed = nn.Sequential(nn.Linear(2 * WAVES, width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, t: torch.Tensor) -> torch.Tensor:
-        both = torch.cat([t, t.new_tensor([FIXED])])
+        both = torch.cat([t, t.new_full((1,), FIXED)])
         angles = both[:, None] * math.pi * 2 ** (torch.arange(WAVES, device=t.device) / 2)
         found = self.embed(torch.cat([angles.sin(), angles.cos()], 1))
         return (found[:-1] - found[-1:])[:, None, None]
@@ -45,8 +45,9 @@ def velocity(net: Net, time: Time, x: torch.Tensor, t: torch.Tensor) -> torch.Te
 
 
 def flow_matching_loss(net: Net, time: Time, x0: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Mean squared error of the velocity of clean latents `x0` `[B, 16, h, w]`, at times drawn around the middle (logit-normal)."""
-    t = torch.sigmoid(torch.randn(len(x0), generator=generator)).to(x0)
-    noise = torch.randn(x0.shape, generator=generator).to(x0)
+    """Mean squared error of the velocity of clean latents `x0` `[B, 16, h, w]`, at times drawn around the middle (logit-normal)
+    by a generator of their device."""
+    t = torch.sigmoid(torch.randn(len(x0), generator=generator, device=x0.device)).to(x0)
+    noise = torch.randn(x0.shape, generator=generator, device=x0.device).to(x0)
     x = torch.lerp(x0, noise, t[:, None, None, None])
     return (velocity(net, time, x, t) - (noise - x0)).square().mean()

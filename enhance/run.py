@@ -63,6 +63,13 @@ class TrainConfig:
     kinds: tuple[str, ...] = KINDS
     """Kinds of damage to learn from, of those that the pairs hold."""
 
+    @classmethod
+    def of(cls, device: torch.device) -> TrainConfig:
+        """What suits a device. A GPU's step is thousands of small kernels, whose begin costs more than four of the CPU's batches (reckoned
+        for an H100, not measured); four are about what 15 cores draw meanwhile. Shadows, whose objects one core reads first, need
+        seconds before they begin. Crops stay: twice the smallest is all that frames of 360 rows hold."""
+        return cls() if device.type == "cpu" else cls(images=32, clips=12, looked_at=128, shade=0.03)
+
     def __post_init__(self):
         if self.temporal_every < 2:
             raise ValueError(f"temporal_every must be at least 2, got {self.temporal_every}")
@@ -73,16 +80,27 @@ class TrainConfig:
 class Run:
     """All that a resumed training needs: networks, optimisers, averaged weights, and how far each stage is."""
 
-    def __init__(self, config: TrainConfig, net: Net, minutes: float | None, steps: int | None, seed: int, stages: Sequence[str]):
+    def __init__(
+        self,
+        config: TrainConfig,
+        net: Net,
+        minutes: float | None,
+        steps: int | None,
+        seed: int,
+        stages: Sequence[str],
+        device: str | torch.device = "cpu",
+    ):
         torch.manual_seed(seed)
+        self.device = torch.device(device)
         self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
-        self.autoencoder = channels_last(Autoencoder())
-        self.average = Net(net.config)
+        self.autoencoder = channels_last(Autoencoder().to(self.device))
+        self.average = channels_last(Net(net.config).to(self.device))
         self.average.load_state_dict(net.state_dict())
-        self.time = Time(net.config.width)
-        self.net = channels_last(net)
+        self.time = Time(net.config.width).to(self.device)
+        self.net = channels_last(net.to(self.device))
         self.step = dict.fromkeys(STAGES, 0)
         self.seconds = dict.fromkeys(STAGES, 0.0)
+        self._loss: dict[str, torch.Tensor] = {}
         self.optimiser = {
             "autoencoder": torch.optim.AdamW(self.autoencoder.parameters(), betas=(0.9, 0.98), weight_decay=1e-4),
             "prior": torch.optim.AdamW(
@@ -104,7 +122,23 @@ class Run:
             f"optimiser {k}": v for k, v in self.optimiser.items()
         }
 
+    def lost(self, stage: str, loss: torch.Tensor) -> None:
+        """Count a step and its loss, which is not read here: that would wait for the GPU."""
+        loss = loss.detach()
+        self._loss[stage] = torch.lerp(self._loss.get(stage, loss), loss, 0.02)
+        self.step[stage] += 1
+
+    def loss(self, stage: str) -> float:
+        """The stage's loss, smoothed over some 50 steps. ValueError where one since the start was not finite."""
+        loss = float(self._loss.get(stage, 0.0))
+        if not np.isfinite(loss):
+            where = f"by step {self.step[stage]}"
+            raise ValueError(f"the {stage}'s loss is {loss} {where}; check the pairs for damaged files, or lower the rate")
+        return loss
+
     def save(self, path: Path) -> None:
+        for stage in STAGES:  # weights that are spoilt must not take the place of good ones
+            self.loss(stage)
         state = {name: part.state_dict() for name, part in self.parts().items()}
         facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds}
         # through Python's file, which says that the disk is full; torch's own writer says "unexpected pos"

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.ahead import Batch
 from enhance.isp import alter, random_isp, random_pipeline
 from enhance.masks import random_mask
 from enhance.object_samples import Objects, ObjectSampler
@@ -33,7 +34,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclass(frozen=True)
-class Sample:
+class Sample(Batch):
     """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (objects' ids from 1, NaN where not told), flow,
     visible."""
 
@@ -43,6 +44,13 @@ class Sample:
     mask: torch.Tensor
     flow: torch.Tensor
     visible: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Images(Batch):
+    """Pictures `[B, 3, h, w]`."""
+
+    rgb: torch.Tensor
 
 
 class Photos:
@@ -97,13 +105,13 @@ class Sampler:
     def rng(self, step: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, step])
 
-    def images(self, step: int, count: int, size: int) -> torch.Tensor:
-        """Crops for the autoencoder `[count, 3, size, size]`: targets and inputs, some with other colours."""
+    def images(self, step: int, count: int, size: int) -> Images:
+        """Crops for the autoencoder: targets and inputs, some with other colours."""
         rng = self.rng(step)
         kinds = [*AFRESH, *(k for k in RENDERED if self.shards[k])]
         windows = [self._window(rng, kinds[rng.integers(len(kinds))], 1, size) for _ in range(count)]
         images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
-        return torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images])
+        return Images(torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images]))
 
     def batch(self, step: int, count: int, frames: int, size: int, kind: str | None = None) -> Sample:
         """`count` clips of `frames` frames, of one kind of damage or of all."""
@@ -124,7 +132,8 @@ class Sampler:
         weights = np.array([KIND_WEIGHTS[k] for k in kinds])
         kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         w = self._window(rng, kind, frames, size)
-        w = w if kind == "isp_frame" else _regraded(rng, w)  # which knows its colours by those of right pictures alone
+        if kind != "isp_frame":  # which knows its colours by those of right pictures alone
+            w = _regraded(rng, w, made=kind in AFRESH)
         objects = w.instance.clamp_min(0).float()
         if kind == "isp":
             region = self._moving_mask(rng, w)
@@ -200,15 +209,20 @@ def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed:
     )
 
 
-def _regraded(rng: np.random.Generator, w: Window) -> Window:
+def _regraded(rng: np.random.Generator, w: Window, made: bool) -> Window:
     """Now and then the whole picture in other colours, damage and target alike: the network must compare within a picture.
 
-    Without this it learns what the few training places look like, and does harm in any other light.
+    Without this it learns what the few training places look like, and does harm in any other light. Of kinds that are `made` of the target
+    nothing else is used, and colours take most of a sample's time.
     """
     if rng.random() < 0.35:
         return w
     grade = random_isp(rng, 0.7)
-    return replace(w, target=grade(w.target), input=grade(w.input), reference=grade(w.reference))
+    target = grade(w.target)
+    if made:
+        return replace(w, target=target)
+    given = grade(w.input)
+    return replace(w, target=target, input=given, reference=grade(w.reference) if w.trust.any() else given)
 
 
 def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:

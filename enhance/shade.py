@@ -7,6 +7,8 @@ missing, the brightness of the ground at the same knots tells.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import nn
 
@@ -84,8 +86,14 @@ def shaded(rgb: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     return srgb_from_linear(linear_from_srgb(rgb.clamp(0, 1)) * torch.exp(-depth)[..., None])
 
 
+@lru_cache(maxsize=8)
+def _neighbours(knots: tuple[float, ...], device: torch.device) -> tuple[torch.Tensor, ...]:
+    """For each inner knot the one before, itself and the one after: kept, for they are asked for many times a picture."""
+    return tuple(torch.tensor(knots[i : len(knots) - 2 + i], device=device) for i in range(3))
+
+
 def _hats(x: torch.Tensor, knots: tuple[float, ...]) -> torch.Tensor:
     """How much each inner knot counts at `x` `[...]`: 1 there, falling to 0 at its neighbours, `[..., len(knots) - 2]`."""
-    before, at, after = (torch.tensor(knots[i : len(knots) - 2 + i], device=x.device) for i in range(3))
+    before, at, after = _neighbours(knots, x.device)
     x = x[..., None]
     return torch.minimum((x - before) / (at - before), (after - x) / (after - at)).clamp_min(0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from enhance.ahead import Batch
 from enhance.isp import random_isp
 from enhance.objects import boxes
 from enhance.shade import read_ground
@@ -24,7 +25,7 @@ NOISE = 0.05
 
 
 @dataclass(frozen=True)
-class Grounds:
+class Grounds(Batch):
     """What is read of the ground by B objects `[B, READ]`, and pixels of it `[B, PIXELS, 3]` as given and as they should be, at `places`
     `[B, PIXELS, 2]`."""
 

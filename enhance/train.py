@@ -7,27 +7,33 @@ their past, with any number of latents from 0 to K, so that it never sees a past
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.ahead import Batch, drawn, workers
 from enhance.calibrate import calibrate_gate, repair_gain
 from enhance.corrections import corrected
 from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
 from enhance.net import Net, NetConfig
-from enhance.objects import changed
+from enhance.object_samples import Objects
+from enhance.objects import ObjectNet, changed
 from enhance.past import Past
 from enhance.precision import autocast
 from enhance.prior import flow_matching_loss
 from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig
-from enhance.samples import Photos, Sample, Sampler
+from enhance.samples import Images, Photos, Sample, Sampler
 from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
+from enhance.shade_samples import Grounds
 from enhance.shards import PairSet
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
 from scenes.names import unknown
@@ -55,10 +61,11 @@ def train(
     save_every: float = 60.0,
     start: str | Path | None = None,
     only: Sequence[str] | None = None,
+    device: str | torch.device = "cpu",
 ) -> Path:
     """Train on pairs and further photos; returns `out/enhancer.safetensors`.
 
-    minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly.
+    minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly, on a CPU.
     seed      of the first weights and of every sample drawn
     out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
     photos    folders of images and videos, for the autoencoder, objects' colours and clean frames
@@ -66,6 +73,8 @@ def train(
     progress  called with the share done, 0..1, and a line of words
     start     weights to train further, "builtin" or a file; their autoencoder is kept
     only      of STAGES those to train, which takes weights to start from; the others' parts stay as they are
+    device    where to train; a run may be resumed on another
+    config    `TrainConfig.of` the device where None
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
     """
@@ -83,34 +92,37 @@ def train(
     if checkpoint.exists() and not resume:
         raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
-    config = config or TrainConfig()
+    config = config or TrainConfig.of(torch.device(device))
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
     clean = pair_set.of("clean", "train") if pair_set and "clean" in config.kinds else []
     begun, origin = load_net(BUILTIN if start == "builtin" else start) if start is not None else (None, None)
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    run = Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER))
+    run = Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER), device)
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
     report = _Reporter(run, progress)
     try:
-        _stage(run, "autoencoder", lambda step: _autoencoder_step(run, sampler, step), checkpoint, save_every, report)
+        go = partial(_stage, run, checkpoint, save_every, report)
+        go("autoencoder", partial(_images, run, sampler), partial(_autoencoder_step, run))
         if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
-        _stage(run, "prior", lambda step: _prior_step(run, sampler, step), checkpoint, save_every, report)
-        _stage(run, "objects", lambda step: _objects_step(run, sampler, step), checkpoint, save_every, report)
+        go("prior", partial(_right, run, sampler), partial(_prior_step, run))
+        go("objects", lambda step: sampler.objects(4 * step + 3, config.looked_at), partial(_objects_step, run))
         if "objects" in run.stages:
             run.net.objects.usual.copy_(usual_changes(sampler.objects(3, USUAL)))
-        _stage(run, "shade", lambda step: _shade_step(run, sampler, step), checkpoint, save_every, report)
+        # its objects are read once and then cheap to draw: further processes would each have to read them
+        go("shade", lambda step: sampler.grounds(step, 2 * config.looked_at), partial(_shade_step, run), processes=0)
         now = run.net.state_dict()
         frozen = {k: v for k, v in now.items() if k.startswith(FROZEN)}
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
         perceptual = PatchPerceptual(run.net.encoder)
-        _stage(run, "enhancer", lambda step: _enhancer_step(run, sampler, perceptual, step), checkpoint, save_every, report)
+        objects = copy.deepcopy(run.net.objects).cpu()
+        go("enhancer", partial(_clips, run, sampler, objects), partial(_enhancer_step, run, perceptual))
     except KeyboardInterrupt:
         run.save(checkpoint)
         raise
@@ -128,29 +140,41 @@ def train(
     return weights
 
 
-def _stage(run: Run, name: str, step: Callable[[int], float], checkpoint: Path, save_every: float, report: _Reporter) -> None:
+def _stage(
+    run: Run,
+    checkpoint: Path,
+    save_every: float,
+    report: _Reporter,
+    name: str,
+    draw: Callable[[int], Batch | None],
+    step: Callable[[Any, int], torch.Tensor],
+    processes: int | None = None,
+) -> None:
+    batches = drawn(draw, run.step[name], run.device, workers(run.device) if processes is None else processes)
     saved = time.monotonic()
     while run.done(name) < 1:
         start = time.monotonic()
         run.set_rate(name)
-        loss = step(run.step[name])
-        run.step[name] += 1
+        run.lost(name, step(next(batches), run.step[name]))
         run.seconds[name] += time.monotonic() - start
-        report(name, loss)
+        report(name)
         if time.monotonic() - saved > save_every:
             run.save(checkpoint)
             saved = time.monotonic()
+    run.loss(name)
 
 
-def _autoencoder_step(run: Run, sampler: Sampler, step: int) -> float:
-    size = max(32, run.config.crop * 2 // 3 // 16 * 16)
-    x = sampler.images(2 * step, 2 * run.config.images, size).contiguous(memory_format=torch.channels_last)
+def _images(run: Run, sampler: Sampler, step: int) -> Images:
+    return sampler.images(2 * step, 2 * run.config.images, max(32, run.config.crop * 2 // 3 // 16 * 16))
+
+
+def _autoencoder_step(run: Run, batch: Images, step: int) -> torch.Tensor:
+    x = batch.rgb.contiguous(memory_format=torch.channels_last)
     torch.manual_seed(run.seed * 1_000_003 + step)
     with autocast(x.device):
         y, latent = run.autoencoder(x, noise=0.05)
     loss = autoencoder_loss(y.float(), x, latent.float())
-    _update(run, "autoencoder", [loss])
-    return float(loss.detach())
+    return _update(run, "autoencoder", [loss])
 
 
 def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
@@ -161,30 +185,32 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
     return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
 
 
-def _prior_step(run: Run, sampler: Sampler, step: int) -> float:
-    right = sampler.batch(5 * step + 4, run.config.images, 1, run.config.crop, "clean").target[:, 0]
+def _right(run: Run, sampler: Sampler, step: int) -> Images:
+    return Images(sampler.batch(5 * step + 4, run.config.images, 1, run.config.crop, "clean").target[:, 0])
+
+
+def _prior_step(run: Run, batch: Images, step: int) -> torch.Tensor:
+    right = batch.rgb
     with torch.no_grad(), autocast(right.device):
         latents = run.net.encoder(right.contiguous(memory_format=torch.channels_last))
-    drawn = torch.Generator().manual_seed(run.seed * 1_000_003 + step)
+    generator = torch.Generator(right.device).manual_seed(run.seed * 1_000_003 + step)
     with autocast(right.device):
-        loss = flow_matching_loss(run.net, run.time, latents.float(), drawn)
+        loss = flow_matching_loss(run.net, run.time, latents.float(), generator)
     return _update(run, "prior", [loss])
 
 
-def _objects_step(run: Run, sampler: Sampler, step: int) -> float:
-    drawn = sampler.objects(4 * step + 3, run.config.looked_at)
-    with autocast(drawn.given.device):
-        coefficients = run.net.objects(drawn.evidence)
-    error = (drawn.given + changed(drawn.given, drawn.height, coefficients) - drawn.target).square().mean((1, 2))
+def _objects_step(run: Run, batch: Objects, step: int) -> torch.Tensor:
+    with autocast(batch.given.device):
+        coefficients = run.net.objects(batch.evidence)
+    error = (batch.given + changed(batch.given, batch.height, coefficients) - batch.target).square().mean((1, 2))
     return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
 
 
-def _shade_step(run: Run, sampler: Sampler, step: int) -> float:
-    drawn = sampler.grounds(step, 2 * run.config.looked_at)
-    if drawn is None:
-        return 0.0
-    dark = shaded(drawn.given, optical_depth(drawn.places, run.net.objects.shade(drawn.read)))
-    error = (dark - drawn.target).square().mean((1, 2))
+def _shade_step(run: Run, batch: Grounds | None, step: int) -> torch.Tensor:
+    if batch is None:
+        return torch.zeros(())
+    dark = shaded(batch.given, optical_depth(batch.places, run.net.objects.shade(batch.read)))
+    error = (dark - batch.target).square().mean((1, 2))
     return _update(run, "shade", [torch.log(error + SHADE_NEAR_ENOUGH).mean()])
 
 
@@ -192,19 +218,28 @@ CROPS = (1.0, 1.0, 1.5, 2.0)
 """Sides of the crops that batches are made of, against the smallest: attention must work on small pictures and on large ones."""
 
 
-def _enhancer_step(run: Run, sampler: Sampler, perceptual: PatchPerceptual, step: int) -> float:
+def _crops(run: Run, step: int) -> tuple[np.random.Generator, float]:
+    """What is drawn for a step beside its sample, and first of it how large its crops are."""
+    rng = np.random.default_rng([run.seed, 7, step])
+    return rng, float(rng.choice(CROPS))
+
+
+def _clips(run: Run, sampler: Sampler, objects: ObjectNet, step: int) -> Sample:
+    """A sample with its told objects corrected, which is done here because it is done one object after the other."""
     c = run.config
     temporal = step % c.temporal_every == 1 and c.frames > 1
-    rng = np.random.default_rng([run.seed, 7, step])
-    scale = float(rng.choice(CROPS))
+    _, scale = _crops(run, step)
     count = max(1, round((c.clips if temporal else c.images) / scale**2))
-    sample = sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
-    losses = rollout_losses(run.net, sample, perceptual, c, rng)
-    total = _update(run, "enhancer", losses)
-    decay = min(0.998, (1 + run.step["enhancer"]) / (10 + run.step["enhancer"]))
+    s = sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
+    return replace(s, input=corrected(objects, s.input.flatten(0, 1), s.mask.flatten(0, 1)).view_as(s.input))
+
+
+def _enhancer_step(run: Run, perceptual: PatchPerceptual, sample: Sample, step: int) -> torch.Tensor:
+    rng, _ = _crops(run, step)
+    total = _update(run, "enhancer", rollout_losses(run.net, sample, perceptual, run.config, rng))
+    decay = min(0.998, (1 + step) / (10 + step))
     with torch.no_grad():
-        for mean, now in zip(run.average.parameters(), run.net.parameters(), strict=True):
-            mean.lerp_(now, 1 - decay)
+        torch._foreach_lerp_(list(run.average.parameters()), list(run.net.parameters()), 1 - decay)
     return total
 
 
@@ -218,7 +253,7 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
     moved = rng.random() < 0.75
     past: Past | None = None
     for t in range(frames):
-        given, target, region = corrected(net.objects, sample.input[:, t], sample.mask[:, t]), sample.target[:, t], sample.region[:, t]
+        given, target, region = sample.input[:, t], sample.target[:, t], sample.region[:, t]
         previous = past.rgb if past is not None else None
         if past is not None:
             past = replace(past, latents=past.latents[:, :longest], valid=past.valid[:, :longest])
@@ -237,14 +272,12 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
         yield loss / frames
 
 
-def _update(run: Run, stage: str, losses) -> float:
-    optimiser, total = run.optimiser[stage], 0.0
+def _update(run: Run, stage: str, losses: Iterable[torch.Tensor]) -> torch.Tensor:
+    optimiser, total = run.optimiser[stage], torch.zeros((), device=run.device)
     optimiser.zero_grad()
     for loss in losses:
         loss.backward()
-        total += float(loss.detach())
-    if not np.isfinite(total):
-        raise ValueError(f"the {stage}'s loss is {total} at step {run.step[stage]}; check the pairs for damaged files, or lower the rate")
+        total += loss.detach()
     torch.nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], 1.0)
     optimiser.step()
     return total
@@ -255,12 +288,10 @@ class _Reporter:
 
     def __init__(self, run: Run, progress: Callable[[float, str], None] | None):
         self.run, self.progress, self.told = run, progress, 0.0
-        self.loss: dict[str, float] = {}
 
-    def __call__(self, stage: str, loss: float) -> None:
-        self.loss[stage] = 0.98 * self.loss.get(stage, loss) + 0.02 * loss
+    def __call__(self, stage: str) -> None:
         if self.progress is None or (time.monotonic() - self.told < 5 and self.run.done(stage) < 1):
             return
         self.told = time.monotonic()
         done = sum(self.run.share(name) * self.run.done(name) for name in STAGES)
-        self.progress(done, f"{stage}: step {self.run.step[stage]}, loss {self.loss[stage]:.4f}")
+        self.progress(done, f"{stage}: step {self.run.step[stage]}, loss {self.run.loss(stage):.4f}")

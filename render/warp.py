@@ -17,9 +17,8 @@ def warp(previous: torch.Tensor, flow_prev: torch.Tensor) -> tuple[torch.Tensor,
     h, w = previous.shape[-2:]
     total = flow_prev[:, :1] + flow_prev[:, 1:]
     known = total - total == 0
-    scale = flow_prev.new_tensor([2 / w, 2 / h], dtype=torch.float32)
     flow = torch.nan_to_num(flow_prev, 0, 0, 0).permute(0, 2, 3, 1).float()
-    grid = torch.addcmul(_centres(h, w, flow.device), flow, scale)
+    grid = torch.addcmul(_centres(h, w, flow.device), flow, _steps(h, w, flow.device))
     x, y = grid[:, None].unbind(-1)
     inside = known & (torch.maximum(x.abs(), y.abs()) < 1)
     moved = F.grid_sample(previous.float(), grid, mode="bilinear", padding_mode="border", align_corners=False)
@@ -32,6 +31,12 @@ def _centres(height: int, width: int, device: torch.device) -> torch.Tensor:
     """Pixel centres `[H, W, 2]`, x and y from -1 to 1 across the image; shared, not to be written to."""
     y, x = ((2 * torch.arange(n, device=device, dtype=torch.float32) + 1) / n - 1 for n in (height, width))
     return torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1)
+
+
+@lru_cache(maxsize=8)
+def _steps(height: int, width: int, device: torch.device) -> torch.Tensor:
+    """One pixel along x and y in the same measure; kept, because to copy two numbers to a GPU is to wait for it."""
+    return torch.tensor([2 / width, 2 / height], dtype=torch.float32, device=device)
 
 
 def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance: float = 1.0) -> torch.Tensor:

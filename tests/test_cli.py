@@ -226,7 +226,13 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-@pytest.mark.parametrize("command", [SHOOT, ["recon", "drive", "-o", "new"], ["pairs", "s1", "--data", "drive", "-o", "pairs"]])
+DEVICE_TAKERS = [
+    SHOOT, ["recon", "drive", "-o", "new"], ["pairs", "s1", "--data", "drive", "-o", "pairs"],
+    ["enhance", "clip.mp4", "-o", "x.mp4"], ["train", "pairs", "-o", "x"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", DEVICE_TAKERS, ids=lambda command: command[0])
 def test_a_device_that_is_not_there_is_refused(door, command):
     assert "leave --device cuda out" in door([*command, "--device", "cuda"], 1)[1]
 

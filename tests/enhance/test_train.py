@@ -16,7 +16,12 @@ from enhance.run import TrainConfig
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import train
 from enhance.weights_file import load_net
+from render.frame_types import Frame
+from scenes.camera import Camera
+from scenes.lenses import Pinhole
 
+ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+DEVICES = ["cpu", pytest.param("cuda", marks=ON_A_GPU)]
 QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2, looked_at=2)
 
 
@@ -82,10 +87,11 @@ def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
         train(pairs, tmp_path, **budget)
 
 
-def test_training_undoes_a_constant_error(pairs, tmp_path):
+@pytest.mark.parametrize("device", DEVICES)
+def test_training_undoes_a_constant_error(pairs, tmp_path, device):
     config = replace(QUICK, autoencoder=0.05, objects=0.01, rate=3e-3, kinds=("underfit", "isp", "clean"))
-    weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL)
-    rows = evaluate(pairs, Enhancer.load(weights))
+    weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL, device=device)
+    rows = evaluate(pairs, Enhancer.load(weights, device))
     assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, PUT_IN, *METHODS]
     by = {(r.kind, r.method): r for r in rows}
     assert by["underfit", "ours"].mean("region") > by["underfit", "identity"].mean("region") + 0.3
@@ -102,6 +108,51 @@ def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_p
     for name, value in before.state_dict().items():
         same = torch.equal(after.state_dict()[name], value)
         assert same if name.startswith("encoder.") else not (same and name == "decoder.pixels.weight"), name
+
+
+@ON_A_GPU
+@pytest.mark.parametrize(("first", "second"), [("cpu", "cuda"), ("cuda", "cpu")])
+def test_a_training_goes_on_on_another_device(pairs, tmp_path, first, second):
+    train(pairs, tmp_path, steps=10, config=QUICK, net=SMALL, device=first)
+    weights = train(pairs, tmp_path, steps=20, config=QUICK, net=SMALL, device=second, resume=True)
+    net, about = load_net(weights)
+    assert sum(about["steps"].values()) >= 20 and all(value.isfinite().all() for value in net.state_dict().values())
+
+
+@ON_A_GPU
+def test_weights_trained_on_a_gpu_make_the_same_picture_on_a_cpu(pairs, tmp_path):
+    weights = train(pairs, tmp_path, steps=60, config=replace(QUICK, rate=3e-3), net=SMALL, device="cuda")
+    here, there = (Enhancer.load(weights, device, bfloat16=False, repair=True) for device in ("cpu", "cuda"))
+    window, memories = pairs.of("underfit", "held out")[0].window(), [None, None]
+    for rgb in window.input.permute(0, 2, 3, 1):
+        (one, memories[0]), (other, memories[1]) = here.step(rgb, memories[0]), there.step(rgb, memories[1])
+        assert not torch.equal(one, rgb)
+        assert (one - other.cpu()).abs().max() < 4 / 255  # convolutions on a GPU round to 10 bits (TF32)
+
+
+@ON_A_GPU
+def test_told_objects_are_corrected_alike_on_a_gpu():
+    y, x = torch.meshgrid(torch.linspace(0, 6, 96), torch.linspace(0, 9, 160), indexing="ij")
+    rgb, ids = torch.stack([x.sin(), (x + y).cos(), y.sin()], -1) * 0.4 + 0.5, torch.zeros(96, 160, dtype=torch.int32)
+    ids[30:70, 40:100] = 1
+    rgb[ids > 0] *= 0.6
+    flat = Pinhole(1.0, 1.0, 80, 48)
+    frame = Frame(Camera(flat, 160, 96, torch.eye(4, dtype=torch.float64)), rgb=rgb, instance=ids)
+    one, other = (Enhancer.load("builtin", device, bfloat16=False).step(frame)[0].cpu() for device in ("cpu", "cuda"))
+    assert not torch.equal(one, rgb) and (one - other).abs().max() < 2 / 255
+
+
+def test_a_loss_that_is_not_finite_ends_a_training_before_it_is_saved(pairs, trained, monkeypatch):
+    kept = (trained / "checkpoint.pt").read_bytes()
+    monkeypatch.setattr(sys.modules["enhance.train"], "pixel_loss", lambda *_: torch.tensor(torch.nan, requires_grad=True))
+    with pytest.raises(ValueError, match="enhancer's loss is nan"):
+        train(pairs, trained, steps=4, config=QUICK, net=SMALL, resume=True)
+    assert (trained / "checkpoint.pt").read_bytes() == kept
+
+
+def test_a_gpu_gets_larger_batches_and_a_cpu_what_it_had():
+    cpu, cuda = (TrainConfig.of(torch.device(name)) for name in ("cpu", "cuda"))
+    assert cpu == TrainConfig() and cuda.images > cpu.images and cuda.crop == cpu.crop
 
 
 @pytest.fixture(scope="module")
