@@ -225,13 +225,13 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
     assert not list(desk.glob("x*")) and not list(desk.glob(".x*"))
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 DEVICE_TAKERS = [
     SHOOT, ["recon", "drive", "-o", "new"], ["pairs", "s1", "--data", "drive", "-o", "pairs"],
     ["enhance", "clip.mp4", "-o", "x.mp4"], ["train", "pairs", "-o", "x"],
 ]  # fmt: skip
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 @pytest.mark.parametrize("command", DEVICE_TAKERS, ids=lambda command: command[0])
 def test_a_device_that_is_not_there_is_refused(door, command):
     assert "leave --device cuda out" in door([*command, "--device", "cuda"], 1)[1]
