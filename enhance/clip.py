@@ -67,12 +67,14 @@ def enhance_video(
     out: str | Path,
     enhancer: Steps | None = None,
     progress: Callable[[int, int | None], None] | None = None,
+    rendered: bool = False,
 ) -> int:
     """Enhance any video that FFmpeg decodes, of any size, in constant memory; returns the number of frames.
 
-    The result is H.264 at the source's rate without its sound. A side that is odd gains one repeated row or column, which
-    H.264's 4:2:0 needs. `progress` is called with frames done and frames in all, where the file says. It warns where no frame was
-    changed. Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
+    The result is H.264 at the source's rate without its sound. A side that is odd gains one repeated row or column, which H.264's 4:2:0
+    needs. `progress` is called with frames done and frames in all, where the file says. rendered: whether the video shows renders, which
+    our own network repairs; else it leaves a video as it is, since nobody says what was put in. It warns where no frame was changed.
+    Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     from render.video import VideoWriter, read_video
 
@@ -80,6 +82,8 @@ def enhance_video(
     if Path(out).exists() and Path(out).samefile(source):
         raise ValueError(f"{out} is the clip itself; write the enhanced one elsewhere")
     enhancer = enhancer or Enhancer.load()
+    if isinstance(enhancer, Enhancer) and not rendered:
+        enhancer = enhancer.for_photos()
     memory, done, changed = None, 0, False
     with VideoWriter(out, video.fps, video.width, video.height) as writer:
         for rgb in video:
@@ -90,5 +94,5 @@ def enhance_video(
             if progress is not None:
                 progress(done, video.count)
     if not changed:
-        warn([f"nothing in {source} was sure to be wrong, so no frame was changed; render --enhance tells objects and has photos to go by"])
+        warn([f"no frame of {source} was changed; if it shows renders, say --rendered; render --enhance tells objects and has photos, too"])
     return done

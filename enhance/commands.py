@@ -131,6 +131,8 @@ class Enhance:
     """The enhanced video, as clean.mp4."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
+    rendered: Flag = False
+    """The video shows renders of splats: repair them. Else the built-in weights leave it as it is, as nobody tells what was put in."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to enhance."""
     overwrite: Overwrite = False
@@ -144,5 +146,6 @@ class Enhance:
 
         check_device(self.device)
         with Progress(f"enhance {self.clip.name}", read_video(self.clip).count) as steps:
-            count = enhance_video(self.clip, self.output, load_saying(self.weights, self.device), lambda done, total: steps.step())
+            enhancer = load_saying(self.weights, self.device)
+            count = enhance_video(self.clip, self.output, enhancer, lambda done, total: steps.step(), self.rendered)
         print(f"wrote {self.output}, {count} frames")

@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from enhance.corrections import Corrections, correct
-from enhance.net import MULTIPLE, Net
+from enhance.net import MULTIPLE, Net, photos_of
 from enhance.past import Past
 from enhance.precision import channels_last, has_bfloat16
 from enhance.step import Steps, checked
@@ -54,8 +54,8 @@ class Enhancer:
         repair: bool | None = None,
     ):
         """bfloat16: whether to compute in it; where that is fast, if None. history: how many frames are looked back to, at most the
-        network's own number, if None. repair: whether the network repairs frames; where its training found that worth it, if None.
-        Without, altered colours are undone and told objects corrected all the same, and references laid in."""
+        network's own number, if None. repair: whether the network repairs what is rendered; where its training found that worth it, alone
+        and beside photos, if None. Without, told objects are corrected all the same, and references laid in."""
         self.device = torch.device(device)
         self.net = channels_last(net.eval().requires_grad_(False).to(self.device))
         self.about = about or {}
@@ -65,8 +65,12 @@ class Enhancer:
             raise ValueError(f"history must be 0 to {net.config.history}, as the network was trained, got {history}")
         gains = self.about.get(REPAIR_GAIN, (WORTH, WORTH))
         self.repairs = tuple(gain >= WORTH if repair is None else repair for gain in gains)
-        if not self.repairs[1]:
+        if not any(self.repairs):
             self.reads = ("instance", "reference")
+
+    def for_photos(self) -> Enhancer:
+        """The same for frames that are photos but for what was put in: objects are corrected, and nothing else is repaired."""
+        return Enhancer(self.net, self.about, self.device, self.bfloat16, self.history, repair=False)
 
     @classmethod
     def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Steps:
@@ -92,9 +96,9 @@ class Enhancer:
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Where repairing was not found worth it (`repair`), nothing is done beside told objects and references. Pixels whose gate
-        and trust are 0, and tiles of 32 x 32 that need nothing, come back exactly as they went in (clamped to 0..1); a frame that needs
-        nothing costs nothing. Raises ValueError for values that are not finite.
+        Where repairing was not found worth it (`repair`), nothing is done beside told objects and references. Tiles of 32 x 32 that need
+        nothing come back exactly as they went in (clamped to 0..1); a frame that needs nothing costs nothing. Raises ValueError for values
+        that are not finite.
         """
         given = checked(frame)
         height, width = given.rgb.shape[:2]
@@ -107,26 +111,29 @@ class Enhancer:
         tiles = Tiles.of(torch.ones(height, width) if given.need is None else given.need)
         if tiles.nothing():
             return rgb, self._skipped(memory, (height, width), flow)
+        photos = None
         if given.reference is not None:
             reference, trust = (x.to(rgb) for x in given.reference)
-            rgb = torch.lerp(rgb, reference.clamp(0, 1), (trust * tiles.pixels().to(trust))[..., None])
+            reference, trust = reference.clamp(0, 1), (trust * tiles.pixels().to(trust))[..., None]
+            rgb = torch.lerp(rgb, reference, trust)
+            photos = photos_of(*(x.permute(2, 0, 1)[None] for x in (reference, trust)))
         corrections: Corrections = {}
         if given.instance is not None:
             instance = given.instance.to(self.device)
             planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), instance, memory.objects if memory else {})
             rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
-        told = given.instance is not None
-        if not self.repairs[told]:
+        if not self.repairs[photos is not None]:
             return rgb.contiguous(), Memory(None, (height, width), given.flow is not None, objects=corrections)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if given.instance is None else _pad(given.instance.to(self.device, torch.float32)[None, None], value=0)
+        photos = None if photos is None else _pad(photos, value=0)
         past = None if memory is None else self._brought(memory, flow, padded)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
             if tiles.everything():
-                out = self.net(padded, mask, past)
+                out = self.net(padded, mask, past, photos)
                 better, after = out.rgb, out.past
             else:
-                better, after = self.net.parts(padded, mask, past, tiles)
+                better, after = self.net.parts(padded, mask, past, photos, tiles)
         better = better[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
         return better, Memory(after, (height, width), given.flow is not None, objects=corrections)
 

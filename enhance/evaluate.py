@@ -90,13 +90,15 @@ def evaluate(
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
     """
     features, rows, others = shipped_features(enhancer.device), [], dict(beside or {})
+    of_photos = enhancer.for_photos() if isinstance(enhancer, Enhancer) else enhancer
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
         some = (PUT_IN,) if shards and all("instances" in s.meta for s in shards) else ()
+        mine = enhancer if kind in RENDERED else of_photos
         for method in (*METHODS, *some, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
-            rows.append(measured(kind, method, shards, others.get(method, enhancer), features))
+            rows.append(measured(kind, method, shards, others.get(method, mine), features))
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows

@@ -13,52 +13,23 @@ from enhance.autoencoder import Encoder
 from render.warp import warp
 
 
-def pixel_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, logarithm: float = 0.01) -> torch.Tensor:
-    """Distance of `out` to `target` `[B, 3, H, W]`: `region_loss` inside `region` `[B, 1, H, W]`, mean absolute error outside."""
-    return region_loss(out, target, region, logarithm) + region_loss(out, target, 1 - region, 0.0)
-
-
-def region_loss(out: torch.Tensor, target: torch.Tensor, region: torch.Tensor, logarithm: float = 0.01) -> torch.Tensor:
-    """Mean absolute error of `out` to `target` `[B, 3, H, W]` within `region` `[B, 1, H, W]`, over the pictures that have any of it.
-
-    A little of the `logarithm` of the squared error (PSNR) keeps strong damage from outweighing the slight. It is floored at 30 dB:
-    with a lower floor the gradient of what is nearly right drowns all others, and the network learns to do nothing.
-    """
+def pixel_loss(out: torch.Tensor, target: torch.Tensor, logarithm: float) -> torch.Tensor:
+    """Mean absolute error of `out` to `target` `[B, 3, H, W]`, and a little of the `logarithm` of the squared error (PSNR), which keeps
+    strong damage from outweighing the slight. It is floored at 35 dB: with a lower floor the gradient of what is nearly right drowns all
+    others, and the network learns to do nothing."""
     error = out - target
-    absolute, some = _part_mean(error.abs(), region)
-    squared, _ = _part_mean(error.square(), region)
-    each = absolute + logarithm * torch.log(squared + 1e-3) if logarithm else absolute
-    return (each * some).sum() / some.sum().clamp_min(1)
+    absolute = error.abs().mean()
+    return absolute + logarithm * torch.log(error.square().mean((1, 2, 3)) + 3e-4).mean() if logarithm else absolute
 
 
-def where_loss(logits: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of `logits` `[B, 1, H, W]` with the `region` 0..1 that is damaged, counted apart where it is and is not.
-
-    Only the product of gate and change reaches the picture: a closed gate hides the
-    change's error and a useless change closes the gate, and training would end there. So this teaches where, and `region_loss` of
-    the ungated frame what, apart. All of a rendered frame counts as damaged: told instead how wrong each place is, the gate is
-    never sure of anything there and stays shut.
-    """
-    each = F.binary_cross_entropy_with_logits(logits, region, reduction="none")
-    total = logits.new_zeros(())
-    for part in (region, 1 - region):
-        mean, some = _part_mean(each, part)
-        total = total + (mean * some).sum() / some.sum().clamp_min(1)
-    return total
-
-
-def _part_mean(value: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Means `[B]` of `value` `[B, C, H, W]` weighted by `part` `[B, 1, H, W]`, and which samples have any such pixels, 0 or 1."""
-    area = part.sum((1, 2, 3)) * value.shape[1]
-    some = (area > 30).to(value.dtype)
-    return (value * part).sum((1, 2, 3)) / area.clamp_min(1), some
-
-
-def temporal_loss(out: torch.Tensor, previous: torch.Tensor, flow: torch.Tensor, visible: torch.Tensor) -> torch.Tensor:
-    """Mean absolute difference of `out` to the previous output `[B, 3, H, W]` moved here along `flow`, on `visible` pixels."""
-    moved, inside = warp(previous, flow)
+def flicker(
+    out: torch.Tensor, previous: torch.Tensor, target: torch.Tensor, before: torch.Tensor, flow: torch.Tensor, visible: torch.Tensor
+) -> torch.Tensor:
+    """Mean absolute difference, on `visible` pixels, of how `out` changed against the `previous` output moved here along `flow`, to how the
+    `target` changed against the one `before`: photos change, too, and a picture that may not is blurred."""
+    moved, inside = warp(torch.cat([previous, before], 1), flow)
     weight = visible * inside
-    return ((out - moved).abs() * weight).sum() / (weight.sum() * 3).clamp_min(1)
+    return (((out - moved[:, :3]) - (target - moved[:, 3:])).abs() * weight).sum() / (weight.sum() * 3).clamp_min(1)
 
 
 class PatchPerceptual(nn.Module):

@@ -1,15 +1,14 @@
 """The enhancer's network: a single-step latent transformer between a frozen encoder and a decoder that sees the frame.
 
-After DiffusionHarmonizer, small. The clean latent goes through the transformer once, at a fixed timestep and without text;
-because both never change, what their embeddings would add to every layer is stored as constants (`Modulation`). Spatial
-attention alternates with temporal attention over the latents of up to `history` frames enhanced before. The decoder gets
-features of the input frame, and of the last enhanced one moved to it, at every scale, and the output is
+It repairs what a reconstruction shows badly. After DiffusionHarmonizer, small. The clean latent goes through the transformer once, at a
+fixed timestep and without text; because both never change, what their embeddings would add to every layer is stored as constants
+(`Modulation`). Spatial attention alternates with temporal attention over the latents of up to `history` frames enhanced before. The decoder
+gets features of the input frame, of what photos said of it, and of the last enhanced one moved to it, at every scale, and the output is
 
-    output = input + gate * (residual + blend * (last - input))
+    output = input + residual + blend * (last - input)
 
-Told objects come here in corrected colours (`ObjectNet`). The residual is free; blending with the last picture keeps a clip calm; the
-gate is exactly 0 where the frame is to be left alone. Residual and blend are zero in an untrained network, which therefore changes
-nothing.
+Told objects come here in corrected colours (`ObjectNet`), and what photos show is laid in already (`render/references.py`). The residual is
+free; blending with the last picture keeps a clip calm. Both are zero in an untrained network, which therefore changes nothing.
 """
 
 from __future__ import annotations
@@ -29,8 +28,9 @@ from enhance.tiles import Tiles, coarser, within
 
 PATCH = 2  # latents per token side
 MULTIPLE = STRIDE * PATCH  # a frame's sides are padded to multiples of this
-SHUT_TRAINING = 0.1  # see hard_gate
-FRAME_CHANNELS = 3 + 2 + 4  # colours; the mask, and whether there is one; the last picture, and where it is seen
+PHOTOS = 4
+"""Channels of what photos say: colours, and how far they are trusted."""
+FRAME_CHANNELS = 3 + 2 + 4 + PHOTOS  # colours; the mask, and whether there is one; the last picture, and where it is seen; photos
 
 
 @dataclass(frozen=True)
@@ -95,57 +95,48 @@ class FrameDecoder(nn.Module):
         self.quarter = Residual(c.quarter)
         self.up_half = nn.Conv2d(c.quarter, 4 * c.half, 1)
         self.fine = Residual(c.half)
-        self.pixels = nn.Conv2d(c.half, 4 * 5, 3, padding=1)
+        self.pixels = nn.Conv2d(c.half, 4 * 4, 3, padding=1)
         zero(self.pixels)
 
     def forward(self, tokens, latent, half, quarter, eighth) -> tuple[torch.Tensor, ...]:
-        """Residual `[B, 3, H, W]`, and logits of gate and blend `[B, 1, H, W]`."""
+        """Residual `[B, 3, H, W]`, and logits of the blend `[B, 1, H, W]`."""
         # Normalised, because a channel that drifts far below zero here is dead for good behind the next activation.
         x = self.norm(F.pixel_shuffle(self.up_eighth(tokens), 2) + self.latent(latent) + eighth)
         x = self.eighth(x)
         x = self.quarter(F.pixel_shuffle(self.up_quarter(F.silu(x)), 2) + quarter)
         x = self.fine(F.pixel_shuffle(self.up_half(F.silu(x)), 2) + half)
-        return F.pixel_shuffle(self.pixels(F.silu(x)), 2).float().split([3, 1, 1], 1)
+        return F.pixel_shuffle(self.pixels(F.silu(x)), 2).float().split([3, 1], 1)
 
 
-def hard_gate(logits: torch.Tensor, shut: float | torch.Tensor = SHUT_TRAINING) -> torch.Tensor:
-    """A gate in 0..1 that closes exactly: the sigmoid stretched so that it is 0 up to shut / (1 + shut).
-
-    Its gradient ignores the clamp, or a closed gate would never open again.
-    """
-    soft = torch.sigmoid(logits) * (1 + shut) - shut
+def blend_of(logits: torch.Tensor) -> torch.Tensor:
+    """A share in 0..1 that is exactly 0 up to logits of 0: the sigmoid, stretched. Its gradient ignores the clamp, or what is 0 would stay
+    so."""
+    soft = 2 * torch.sigmoid(logits) - 1
     return soft + (soft.clamp(0, 1) - soft).detach() if torch.is_grad_enabled() else soft.clamp(0, 1)
 
 
-def of_mask(pair: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """The first of two numbers where no mask is known, the second where one is: known `[B, 1, H, W]`, 0 or 1."""
-    return pair[0] + (pair[1] - pair[0]) * known
+def photos_of(reference: torch.Tensor, trust: torch.Tensor) -> torch.Tensor:
+    """What photos say `[B, 3, H, W]` and how far that is trusted `[B, 1, H, W]`, as the network takes it `[B, PHOTOS, H, W]`."""
+    return torch.cat([(reference * 2 - 1) * (trust > 0), trust], 1)
 
 
 @dataclass(frozen=True)
 class Enhanced:
     """What one step gives.
 
-    rgb      `[B, 3, H, W]`: the frame
-    logits   `[B, 1, H, W]`: of the gate
-    ungated  `[B, 3, H, W]`: what the frame would be with an open gate
-    latent   `[B, 16, H/8, W/8]`: the enhanced frame's
-    past     what the next frame is given, still to be moved there
+    rgb     `[B, 3, H, W]`: the frame
+    latent  `[B, 16, H/8, W/8]`: the enhanced frame's
+    past    what the next frame is given, still to be moved there
     """
 
     rgb: torch.Tensor
-    logits: torch.Tensor
-    ungated: torch.Tensor
     latent: torch.Tensor
     past: Past
 
 
 class Net(nn.Module):
     """The whole network. `encoder` is the autoencoder's, `objects` is trained on objects, both before and then frozen; everything else is
-    trained on pairs. `shut` says how far the gate must be open to count, without a mask and with one: it is set in training
-    (`enhance.calibrate`)."""
-
-    shut: torch.Tensor
+    trained on pairs."""
 
     def __init__(self, config: NetConfig | None = None):
         super().__init__()
@@ -160,29 +151,28 @@ class Net(nn.Module):
         self.norm = nn.LayerNorm(config.width)
         self.denoise = nn.Conv2d(config.width, LATENT * PATCH**2, 1)
         self.decoder = FrameDecoder(config)
-        self.register_buffer("shut", torch.tensor([0.5, 0.5]))
         zero(self.denoise)
 
-    def forward(self, rgb: torch.Tensor, mask: torch.Tensor | None = None, past: Past | None = None) -> Enhanced:
+    def forward(
+        self, rgb: torch.Tensor, mask: torch.Tensor | None = None, past: Past | None = None, photos: torch.Tensor | None = None
+    ) -> Enhanced:
         """One frame.
 
-        rgb   `[B, 3, H, W]`, sides multiples of 16
-        mask  `[B, 1, H, W]`, above 0 where inserted or moving objects are, their colours corrected (`enhance.corrections`); NaN
-              throughout a frame, or None, where unknown
-        past  of the frames before, already moved to this one; None at the start
+        rgb     `[B, 3, H, W]`, sides multiples of 16
+        mask    `[B, 1, H, W]`, above 0 where inserted or moving objects are, their colours corrected (`enhance.corrections`); NaN
+                throughout a frame, or None, where unknown
+        past    of the frames before, already moved to this one; None at the start
+        photos  `photos_of` what was laid into rgb; None where nothing was
         """
         past = past or Past.none(rgb)
-        told = told_of(rgb, mask)
-        better, logits, ungated, latent = self.repair(rgb, told, past)
-        after = past.followed(better, latent, self.config.history)
-        return Enhanced(better, logits, ungated, latent, after)
+        better, latent = self.repair(rgb, told_of(rgb, mask), past, _or_no(photos, rgb))
+        return Enhanced(better, latent, past.followed(better, latent, self.config.history))
 
-    def repair(self, rgb: torch.Tensor, told: torch.Tensor, past: Past) -> tuple[torch.Tensor, ...]:
-        """A frame or a window of it: picture, logits, ungated and latent, as in `Enhanced`."""
-        known = told[:, 1:]
+    def repair(self, rgb: torch.Tensor, told: torch.Tensor, past: Past, photos: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """A frame or a window of it: picture and latent, as in `Enhanced`."""
         last = past.rgb * past.seen
         # the convolutions round their input to their own precision anyway: once before it is shuffled is less to move
-        frame = torch.cat([lower(x) for x in (rgb * 2 - 1, told, last * 2 - past.seen, past.seen)], 1)
+        frame = torch.cat([lower(x) for x in (rgb * 2 - 1, told, last * 2 - past.seen, past.seen, photos)], 1)
         with torch.no_grad():
             latent = self.encoder(rgb)
         half, quarter, eighth, seen = self.stem(frame)
@@ -192,27 +182,25 @@ class Net(nn.Module):
             x = block(x, history, inside)
         tokens = self.norm(x).permute(0, 3, 1, 2)
         enhanced = latent - F.pixel_shuffle(self.denoise(tokens), PATCH)
-        residual, logits, blend = self.decoder(tokens, enhanced, half, quarter, eighth)
-        enhanced = enhanced.float()
+        residual, blend = self.decoder(tokens, enhanced, half, quarter, eighth)
         given = rgb.float()
-        ungated = given + residual + hard_gate(blend, 1.0) * past.seen * (last - given)
-        shut = SHUT_TRAINING if torch.is_grad_enabled() else of_mask(self.shut, known)
-        better = given + hard_gate(logits, shut) * (ungated - given)
-        return better, logits, ungated, enhanced
+        return given + residual + blend_of(blend) * past.seen * (last - given), enhanced.float()
 
     @torch.no_grad()
-    def parts(self, rgb: torch.Tensor, mask: torch.Tensor | None, past: Past | None, tiles: Tiles) -> tuple[torch.Tensor, Past]:
+    def parts(
+        self, rgb: torch.Tensor, mask: torch.Tensor | None, past: Past | None, photos: torch.Tensor | None, tiles: Tiles
+    ) -> tuple[torch.Tensor, Past]:
         """One frame `[1, 3, H, W]`, worked on in the windows around `tiles` only: the picture and its past. Other tiles stay exactly as
         they are, and nothing of them is remembered but the picture."""
         past = past or Past.none(rgb)
-        told = told_of(rgb, mask)
+        told, photos = told_of(rgb, mask), _or_no(photos, rgb)
         height, width = rgb.shape[-2:]
         better, pixels = rgb.clone(), F.pad(tiles.pixels(), (0, width - tiles.width, 0, height - tiles.height))
         latent = rgb.new_zeros(1, LATENT, height // STRIDE, width // STRIDE)
         known = latent[:, :1].clone()
         for window, core in tiles.windows():
             y, x = within(window, height, width)
-            picture, _, _, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)))
+            picture, found = self.repair(rgb[..., y, x], told[..., y, x], past.cropped((y, x)), photos[..., y, x])
             v, u = within(core, height, width)
             inner = slice(v.start - y.start, v.stop - y.start), slice(u.start - x.start, u.stop - x.start)
             better[..., v, u] = torch.where(pixels[v, u].to(rgb.device), picture[..., inner[0], inner[1]], rgb[..., v, u])
@@ -229,3 +217,7 @@ class Net(nn.Module):
             return past.latents.new_zeros(b, 0, h, w, self.config.width), past.valid.new_zeros(b, 0, h, w, dtype=torch.bool)
         tokens = self.embed(past.latents.flatten(0, 1)).permute(0, 2, 3, 1).reshape(b, k, h, w, -1) + self.age[:k, None, None]
         return lower(tokens), F.max_pool2d(1 - past.valid.flatten(0, 1).float(), PATCH).reshape(b, k, h, w) < 0.5
+
+
+def _or_no(photos: torch.Tensor | None, rgb: torch.Tensor) -> torch.Tensor:
+    return rgb.new_zeros(rgb.shape[0], PHOTOS, *rgb.shape[-2:]) if photos is None else photos

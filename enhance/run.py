@@ -52,23 +52,21 @@ class TrainConfig:
     """Highest learning rate; half of it where trained weights are trained further."""
     latent: float = 0.1
     """Weight of the distance of the enhanced latent to the target's."""
-    logarithm: float = 0.1
-    """Weight of the logarithm of the squared error beside the absolute one, in the region."""
-    gate: float = 0.1
-    """Weight of the cross entropy of the gate."""
+    logarithm: float = 0.02
+    """Weight of the logarithm of the squared error beside the absolute one."""
     perceptual: float = 0.01
     """Weight of the perceptual distance on a random patch."""
-    temporal: float = 1.0
-    """Weight of the warp error in temporal batches."""
+    temporal: float = 0.3
+    """Weight of flicker that the target has not, in temporal batches."""
     kinds: tuple[str, ...] = KINDS
     """Kinds of damage to learn from, of those that the pairs hold."""
 
     @classmethod
     def of(cls, device: torch.device) -> TrainConfig:
-        """What suits a device. A GPU's step is thousands of small kernels, whose begin costs more than four of the CPU's batches (reckoned
-        for an H100, not measured); four are about what 15 cores draw meanwhile. Shadows, whose objects one core reads first, need
-        seconds before they begin. Crops stay: twice the smallest is all that frames of 360 rows hold."""
-        return cls() if device.type == "cpu" else cls(images=32, clips=12, looked_at=128, shade=0.03)
+        """What suits a device. A GPU's step is thousands of small kernels, whose begin costs more than eight of the CPU's batches; eight are
+        about what 15 cores draw meanwhile. Shadows, whose objects one core reads first, need seconds before they begin. Crops stay: twice
+        the smallest is all that frames of 360 rows hold."""
+        return cls() if device.type == "cpu" else cls(images=64, clips=16, looked_at=128, shade=0.03, rate=1.2e-3)
 
     def __post_init__(self):
         if self.temporal_every < 2:

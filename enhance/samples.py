@@ -1,4 +1,4 @@
-"""Training samples: crops of stored pairs and of photos, altered afresh each time they are drawn."""
+"""Training samples: crops of stored pairs and of photos, flipped and in other colours each time they are drawn."""
 
 from __future__ import annotations
 
@@ -11,39 +11,33 @@ import torch
 from torch.nn import functional as F
 
 from enhance.ahead import Batch
-from enhance.isp import alter, random_isp, random_pipeline
-from enhance.masks import random_mask
+from enhance.isp import random_isp
 from enhance.object_samples import Objects, ObjectSampler
 from enhance.shade_samples import Grounds, ShadeSampler
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
 
-KIND_WEIGHTS = {
-    "underfit": 0.2, "sparse": 0.1, "cycle": 0.1, "crossref": 0.05,
-    "isp": 0.13, "isp_frame": 0.07, "relight": 0.1, "shadow": 0.14, "reinsert": 0.06, "clean": 0.12,
-}  # fmt: skip
-AFRESH = ("isp", "isp_frame", "clean")
-"""Kinds that are made of any clip's targets each time anew; of the others the stored frames are drawn."""
+KIND_WEIGHTS = {"underfit": 0.4, "sparse": 0.3, "cycle": 0.2, "crossref": 0.1}
+"""How often the network sees rendered kinds; most of what crossref lacks nobody can know."""
 PLACED = ("relight", "shadow", "reinsert")
-"""Kinds that change a part of the frame; crops look for it."""
-AIMED = 0.8  # how often
+"""Kinds that change a part of the frame."""
+PHOTOGRAPHED = 0.4  # how often a right picture is one of the further photos, where there are some
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
 REFERENCED = 0.5  # how often a rendered frame comes as photos beside it have bettered it
-ALIEN = 254
-"""Id of an object that is none of the scene's."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclass(frozen=True)
 class Sample(Batch):
-    """Frames for the network, `[B, T, C, h, w]` each: input, target, region, mask (objects' ids from 1, NaN where not told), flow,
-    visible."""
+    """Rendered frames for the network, `[B, T, C, h, w]` each: input, target, mask (objects' ids from 1, NaN where not told), flow,
+    visible, and the reference that was laid into the input, with its trust, 0 where none was."""
 
     input: torch.Tensor
     target: torch.Tensor
-    region: torch.Tensor
     mask: torch.Tensor
     flow: torch.Tensor
     visible: torch.Tensor
+    reference: torch.Tensor
+    trust: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -64,27 +58,13 @@ class Photos:
             if len(self.frames) == before:
                 raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PHOTO_SUFFIXES)} or a video")
 
-    def window(self, rng: np.random.Generator, frames: int, size: int) -> Window:
-        """A crop that pans by whole pixels over one photo: `frames` frames whose flow is exact."""
+    def crop(self, rng: np.random.Generator, size: int) -> torch.Tensor:
+        """A crop `[3, size, size]` of one photo, as it is or shrunk."""
         photo = self.frames[rng.integers(len(self.frames))]
-        zoom = min(float(rng.choice([1.0, 1.0, 1.5, 2.0])), min(photo.shape[:2]) / size)
-        n = int(size * zoom)
-        step = rng.integers(-6, 7, 2) if frames > 1 else np.zeros(2, int)
-        room = (np.array(photo.shape[:2]) - n) // frames
-        step = np.clip(step, -room, room)
-        span = np.abs(step) * (frames - 1)
-        first = rng.integers(np.array(photo.shape[:2]) - n - span + 1) + np.where(step < 0, span, 0)
-        crops = [photo[y : y + n, x : x + n] for y, x in (first + t * step for t in range(frames))]
-        rgb = torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2).float() / 255
-        if n != size:
-            rgb = F.interpolate(rgb, (size, size), mode="area")
-        scale = size / n
-        flow = torch.tensor(step[::-1] * scale, dtype=torch.float32)[None, :, None, None].repeat(frames, 1, size, size)
-        flow[0] = torch.nan
-        seen = torch.ones(frames, 1, size, size)
-        seen[0] = 0
-        nowhere = torch.zeros_like(seen)
-        return Window(rgb, rgb, nowhere, nowhere.to(torch.int16), flow, seen, rgb, nowhere)
+        n = int(size * min(float(rng.choice([1.0, 1.0, 1.5, 2.0])), min(photo.shape[:2]) / size))
+        y, x = (int(rng.integers(side - n + 1)) for side in photo.shape[:2])
+        rgb = torch.from_numpy(photo[y : y + n, x : x + n]).permute(2, 0, 1).float() / 255
+        return rgb if n == size else F.interpolate(rgb[None], (size, size), mode="area")[0]
 
 
 class Sampler:
@@ -94,9 +74,10 @@ class Sampler:
         if pairs is None and photos is None:
             raise ValueError("there is nothing to train on: give pairs, photos or both")
         self.pairs, self.photos, self.seed, self.kinds = pairs, photos, seed, kinds
-        self.shards = {kind: pairs.of(kind, "train") if pairs and kind in kinds else [] for kind in KIND_WEIGHTS}
+        self.shards = {kind: pairs.of(kind, "train") if pairs and kind in kinds else [] for kind in KINDS}
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
+        self.rendered = [kind for kind in RENDERED if self.shards[kind]]
         self._shade = ShadeSampler(self.shards["shadow"], seed)
         self._objects = ObjectSampler(self.shards, photos.frames if photos else [], "isp" in kinds)
         if pairs and not any(self.shards.values()) and photos is None:
@@ -106,17 +87,22 @@ class Sampler:
         return np.random.default_rng([self.seed, step])
 
     def images(self, step: int, count: int, size: int) -> Images:
-        """Crops for the autoencoder: targets and inputs, some with other colours."""
+        """Crops for the autoencoder, of right pictures and of renders, some in other colours."""
         rng = self.rng(step)
-        kinds = [*AFRESH, *(k for k in RENDERED if self.shards[k])]
-        windows = [self._window(rng, kinds[rng.integers(len(kinds))], 1, size) for _ in range(count)]
-        images = [w.input[0] if rng.random() < 0.3 else w.target[0] for w in windows]
+        rendered = [bool(self.rendered) and rng.random() < 0.3 for _ in range(count)]
+        images = [self._rendered(rng, 1, size).input[0] if one else self._right(rng, size) for one in rendered]
         return Images(torch.stack([random_isp(rng)(image) if rng.random() < 0.4 else image for image in images]))
 
-    def batch(self, step: int, count: int, frames: int, size: int, kind: str | None = None) -> Sample:
-        """`count` clips of `frames` frames, of one kind of damage or of all."""
+    def right(self, step: int, count: int, size: int) -> Images:
+        """Crops of right pictures, some in other colours."""
         rng = self.rng(step)
-        drawn = [self._sample(rng, frames, size, kind) for _ in range(count)]
+        images = [self._right(rng, size) for _ in range(count)]
+        return Images(torch.stack([random_isp(rng, 0.7)(image) if rng.random() < REGRADED else image for image in images]))
+
+    def batch(self, step: int, count: int, frames: int, size: int) -> Sample:
+        """`count` clips of `frames` frames, of all rendered kinds."""
+        rng = self.rng(step)
+        drawn = [self._sample(rng, frames, size) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
     def objects(self, step: int, count: int) -> Objects:
@@ -127,76 +113,33 @@ class Sampler:
         """Ground by objects with and without their shadow."""
         return self._shade.draw(self.rng(step), count)
 
-    def _sample(self, rng: np.random.Generator, frames: int, size: int, kind: str | None) -> Sample:
-        kinds = [kind] if kind else [k for k in KIND_WEIGHTS if k in self.kinds and (k in AFRESH or self.shards[k])]
-        weights = np.array([KIND_WEIGHTS[k] for k in kinds])
-        kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
-        w = self._window(rng, kind, frames, size)
-        if kind != "isp_frame":  # which knows its colours by those of right pictures alone
-            w = _regraded(rng, w, made=kind in AFRESH)
+    def _sample(self, rng: np.random.Generator, frames: int, size: int) -> Sample:
+        w = _regraded(rng, self._rendered(rng, frames, size))
+        trust = w.trust if rng.random() < REFERENCED else torch.zeros_like(w.trust)
+        damaged = (torch.lerp(w.input, w.reference, trust) * 255).round() / 255
         objects = w.instance.clamp_min(0).float()
-        if kind == "isp":
-            region = self._moving_mask(rng, w)
-            damaged, told = alter(w.target, region, random_pipeline(rng)), _with_alien(objects, region)
-            if rng.random() < 0.25:
-                told = _with_alien(torch.zeros_like(objects), region)
-        elif kind == "isp_frame":
-            damaged, region = random_pipeline(rng)(w.target), torch.ones_like(w.region)
-            told = region * ALIEN
-        elif kind in RENDERED:
-            damaged, region, told = w.input, torch.ones_like(w.region), objects
-            if rng.random() < REFERENCED:
-                damaged = torch.lerp(damaged, w.reference, w.trust)
-            if "isp" in self.kinds and rng.random() < 0.2:  # an inserted asset in a rendered clip: both kinds of damage at once
-                alien = self._moving_mask(rng, w)
-                damaged, told = alter(damaged, alien, random_isp(rng)), _with_alien(objects, alien)
-        elif kind in PLACED:
-            damaged, region, told = w.input, w.region, objects
-        else:
-            damaged, region = w.target, torch.zeros_like(w.region)
-            told = objects if objects.any() and rng.random() < 0.5 else _with_alien(torch.zeros_like(objects), self._moving_mask(rng, w))
-        damaged = (damaged * 255).round() / 255
-        mask = told if rng.random() < MASK_KNOWN or kind == "isp_frame" else torch.full_like(told, torch.nan)
-        return _flipped(rng, Sample(damaged, w.target, region, mask, w.flow, w.visible))
+        mask = objects if rng.random() < MASK_KNOWN else torch.full_like(objects, torch.nan)
+        return _flipped(rng, Sample(damaged, w.target, mask, w.flow, w.visible, w.reference * (trust > 0), trust))
 
-    def _window(self, rng: np.random.Generator, kind: str, frames: int, size: int) -> Window:
-        stored = [s for of in self.shards.values() for s in of] if kind in AFRESH else self.shards[kind]
-        shards = [s for s in stored if s.frames >= frames]
-        if not shards and self.photos is None:
-            raise ValueError(f"no training clip has {frames} frames; make pairs of longer clips")
-        if self.photos is not None and (not shards or (kind in AFRESH and rng.random() < 0.4)):
-            return self.photos.window(rng, frames, size)
-        return _crop(rng, shards[rng.integers(len(shards))], frames, size, aimed=kind in PLACED and rng.random() < AIMED)
+    def _rendered(self, rng: np.random.Generator, frames: int, size: int) -> Window:
+        weights = np.array([KIND_WEIGHTS[k] for k in self.rendered])
+        kind = self.rendered[rng.choice(len(weights), p=weights / weights.sum())]
+        shards = [s for s in self.shards[kind] if s.frames >= frames]
+        if not shards:
+            raise ValueError(f"no training clip of kind {kind} has {frames} frames; make pairs of longer clips")
+        return _crop(rng, shards[rng.integers(len(shards))], frames, size)
 
-    def _moving_mask(self, rng: np.random.Generator, w: Window) -> torch.Tensor:
-        """A region `[T, 1, h, w]` that follows the content: instances where there are some, else a shape carried along the flow."""
-        frames, _, h, width = w.instance.shape
-        ids = [int(i) for i in w.instance.unique() if i > 0]
-        chosen = [i for i in ids if rng.random() < 0.6]
-        if chosen and rng.random() < 0.6:
-            mask = torch.isin(w.instance, torch.tensor(chosen, dtype=w.instance.dtype)).float()
-            return F.avg_pool2d(mask, 3, 1, 1) if rng.random() < 0.5 else mask
-        shape = torch.from_numpy(random_mask(rng, h, width))[None, None]
-        masks = [shape]
-        for t in range(1, frames):
-            drift = torch.nan_to_num(w.flow[t]).mean((1, 2))
-            masks.append(torch.roll(masks[-1], (-round(float(drift[1])), -round(float(drift[0]))), (-2, -1)))
-        return torch.cat(masks)
+    def _right(self, rng: np.random.Generator, size: int) -> torch.Tensor:
+        stored = [s for of in self.shards.values() for s in of]
+        if self.photos is not None and (not stored or rng.random() < PHOTOGRAPHED):
+            return self.photos.crop(rng, size)
+        return _crop(rng, stored[rng.integers(len(stored))], 1, size).target[0]
 
 
-def _with_alien(objects: torch.Tensor, region: torch.Tensor) -> torch.Tensor:
-    """Ids of objects, and a further one where `region` reaches beyond them."""
-    return torch.where((objects == 0) & (region > 0.5), float(ALIEN), objects)
-
-
-def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed: bool) -> Window:
-    """A crop of a stored clip anywhere, or, when `aimed`, around some pixel of its changed region."""
+def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int) -> Window:
+    """A crop of a stored clip anywhere."""
     h, w = min(size, shard.height), min(size, shard.width)
     start, top, left = (int(rng.integers(n + 1)) for n in (shard.frames - frames, shard.height - h, shard.width - w))
-    changed = shard.changed(start + frames // 2).nonzero() if aimed else torch.zeros(0, 2)
-    if len(changed):
-        y, x = changed[rng.integers(len(changed))].tolist()
-        top, left = (int(np.clip(at - rng.integers(n), 0, side - n)) for at, n, side in ((y, h, shard.height), (x, w, shard.width)))
     window = shard.window(start, frames, top, left, h, w)
     if (h, w) == (size, size):
         return window
@@ -209,20 +152,19 @@ def _crop(rng: np.random.Generator, shard: Shard, frames: int, size: int, aimed:
     )
 
 
-def _regraded(rng: np.random.Generator, w: Window, made: bool) -> Window:
-    """Now and then the whole picture in other colours, damage and target alike: the network must compare within a picture.
+REGRADED = 0.65
 
-    Without this it learns what the few training places look like, and does harm in any other light. Of kinds that are `made` of the target
-    nothing else is used, and colours take most of a sample's time.
+
+def _regraded(rng: np.random.Generator, w: Window) -> Window:
+    """More often than not the whole picture in other colours, damage and target alike: the network must compare within a picture.
+
+    Without this it learns what the few training places look like, and does harm in any other light.
     """
-    if rng.random() < 0.35:
+    if rng.random() >= REGRADED:
         return w
     grade = random_isp(rng, 0.7)
-    target = grade(w.target)
-    if made:
-        return replace(w, target=target)
     given = grade(w.input)
-    return replace(w, target=target, input=given, reference=grade(w.reference) if w.trust.any() else given)
+    return replace(w, target=grade(w.target), input=given, reference=grade(w.reference) if w.trust.any() else given)
 
 
 def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:

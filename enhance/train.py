@@ -1,5 +1,5 @@
 """Training: the autoencoder on single images, the prior on its latents, the objects' colours on objects, then, with all but
-the prior frozen, the enhancer on pairs.
+the prior frozen, the enhancer on rendered frames.
 
 The enhancer's batches alternate: images without a past, and clips that the network walks through with its own earlier outputs as
 their past, with any number of latents from 0 to K, so that it never sees a past better than the one it will make itself.
@@ -7,7 +7,6 @@ their past, with any number of latents from 0 to K, so that it never sees a past
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -20,12 +19,11 @@ import torch
 from torch.nn import functional as F
 
 from enhance.ahead import Batch, drawn, workers
-from enhance.calibrate import calibrate_gate, repair_gain
-from enhance.corrections import corrected
-from enhance.losses import PatchPerceptual, pixel_loss, region_loss, temporal_loss, where_loss
-from enhance.net import Net, NetConfig
+from enhance.gain import repair_gain
+from enhance.losses import PatchPerceptual, flicker, pixel_loss
+from enhance.net import Net, NetConfig, photos_of
 from enhance.object_samples import Objects
-from enhance.objects import ObjectNet, changed
+from enhance.objects import changed
 from enhance.past import Past
 from enhance.precision import autocast
 from enhance.prior import flow_matching_loss
@@ -34,7 +32,7 @@ from enhance.samples import Images, Photos, Sample, Sampler
 from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
 from enhance.shade_samples import Grounds
-from enhance.shards import PairSet
+from enhance.shards import RENDERED, PairSet
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
 from scenes.names import unknown
 
@@ -94,12 +92,12 @@ def train(
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     config = config or TrainConfig.of(torch.device(device))
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
-    clean = pair_set.of("clean", "train") if pair_set and "clean" in config.kinds else []
     begun, origin = load_net(BUILTIN if start == "builtin" else start) if start is not None else (None, None)
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    run = Run(config, begun, minutes, steps, seed, only or (STAGES if start is None else FURTHER), device)
+    stages = [s for s in only or (STAGES if start is None else FURTHER) if s != "enhancer" or sampler.rendered]
+    run = Run(config, begun, minutes, steps, seed, stages, device)
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
@@ -121,17 +119,14 @@ def train(
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
         perceptual = PatchPerceptual(run.net.encoder)
-        objects = copy.deepcopy(run.net.objects).cpu()
-        go("enhancer", partial(_clips, run, sampler, objects), partial(_enhancer_step, run, perceptual))
+        go("enhancer", partial(_clips, run, sampler), partial(_enhancer_step, run, perceptual))
     except KeyboardInterrupt:
         run.save(checkpoint)
         raise
-    if "enhancer" in run.stages:
-        calibrate_gate(run.average, clean)
     run.save(checkpoint)
     weights = out / "enhancer.safetensors"
     shards = pair_set.of(split="train") if pair_set else []
-    gains = repair_gain(run.average, [s for s in shards if s.meta["kind"] != "clean"])
+    gains = repair_gain(run.average, [s for s in shards if s.meta["kind"] in RENDERED])
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
     data |= {"further": origin} if origin is not None else {}
@@ -186,7 +181,7 @@ def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> 
 
 
 def _right(run: Run, sampler: Sampler, step: int) -> Images:
-    return Images(sampler.batch(5 * step + 4, run.config.images, 1, run.config.crop, "clean").target[:, 0])
+    return sampler.right(5 * step + 4, run.config.images, run.config.crop)
 
 
 def _prior_step(run: Run, batch: Images, step: int) -> torch.Tensor:
@@ -224,20 +219,18 @@ def _crops(run: Run, step: int) -> tuple[np.random.Generator, float]:
     return rng, float(rng.choice(CROPS))
 
 
-def _clips(run: Run, sampler: Sampler, objects: ObjectNet, step: int) -> Sample:
-    """A sample with its told objects corrected, which is done here because it is done one object after the other."""
+def _clips(run: Run, sampler: Sampler, step: int) -> Sample:
     c = run.config
     temporal = step % c.temporal_every == 1 and c.frames > 1
     _, scale = _crops(run, step)
     count = max(1, round((c.clips if temporal else c.images) / scale**2))
-    s = sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
-    return replace(s, input=corrected(objects, s.input.flatten(0, 1), s.mask.flatten(0, 1)).view_as(s.input))
+    return sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
 
 
 def _enhancer_step(run: Run, perceptual: PatchPerceptual, sample: Sample, step: int) -> torch.Tensor:
     rng, _ = _crops(run, step)
     total = _update(run, "enhancer", rollout_losses(run.net, sample, perceptual, run.config, rng))
-    decay = min(0.998, (1 + step) / (10 + step))
+    decay = min(0.999, (1 + step) / (10 + step))
     with torch.no_grad():
         torch._foreach_lerp_(list(run.average.parameters()), list(run.net.parameters()), 1 - decay)
     return total
@@ -253,21 +246,20 @@ def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: Tra
     moved = rng.random() < 0.75
     past: Past | None = None
     for t in range(frames):
-        given, target, region = sample.input[:, t], sample.target[:, t], sample.region[:, t]
+        given, target = sample.input[:, t], sample.target[:, t]
         previous = past.rgb if past is not None else None
         if past is not None:
             past = replace(past, latents=past.latents[:, :longest], valid=past.valid[:, :longest])
             past = past.moved(sample.flow[:, t]) if moved else past
         with autocast(given.device):
-            out = net(given, sample.mask[:, t], past)
+            out = net(given, sample.mask[:, t], past, photos_of(sample.reference[:, t], sample.trust[:, t]))
             with torch.no_grad():
                 wanted = net.encoder(target.contiguous(memory_format=torch.channels_last))
             seen = perceptual(out.rgb, target, rng) if c.perceptual else 0.0
-        loss = pixel_loss(out.rgb, target, region, c.logarithm) + c.perceptual * seen
-        loss = loss + region_loss(out.ungated, target, region, c.logarithm) + c.gate * where_loss(out.logits, region)
-        loss = loss + c.latent * (out.latent - wanted.float()).abs().mean()
+        loss = pixel_loss(out.rgb, target, c.logarithm) + c.perceptual * seen + c.latent * (out.latent - wanted.float()).abs().mean()
         if previous is not None:
-            loss = loss + c.temporal * temporal_loss(out.rgb, previous, sample.flow[:, t], sample.visible[:, t])
+            before = sample.target[:, t - 1]
+            loss = loss + c.temporal * flicker(out.rgb, previous, target, before, sample.flow[:, t], sample.visible[:, t])
         past = out.past
         yield loss / frames
 

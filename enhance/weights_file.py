@@ -15,10 +15,10 @@ BUILTIN = Path(__file__).parent / "weights" / "builtin.safetensors"
 FORMAT = "sidestep-enhancer-1"
 
 WORTH = 0.2
-"""Gain in dB on the pairs that it was trained on from which a network repairs frames at all: a tenth or two are lost on new places."""
+"""Gain in dB on the pairs that it was trained on from which a network repairs rendered frames at all: some is lost on new places."""
 
 REPAIR_GAIN = "repair gain, dB"
-"""Under what name the header says that gain (`enhance.calibrate.repair_gain`): untold, and told where objects are."""
+"""Under what name the header says that gain (`enhance.gain.repair_gain`): alone, and beside what photos say."""
 
 
 def save_net(net: Net, path: str | Path, about: dict) -> None:

@@ -5,7 +5,7 @@ import torch
 from small_net import SMALL, stirred
 
 from enhance.autoencoder import Autoencoder
-from enhance.net import Net, hard_gate
+from enhance.net import Net, blend_of, photos_of
 from enhance.past import Past
 
 
@@ -60,15 +60,24 @@ def test_samples_of_a_batch_do_not_mix():
     assert torch.allclose(both[1:], one, atol=1e-5)
 
 
-def test_the_gate_closes_exactly():
+def test_photos_are_seen_where_they_are_trusted():
+    rgb, _ = inputs(k=0)
+    net, seen, trust = stirred(), torch.rand(1, 3, 32, 48), torch.zeros(1, 1, 32, 48)
+    with torch.inference_mode():
+        none = net(rgb).rgb
+        assert torch.equal(none, net(rgb, photos=photos_of(seen, trust)).rgb)
+        assert not torch.equal(none, net(rgb, photos=photos_of(seen, trust + 0.5)).rgb)
+
+
+def test_the_last_picture_is_left_out_exactly():
     with torch.no_grad():
-        gate = hard_gate(torch.tensor([-9.0, 0.0, 9.0]))
-    assert gate[0] == 0 and gate[2] > 0.999 and 0 < gate[1] < 1
+        share = blend_of(torch.tensor([-9.0, 0.0, 1.0, 9.0]))
+    assert share[0] == 0 == share[1] and share[3] > 0.999 and 0 < share[2] < 1
 
 
-def test_a_closed_gate_still_has_a_gradient():
+def test_what_is_left_out_still_has_a_gradient():
     logit = torch.tensor([-4.0], requires_grad=True)
-    hard_gate(logit).backward()
+    blend_of(logit).backward()
     assert logit.grad is not None and logit.grad > 0
 
 

@@ -1,0 +1,46 @@
+"""What repairing is worth: measured at the end of training, so that a network that gains too little is not run."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+
+import torch
+from torch.nn import functional as F
+
+from enhance.net import MULTIPLE, Net, photos_of
+from enhance.precision import autocast
+from enhance.shards import Shard
+
+CLIPS = 32
+"""Clips that are looked at, spread over all of a kind."""
+
+
+@torch.no_grad()
+def repair_gain(net: Net, rendered: Sequence[Shard]) -> list[float]:
+    """By how many dB `Net.repair` brings clips' middle frames nearer to their targets, the mean over kinds: alone, and beside what photos
+    say. 0 where there are no clips."""
+    by_kind = defaultdict(list)
+    for shard in rendered:
+        by_kind[shard.meta["kind"]].append(shard)
+    means = [[_gains(net, shard) for shard in shards[:: max(1, len(shards) // CLIPS)]] for shards in by_kind.values()]
+    if not means:
+        return [0.0, 0.0]
+    return torch.stack([torch.tensor(of_kind).mean(0) for of_kind in means]).mean(0).tolist()
+
+
+def _gains(net: Net, shard: Shard) -> list[float]:
+    device = next(net.parameters()).device
+    window = shard.window(shard.frames // 2, 1)
+    pad = (0, -shard.width % MULTIPLE, 0, -shard.height % MULTIPLE)
+    rendered, target, reference = (F.pad(x, pad, mode="replicate").to(device) for x in (window.input, window.target, window.reference))
+    gains = []
+    for trust in (torch.zeros_like(window.trust), window.trust):
+        trust = F.pad(trust, pad).to(device)
+        given = torch.lerp(rendered, reference, trust)
+        with autocast(device):
+            better = net(given, photos=photos_of(reference, trust)).rgb
+        before, after = ((x.clamp(0, 1) - target).square().mean().clamp_min(1e-12).item() for x in (given, better))
+        gains.append(10 * math.log10(before / after))
+    return gains

@@ -1,0 +1,50 @@
+"""What repairing gains is measured apart for frames alone and beside photos."""
+
+from types import SimpleNamespace
+
+import torch
+from small_net import SMALL, stirred
+
+from enhance.gain import repair_gain
+from enhance.net import Net, photos_of
+
+
+def shard(given, target, kind="sparse", reference=None, trust=0.0):
+    """A clip of one frame `[3, H, W]`."""
+    some = torch.full((1, 1, *given.shape[1:]), trust)
+    window = SimpleNamespace(
+        input=given[None], target=target[None], reference=(given if reference is None else reference)[None], trust=some
+    )
+    meta = {"kind": kind}
+    return SimpleNamespace(frames=1, height=given.shape[1], width=given.shape[2], meta=meta, window=lambda *_: window)
+
+
+def picture(seed=0):
+    return 0.2 + 0.6 * torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(seed))
+
+
+def test_repairing_gains_where_it_leads_to_the_target_and_loses_where_it_leads_away():
+    net, given = stirred(), picture()
+    better = net(given[None]).rgb[0].clamp(0, 1).detach()
+    half_way = given + (better - given) / 2
+    assert (better - given).abs().max() > 1e-3
+    assert repair_gain(net, [shard(given, better)])[0] > 20 and repair_gain(net, [shard(given, given - (better - given))])[0] < -3
+    assert abs(repair_gain(net, [shard(given, half_way)])[0]) < 0.5
+    assert repair_gain(Net(SMALL), [shard(given, better)]) == [0.0, 0.0] == repair_gain(net, [])
+
+
+def test_what_photos_say_is_laid_in_and_told_before_the_gain_is_measured():
+    net, given, seen = stirred(), picture(), picture(1)
+    trust = torch.full((1, 1, 32, 48), 0.5)
+    both = torch.lerp(given[None], seen[None], trust)
+    better = net(both, photos=photos_of(seen[None], trust)).rgb[0].clamp(0, 1).detach()
+    alone, beside = repair_gain(net, [shard(given, better, reference=seen, trust=0.5)])
+    assert beside > 20 > alone
+
+
+def test_kinds_count_alike_however_many_clips_they_have():
+    net, given = stirred(), picture()
+    better = net(given[None]).rgb[0].clamp(0, 1).detach()
+    good, bad = shard(given, better), shard(given, given - (better - given), "underfit")
+    few, many = (repair_gain(net, [good, *[bad] * n])[0] for n in (1, 5))
+    assert abs(few - many) < 1e-4
