@@ -63,7 +63,7 @@ class TrainConfig:
 
     @classmethod
     def of(cls, device: torch.device) -> TrainConfig:
-        """What suits a device. A GPU's step is thousands of small kernels, whose begin costs more than eight of the CPU's batches, and eight
+        """What suits a device. A GPU's step is thousands of small kernels, whose begin costs more than eight of the CPU's batches; eight
         are about what 15 cores draw meanwhile. Shadows, whose objects one core reads first, need seconds before they begin. Crops stay:
         twice the smallest is all that frames of 360 rows hold."""
         return cls() if device.type == "cpu" else cls(images=64, clips=16, looked_at=128, shade=0.03, rate=1.2e-3)
