@@ -10,7 +10,7 @@ import torch
 
 from recon.frames import Frames, View
 from recon.model import Knots, scaled, small_poses
-from recon.shutter import as_read
+from recon.shutter import shifts_of
 from scenes.camera import Camera, RigCamera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
@@ -113,11 +113,17 @@ class Motion:
         """What stands before a view's camera, its splats moved to where they were when their rows were read; ends: of `readout`."""
         if not ends:
             return placed
-        moved = []
-        for p in placed:
-            first, last = (back @ (poses[p.instance] if p.instance else p.world_from_local) for back, poses in ends)
-            moved.append(replace(p, gaussians=as_read(p.gaussians, first, last, camera, self.rig[view.camera].shutter)))
-        return moved
+        shutter = self.rig[view.camera].shutter
+        first, last = (
+            torch.stack([back @ (poses[p.instance] if p.instance else p.world_from_local) for p in placed]) for back, poses in ends
+        )
+        # all actors at once, which are many and small, and beside them what stands still, which is one and large
+        shifts: dict[int, torch.Tensor] = {}
+        for group in ([k for k, p in enumerate(placed) if not p.instance], [k for k, p in enumerate(placed) if p.instance]):
+            if group:
+                means = [placed[k].gaussians.means for k in group]
+                shifts |= zip(group, shifts_of(means, first[group], last[group], camera, shutter), strict=True)
+        return [replace(p, gaussians=replace(p.gaussians, means=p.gaussians.means + shifts[k])) for k, p in enumerate(placed)]
 
     def left(self, view: View) -> torch.Tensor:
         """The direction `[3]` to the body's left at a view."""

@@ -28,14 +28,33 @@ def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: 
 
 
 @torch.no_grad()
-def readout_shift(points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> torch.Tensor:
-    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`."""
+def readout_shift(
+    points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str, which: torch.Tensor | None = None
+) -> torch.Tensor:
+    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`. which
+    `[N]`: where first and last are several poses `[P, 4, 4]`, which of them is each point's."""
     middle, travel = (0.5 * (first + last)).float(), (last - first).float()
-    middle, local = (upload(m, points.device) for m in (middle, middle[:3, :3].T @ travel[:3]))
-    seen = points @ middle[:3, :3].T + middle[:3, 3]
+    middle, local = (upload(m, points.device) for m in (middle[..., :3, :], middle[..., :3, :3].mT @ travel[..., :3, :]))
+
+    def carried(by: torch.Tensor) -> torch.Tensor:
+        if which is None:
+            return points @ by[:, :3].T + by[:, 3]
+        mine = by.index_select(0, which)
+        return (mine[:, :, :3] * points[:, None]).sum(-1) + mine[:, :, 3]
+
+    seen = carried(middle)
     ahead = seen[:, 2:] > NEAR
     axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
     share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
     # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
     share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
-    return share * (points @ local[:, :3].T + local[:, 3])
+    return share * carried(local)
+
+
+def shifts_of(means: list[torch.Tensor], first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> tuple[torch.Tensor, ...]:
+    """`readout_shift` of several groups of points, each with poses of its own `[P, 4, 4]`."""
+    if len(means) == 1:
+        return (readout_shift(means[0], first[0], last[0], camera, shutter),)
+    counts = torch.tensor([len(m) for m in means])
+    which = upload(torch.repeat_interleave(torch.arange(len(means)), counts), means[0].device)
+    return readout_shift(torch.cat(means), first, last, camera, shutter, which).split(counts.tolist())

@@ -50,8 +50,7 @@ def poses(camera: Camera, placed: Sequence[Placed]) -> torch.Tensor:
     """float64 `[P, C, 4, 4]`: cam_from_local of each instance as coefficients of the powers of the readout's share, C = 1 where nothing
     moves. Composed in float64, differentiable in every pose; all on the cameras' device."""
     if not moves(camera, placed):
-        cam_from_world = inverse(camera.world_from_cam)
-        return torch.stack([cam_from_world @ p.world_from_local for p in placed])[:, None]
+        return (inverse(camera.world_from_cam) @ torch.stack([p.world_from_local for p in placed]))[:, None]
     cam_from_world = inverse(_along(camera.world_from_cam, camera.world_from_cam_end))
     nodes = torch.stack([cam_from_world @ _along(p.world_from_local, p.world_from_local_end) for p in placed])
     return torch.einsum("kn,pnij->pkij", _CUBIC.to(nodes.device), nodes)

@@ -202,8 +202,10 @@ def _check(placed, camera, outputs, flow_to, model, config) -> None:
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")
-    for name, pose in [("camera", camera.world_from_cam)] + [(f"instance {p.instance}", p.world_from_local) for p in placed]:
-        if not torch.isfinite(pose).all():
-            raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
+    given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
+    if not torch.isfinite(torch.stack(given).sum()):  # one value that is not finite makes the sum so
+        for name, pose in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, strict=True):
+            if not torch.isfinite(pose).all():
+                raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
     if max(p.instance for p in placed) >= 2**24 or min(p.instance for p in placed) < 0:
         raise ValueError("instance ids must lie between 0 and 2^24 - 1")

@@ -60,9 +60,9 @@ class Gaussians:
         check_tensor("sh", self.sh, (n, "K", 3), torch.float32)
         if self.sh.shape[1] not in SH_COUNTS:
             raise ValueError(f"sh must have 1, 4, 9 or 16 coefficients, got {self.sh.shape[1]}")
-        devices = {str(t.device) for t in self.tensors().values()}
-        if len(devices) > 1:
-            raise ValueError(f"all fields must be on one device, got {', '.join(sorted(devices))}")
+        if any(t.device != self.means.device for t in (self.quats, self.log_scales, self.logit_opacities, self.sh)):
+            devices = sorted({str(t.device) for t in self.tensors().values()})
+            raise ValueError(f"all fields must be on one device, got {', '.join(devices)}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -77,11 +77,13 @@ class Gaussians:
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """The five fields by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return {
+            "means": self.means, "quats": self.quats, "log_scales": self.log_scales, "logit_opacities": self.logit_opacities, "sh": self.sh,
+        }  # fmt: skip
 
     def map(self, change) -> Gaussians:
         """A copy with `change(tensor)` in place of every field."""
-        return replace(self, **{name: change(t) for name, t in self.tensors().items()})
+        return Gaussians(*(change(t) for t in self.tensors().values()))
 
     def to(self, device) -> Gaussians:
         return self.map(lambda t: t.to(device))
