@@ -29,18 +29,17 @@ def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: 
 
 @torch.no_grad()
 def readout_shift(
-    points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str, which: torch.Tensor | None = None
+    points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str, counts: list[int] | None = None
 ) -> torch.Tensor:
-    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`. which
-    `[N]`: where first and last are several poses `[P, 4, 4]`, which of them is each point's."""
+    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`. counts:
+    where first and last are several poses `[P, 4, 4]`, of how many of the points each is."""
     middle, travel = (0.5 * (first + last)).float(), (last - first).float()
     middle, local = (upload(m, points.device) for m in (middle[..., :3, :], middle[..., :3, :3].mT @ travel[..., :3, :]))
 
     def carried(by: torch.Tensor) -> torch.Tensor:
-        if which is None:
+        if counts is None:
             return points @ by[:, :3].T + by[:, 3]
-        mine = by.index_select(0, which)
-        return (mine[:, :, :3] * points[:, None]).sum(-1) + mine[:, :, 3]
+        return torch.cat([torch.addmm(m[:, 3], p, m[:, :3].T) for p, m in zip(points.split(counts), by, strict=True)])
 
     seen = carried(middle)
     ahead = seen[:, 2:] > NEAR
@@ -55,6 +54,5 @@ def shifts_of(means: list[torch.Tensor], first: torch.Tensor, last: torch.Tensor
     """`readout_shift` of several groups of points, each with poses of its own `[P, 4, 4]`."""
     if len(means) == 1:
         return (readout_shift(means[0], first[0], last[0], camera, shutter),)
-    counts = torch.tensor([len(m) for m in means])
-    which = upload(torch.repeat_interleave(torch.arange(len(means)), counts), means[0].device)
-    return readout_shift(torch.cat(means), first, last, camera, shutter, which).split(counts.tolist())
+    counts = [len(m) for m in means]
+    return readout_shift(torch.cat(means), first, last, camera, shutter, counts).split(counts)

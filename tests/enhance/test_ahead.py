@@ -26,15 +26,15 @@ def tensors(batch: Batch) -> list[torch.Tensor]:
 
 
 def draws_of(sampler, what):
-    return {"batch": lambda step: sampler.batch(step, 2, 2, 32), "objects": lambda step: sampler.objects(step, 3)}[what]
+    return {"right": lambda step: sampler.right(step, 2, 32), "objects": lambda step: sampler.objects(step, 3)}[what]
 
 
-@pytest.mark.parametrize("what", ["batch", "objects"])
+@pytest.mark.parametrize("what", ["right", "objects"])
 def test_what_is_drawn_ahead_is_what_is_drawn_when_asked_for(sampler, what):
     state = torch.get_rng_state()
     asked, ahead = (islice(drawn(draws_of(sampler, what), 5, CPU, processes), 4) for processes in (0, 2))
     for one, other in zip(asked, ahead, strict=True):
-        assert len(tensors(one)) == {"batch": 6, "objects": 9}[what]
+        assert len(tensors(one)) == {"right": 1, "objects": 9}[what]
         assert all(torch.equal(a.nan_to_num(7), b.nan_to_num(7)) for a, b in zip(tensors(one), tensors(other), strict=True))
     assert torch.equal(state, torch.get_rng_state())
 
