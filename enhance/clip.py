@@ -94,5 +94,10 @@ def enhance_video(
             if progress is not None:
                 progress(done, video.count)
     if not changed:
-        warn([f"no frame of {source} was changed; if it shows renders, say --rendered; render --enhance tells objects and has photos, too"])
+        why = (
+            "these weights' network rests, as it gained too little where it had not been"
+            if rendered
+            else "if it shows renders, say --rendered"
+        )
+        warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
     return done

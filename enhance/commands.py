@@ -86,7 +86,7 @@ class Train:
     start: str | None = None
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
-    """What of objects, shade, enhancer to train further; the rest of the weights stays as it is."""
+    """What of prior, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train; the weights run on either."""
     resume: Flag = False

@@ -75,9 +75,11 @@ def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
 def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     write(tmp_path / "in.mp4")
     enhance_video(tmp_path / "in.mp4", tmp_path / "same.mp4", Enhancer(Net(SMALL)))
-    assert "in.mp4 was changed; if it shows renders" in capsys.readouterr().err
+    assert "in.mp4 was changed: if it shows renders, say --rendered" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "photos.mp4", Enhancer(stirred()))
     assert "was changed" in capsys.readouterr().err
+    enhance_video(tmp_path / "in.mp4", tmp_path / "rested.mp4", Enhancer(stirred(), repair=False), rendered=True)
+    assert "network rests" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "other.mp4", Enhancer(stirred()), rendered=True)
     assert "was changed" not in capsys.readouterr().err
 
