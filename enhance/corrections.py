@@ -25,11 +25,6 @@ Corrections = Mapping[int, tuple[torch.Tensor, int]]
 was seen."""
 
 
-def corrected(net: ObjectNet, rgb: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
-    """Frames `[B, 3, H, W]` without a past, with objects by their ids `[B, 1, H, W]`, NaN where not told, as `correct` makes them."""
-    return torch.stack([correct(net, x, torch.nan_to_num(i[0]), {})[0] for x, i in zip(rgb, ids, strict=True)])
-
-
 @torch.no_grad()
 def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
     """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there and the shadows that they

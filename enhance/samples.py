@@ -73,7 +73,7 @@ class Sampler:
     def __init__(self, pairs: PairSet | None, photos: Photos | None, seed: int, kinds: Sequence[str] = KINDS):
         if pairs is None and photos is None:
             raise ValueError("there is nothing to train on: give pairs, photos or both")
-        self.pairs, self.photos, self.seed, self.kinds = pairs, photos, seed, kinds
+        self.photos, self.seed = photos, seed
         self.shards = {kind: pairs.of(kind, "train") if pairs and kind in kinds else [] for kind in KINDS}
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]

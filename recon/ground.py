@@ -79,10 +79,11 @@ def _without_objects(heights: np.ndarray, distance: np.ndarray) -> np.ndarray:
         if not ring.any():
             continue
         guess, weight = _averages(ground, heights, 2.5)
-        wider, weight_wide = _averages(ground, heights, 10.0)
-        guess = np.where(weight > 1e-3, guess, np.where(weight_wide > 1e-4, wider, 0.0))
-        # where nothing around is known, the farther away the less
-        slack = np.where(weight > 1e-3, STEP, STEP + 0.04 * distance)
+        slack, alone = np.full(heights.shape, STEP), weight <= 1e-3
+        if (ring & alone).any():  # nothing is known around: what is wider around, and the farther from the path the less surely
+            wider, weight = _averages(ground, heights, 10.0)
+            guess = np.where(alone, np.where(weight > 1e-4, wider, 0.0), guess)
+            slack = np.where(alone, STEP + 0.04 * distance, STEP)
         ground |= ring & (np.abs(heights - guess) < slack)
     smooth = _filled(np.where(ground, heights, np.nan), 0.0, start=2.5)
     return np.where(ground & (np.abs(heights - smooth) < 0.3), heights, np.nan)

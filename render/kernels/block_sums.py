@@ -50,7 +50,7 @@ def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
         at = kind * wp.static(of_kind) + (warp * wp.static(lanes) + entry) * wp.static(SUMS)
         if wp.static(lanes > 1):
             lane = thread % wp.static(lanes)
-            total = sum_of_warp(values, lane)
+            total = sum_of_warp(values)
             if lane < wp.static(SUMS):
                 cell(at + lane, total, True)
         else:

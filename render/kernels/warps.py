@@ -129,12 +129,12 @@ HALVE(1)
 #undef HALVE
 return v[0] + __shfl_xor_sync(0xffffffffu, v[0], 16);
 #else
-return values[at];
+return values[0];
 #endif
 """)
-def sum_of_warp(values: vec_sums, at: int) -> float:
-    """Number `at`, which is the thread's lane modulo SUMS, summed over the warp. The numbers halve while the threads that sum each double:
-    16 exchanges for 16 numbers, where one number alone takes 5."""
+def sum_of_warp(values: vec_sums) -> float:
+    """The number of the thread's lane modulo SUMS, summed over the warp; of one thread, the first. The numbers halve while the threads that
+    sum each double: 16 exchanges for 16 numbers, where one number alone takes 5."""
     ...
 
 

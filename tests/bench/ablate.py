@@ -176,7 +176,7 @@ class Bench:
             with autocast(given.device):
                 out = net(given, torch.nan_to_num(told_of(given, sample.mask[:, 0])))
                 seen = perceptual(out, target, np.random.default_rng([self.seed, 7, step]))
-            loss = pixel_loss(out, target, sample.region[:, 0], CONFIG.logarithm) + CONFIG.perceptual * seen
+            loss = pixel_loss(out, target, CONFIG.logarithm) + CONFIG.perceptual * seen
             optimiser.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from enhance.corrections import STEADY, correct, corrected
+from enhance.corrections import STEADY, correct
 from enhance.object_samples import PIXELS, ObjectSampler
 from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
 from enhance.shade import KNOTS
@@ -77,7 +77,7 @@ def test_only_told_objects_change_and_small_ones_do_not():
 
 def test_where_no_mask_is_told_nothing_changes():
     rgb, _ = scene()
-    assert torch.equal(corrected(stirred(), rgb[None], torch.full((1, 1, 64, 96), torch.nan))[0], rgb)
+    assert torch.equal(correct(stirred(), rgb, torch.zeros(64, 96), {})[0], rgb)
 
 
 def test_an_object_s_corrections_are_averaged_over_frames():
