@@ -15,7 +15,7 @@ from enhance.damage import Damage, Sources, make
 from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, refits, shots_of
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
-from recon.assets import FEWEST_SPLATS, candidates
+from recon.assets.extract import FEWEST_SPLATS, candidates
 from recon.early import SHORT as EARLY
 from recon.log import Log
 from render.references import References

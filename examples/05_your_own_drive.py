@@ -4,8 +4,7 @@ from pathlib import Path
 
 import tyro
 
-from recon import open_log, reconstruct
-from recon.fit import FitConfig
+from recon import FitConfig, open_log, reconstruct
 from render import render_frame
 from render.contact import write_contact_sheet
 from render.video import from_bytes

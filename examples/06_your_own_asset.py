@@ -4,8 +4,8 @@ from pathlib import Path
 
 import tyro
 
-from recon.adding import add_mesh, check_databank
-from recon.meshes import MeshFit
+from recon.assets.adding import add_mesh, check_databank
+from recon.assets.meshes import MeshFit
 from render import render_clip
 from render.video import write_image
 from scenes import Databank, load

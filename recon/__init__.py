@@ -2,7 +2,14 @@
 
 import importlib
 
-_HOME = {"Log": "log", "open_log": "readers", "reconstruct": "build", "stopped_early": "early", "extract_assets": "assets"}
+_HOME = {
+    "FitConfig": "fit.fit",
+    "Log": "log",
+    "extract_assets": "assets.extract",
+    "open_log": "readers",
+    "reconstruct": "build",
+    "stopped_early": "early",
+}
 
 __all__ = sorted(_HOME)
 

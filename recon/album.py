@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
+from recon.fit.shutter import readout_shift
 from recon.frames import Frames
 from recon.report import readout_ends
-from recon.shutter import readout_shift
 from render import render_frame
 from render.album import keep_photos
 from render.rays import camera_rays

@@ -13,18 +13,18 @@ import torch
 
 from recon.album import keep_album
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit import Fit, FitConfig, run
+from recon.fit.fit import Fit, FitConfig, run
+from recon.fit.limbs import Limbs
+from recon.fit.model import MODEL, Knots
+from recon.fit.motion import Motion
+from recon.fit.strides import stride_of
 from recon.frames import Frames, load_frames
-from recon.limbs import Limbs
 from recon.log import Log, Sweep, Track
-from recon.model import MODEL, Knots
-from recon.motion import Motion
-from recon.movers import with_movers
+from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.skies import seen_sky
 from recon.start import Start, prepare
-from recon.strides import stride_of
 from recon.tracks import LIMBED
 from render.progress import Progress
 from scenes.asset import Actor, Asset

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.fit import FitConfig
+from recon.fit.fit import FitConfig
 from recon.log import Track
-from recon.measured import Measured
+from recon.seeds.measured import Measured
 from recon.start import Start
 from scenes.atomic import atomic_file
 from scenes.camera import RigCamera
@@ -84,7 +84,7 @@ def _camera(plain: list) -> RigCamera:
 
 
 def _start(plain: dict, fit: dict) -> Start:
-    from recon.model import Splats
+    from recon.fit.model import Splats
 
     tracks = [
         Track(

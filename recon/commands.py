@@ -152,7 +152,7 @@ class Add:
     """Folder of the databank."""
 
     def run(self) -> None:
-        from recon.adding import add_mesh, add_splats, holds_splats
+        from recon.assets.adding import add_mesh, add_splats, holds_splats
 
         add = add_splats if holds_splats(self.file) else add_mesh
         share = {"licence": self.licence, "attribution": self.attribution}
@@ -168,7 +168,7 @@ class Check:
     """Folder of the databank."""
 
     def run(self) -> None:
-        from recon.adding import check_databank
+        from recon.assets.adding import check_databank
         from scenes import Databank
 
         entries = Databank(self.databank).entries()

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
+from recon.fit.shutter import as_read
 from recon.frames import Frames, View
-from recon.shutter import as_read
 from render import render_frame
 from render.compare import psnr, ssim
 from scenes.camera import Camera, RigCamera

@@ -10,19 +10,19 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.actors import split_points
-from recon.carpet import carpet
-from recon.dense import cloud_from_pictures
-from recon.densify import LARGEST
-from recon.fill import unexplained
+from recon.fit.densify import LARGEST
+from recon.fit.model import Splats, draw
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
-from recon.measured import Measured, by_lidar
-from recon.model import Splats, draw
-from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.carpet import carpet
+from recon.seeds.dense import cloud_from_pictures
+from recon.seeds.fill import unexplained
+from recon.seeds.measured import Measured, by_lidar
+from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.sweep import companions
+from recon.seeds.triangulate import triangulated
 from recon.skies import SkyPicture, like_sky
-from recon.sweep import companions
-from recon.triangulate import triangulated
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground

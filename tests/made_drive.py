@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from street import START_US, STEP_US
 
-from recon.pandaset import LIDAR_FROM_BODY, MIDDLE_US, READOUT_US
+from recon.readers.pandaset import LIDAR_FROM_BODY, MIDDLE_US, READOUT_US
 from render import render_frame
 from scenes.poses import inverse, quat_from_matrix, yaw_of
 

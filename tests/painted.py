@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from recon.colmap import CAM_FROM_BODY
 from recon.log import Log, LogCamera, Packed
+from recon.readers.colmap import CAM_FROM_BODY
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.lenses import Pinhole

@@ -19,7 +19,7 @@ import numpy as np
 from recon import open_log
 from recon.actors import MARGIN, inside
 from recon.log import Log, Track
-from recon.movers import with_movers
+from recon.movers.search import with_movers
 from scenes.poses import inverse
 
 FEWEST = 5

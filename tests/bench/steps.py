@@ -15,19 +15,19 @@ from pathlib import Path
 
 import torch
 
-import recon.fit
+import recon.fit.fit
 import render.bridge
 from recon import open_log
 from recon.build import begin, choose, fit_config, fit_size
-from recon.descent import Descent
-from recon.develop import Develop
-from recon.fit import Fit
-from recon.losses import PictureLoss
-from recon.motion import Motion
+from recon.fit.descent import Descent
+from recon.fit.develop import Develop
+from recon.fit.fit import Fit
+from recon.fit.losses import PictureLoss
+from recon.fit.motion import Motion
 from render.bridge import Rasterize
 
 PARTS = [
-    (Fit, "step"), (Fit, "_in_sight"), (recon.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
+    (Fit, "step"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
     (Motion, "actor_poses"), (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
     (PictureLoss, "forward"), (Fit, "_gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
     (Develop, "backward"), (Descent, "follow"), (Fit, "_follow"),

@@ -8,7 +8,7 @@ from made_drive import write_drive
 
 from enhance.refits import SHORT, Less, as_reconstructed, by_turns, refits, rendered_aside, thinned
 from recon import open_log
-from recon.fit import Fit
+from recon.fit.fit import Fit
 from render import render_frame
 from render.compare import psnr
 from scenes.poses import inverse

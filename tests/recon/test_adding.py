@@ -6,7 +6,7 @@ import torch
 from randomized import gaussians
 from street import box, car
 
-from recon.adding import add_splats, check_databank, holds_splats, turned_upright
+from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
 from scenes import Asset, Databank, save
 from scenes.poses import matrix_from_quat
 from scenes.sizes import SIZES, odd_size

@@ -17,7 +17,7 @@ from made_waymo import NAMES as FIVE  # noqa: E402
 from made_waymo import READOUT_US, SEGMENT, near_points, write_waymo  # noqa: E402
 
 from recon import open_log  # noqa: E402
-from recon.waymo import _from_range, _rotations  # noqa: E402
+from recon.readers.waymo import _from_range, _rotations  # noqa: E402
 from scenes.lenses import OpenCV, Pinhole  # noqa: E402
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from street import box, splats
 
-from recon.assets import SECTORS, seen, shown_colours
-from recon.cleaning import cleaned, lies_on_road, of_object, outliers
+from recon.assets.cleaning import cleaned, lies_on_road, of_object, outliers
+from recon.assets.extract import SECTORS, seen, shown_colours
 from scenes import Gaussians, Trajectory
 from scenes.poses import translation, yaw
 

@@ -9,12 +9,12 @@ from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 
 from recon import open_log, reconstruct
 from recon.build import MOST, PER_PHOTO, fit_config, fit_size
-from recon.dense import cloud_from_pictures
-from recon.fit import FitConfig
+from recon.fit.fit import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
-from recon.gauge import find_gauge, up_from_cameras
 from recon.ground import estimate_ground
+from recon.readers.gauge import find_gauge, up_from_cameras
+from recon.seeds.dense import cloud_from_pictures
 from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert

@@ -1,8 +1,8 @@
 import numpy as np
 import torch
 
-from recon.densify import Growth, grow
-from recon.model import Splats
+from recon.fit.densify import Growth, grow
+from recon.fit.model import Splats
 from scenes.gaussians import Gaussians
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from recon.develop import Develop, developed, developed_by_matrices
+from recon.fit.develop import Develop, developed, developed_by_matrices
 from recon.kernels.develop import SKY_STEP
 from scenes import Camera, Pinhole
 from scenes.poses import yaw

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from recon.fill import FAR, unexplained
 from recon.frames import View
+from recon.seeds.fill import FAR, unexplained
+from recon.seeds.sweep import companions, swept_depth
 from recon.skies import SkyPicture, like_sky, seen_sky, sky_mask
-from recon.sweep import companions, swept_depth
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
 

@@ -11,9 +11,9 @@ from PIL import Image
 from recon import open_log, reconstruct, stopped_early
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path
-from recon.fit import Fit, FitConfig
-from recon.measured import Measured, mistake
-from recon.model import Knots, Splats, small_poses
+from recon.fit.fit import Fit, FitConfig
+from recon.fit.model import Knots, Splats, small_poses
+from recon.seeds.measured import Measured, mistake
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr

@@ -6,9 +6,9 @@ import torch
 from PIL import Image
 
 from recon import open_log
-from recon.colmap import CAM_FROM_BODY
 from recon.frames import load_frames
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
+from recon.readers.colmap import CAM_FROM_BODY
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 import walker
 
-from recon.assets import at_rest
+from recon.assets.extract import at_rest
 from recon.build import assemble, begin, choose
-from recon.fit import Fit, FitConfig
+from recon.fit.fit import Fit, FitConfig
 from recon.tracks import LIMBED
 from render import render_frame
 from scenes import Scene

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from recon.losses import PictureLoss, _blur, _blur_by_matrices, similarity
+from recon.fit.losses import PictureLoss, _blur, _blur_by_matrices, similarity
 from render.compare import ssim
 
 

@@ -8,8 +8,8 @@ from painted import SIZE, drive
 from recon.actors import split_points
 from recon.frames import load_frames
 from recon.log import LidarPoints, Sweep, Track
-from recon.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake
-from recon.stereo import plate_of
+from recon.seeds.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake
+from recon.seeds.stereo import plate_of
 from scenes.camera import Camera
 from scenes.lenses import Fisheye, OpenCV, Pinhole
 from scenes.poses import translation

@@ -7,7 +7,7 @@ from made_ncore import NAMES, READOUT_US, Camera, Graph, Lidar, Loader, install,
 from made_tape import check, tape
 
 from recon import open_log
-from recon.ncore import lens_of
+from recon.readers.ncore import lens_of
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
 
 

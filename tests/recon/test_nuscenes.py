@@ -6,7 +6,7 @@ from made_nuscenes import NAMES, write_nuscenes
 from made_tape import check, tape
 
 from recon import open_log
-from recon.nuscenes import label_of
+from recon.readers.nuscenes import label_of
 
 
 @pytest.fixture(scope="module")

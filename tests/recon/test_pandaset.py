@@ -8,7 +8,7 @@ from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
 from recon.actors import inside
-from recon.pandaset import LABELS
+from recon.readers.pandaset import LABELS
 from recon.tracks import slug
 from scenes.poses import inverse
 

@@ -6,7 +6,7 @@ from made_colmap import pictures_along, write_colmap
 from PIL import Image
 
 from recon import open_log
-from recon import photos as reader
+from recon.readers import photos as reader
 from render.video import VideoWriter
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")

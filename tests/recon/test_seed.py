@@ -3,7 +3,7 @@ import torch
 
 from recon import open_log
 from recon.frames import load_frames
-from recon.seed import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from scenes.poses import matrix_from_quat
 
 ALL = (0, 2**62)

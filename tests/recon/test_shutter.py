@@ -6,11 +6,11 @@ from randomized import gaussians
 from street import START_US, rig, street
 
 from recon.album import at_once
+from recon.fit.model import Knots
+from recon.fit.motion import EGO, Motion
+from recon.fit.shutter import as_read
 from recon.frames import Frames, View
-from recon.model import Knots
-from recon.motion import EGO, Motion
 from recon.report import read_out
-from recon.shutter import as_read
 from render import render_frame
 from render.compare import psnr
 from scenes import Camera, Pinhole

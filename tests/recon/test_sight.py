@@ -4,8 +4,8 @@ import torch
 from randomized import gaussians
 from street import START_US, street
 
-from recon.model import Splats, draw
-from recon.sight import in_sight
+from recon.fit.model import Splats, draw
+from recon.fit.sight import in_sight
 from scenes import Camera, Pinhole, Placed
 from scenes.lenses import Fisheye
 from scenes.poses import inverse, translation, yaw

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from made_drive import pickle_frame
 
-from recon.unpickle import read_frame
+from recon.readers.unpickle import read_frame
 
 
 class Malicious:

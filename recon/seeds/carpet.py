@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.seed import Cloud
+from recon.seeds.points import Cloud
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb

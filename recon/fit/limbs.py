@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import torch
 
+from recon.fit.strides import gone, phase, waves
 from recon.log import Track
-from recon.strides import gone, phase, waves
 from scenes.camera import Camera
 from scenes.deformation import Deformation, Lattice, between
 from scenes.gaussians import Placed

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 import torch
 import warp as wp
 
-from recon.densify import LARGEST, LONGEST, THINNEST, Growth
+from recon.fit.densify import LARGEST, LONGEST, THINNEST, Growth
+from recon.fit.model import FIELDS, Splats
 from recon.kernels.descent import BETA1, BETA2, Rates, catch_up, descend
-from recon.model import FIELDS, Splats
 from render.launch import run, stage, view
 
 _TYPES = (wp.vec3, wp.vec4, wp.vec3, float, wp.vec3)

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.readers.unpickle import read_frame
 from recon.tracks import named, slug
-from recon.unpickle import read_frame
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.arrow import read_cell, read_table
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
+from recon.readers.arrow import read_cell, read_table
 from recon.tracks import Boxes, tracks_of
 from scenes.lenses import OpenCV
 from scenes.names import unknown

@@ -14,8 +14,8 @@ from recon.actors import Split
 from recon.frames import Frames, View
 from recon.log import Log, Sweep, Track
 from recon.project import project
-from recon.seed import nearest_box
-from recon.stereo import WIDTH, Plate
+from recon.seeds.points import nearest_box
+from recon.seeds.stereo import WIDTH, Plate
 from scenes.camera import Camera
 from scenes.poses import inverse
 

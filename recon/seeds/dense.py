@@ -9,10 +9,10 @@ import torch
 
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints, Track
-from recon.measured import PICTURES, Measured, by_pictures
 from recon.project import project
-from recon.seed import Cloud, nearest_box, spread
-from recon.stereo import Plate, plate_of, swept
+from recon.seeds.measured import PICTURES, Measured, by_pictures
+from recon.seeds.points import Cloud, nearest_box, spread
+from recon.seeds.stereo import Plate, plate_of, swept
 from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground

@@ -11,18 +11,18 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 
-from recon.densify import Growth, grow
-from recon.descent import Descent, rates_at
-from recon.develop import developed
+from recon.fit.densify import Growth, grow
+from recon.fit.descent import Descent, rates_at
+from recon.fit.develop import developed
+from recon.fit.limbs import Limbs
+from recon.fit.losses import PictureLoss
+from recon.fit.model import Splats, draw, placed_groups
+from recon.fit.motion import REFINED, Moment, Motion
+from recon.fit.sight import Eye, in_sight
 from recon.frames import Frames, View
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
-from recon.limbs import Limbs
-from recon.losses import PictureLoss
-from recon.measured import Measured, mistake
-from recon.model import Splats, draw, placed_groups
-from recon.motion import REFINED, Moment, Motion
-from recon.sight import Eye, in_sight
+from recon.seeds.measured import Measured, mistake
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
@@ -59,7 +59,7 @@ class FitConfig:
     """Part of the splats in sight that a step leaves out of its picture, by lot, towards the end; the others are denser for them. Where few
     photos see a place, none may serve one photo alone (DropGaussian, Park et al. 2025)."""
     depth_weight: float = 1.0
-    """Of depths that are not as measured, times what suits who measured them (`recon/measured.py`)."""
+    """Of depths that are not as measured, times what suits who measured them (`recon/seeds/measured.py`)."""
     seed: int = 0
     """Of the order of views."""
 

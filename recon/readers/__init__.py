@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from recon.argoverse2 import is_argoverse2, read_argoverse2
-from recon.colmap import find_model, read_colmap
-from recon.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
 from recon.log import Log
-from recon.ncore import is_ncore, read_ncore
-from recon.nuscenes import is_nuscenes, read_nuscenes
-from recon.pandaset import is_pandaset, read_pandaset
-from recon.photos import is_photos, is_video, read_photos
-from recon.waymo import is_waymo, read_waymo
+from recon.readers.argoverse2 import is_argoverse2, read_argoverse2
+from recon.readers.colmap import find_model, read_colmap
+from recon.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
+from recon.readers.ncore import is_ncore, read_ncore
+from recon.readers.nuscenes import is_nuscenes, read_nuscenes
+from recon.readers.pandaset import is_pandaset, read_pandaset
+from recon.readers.photos import is_photos, is_video, read_photos
+from recon.readers.waymo import is_waymo, read_waymo
 
 
 def open_log(path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:

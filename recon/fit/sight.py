@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 import warp as wp
 
+from recon.fit.model import MODEL, Splats
 from recon.kernels.sight import mark
-from recon.model import MODEL, Splats
 from render.cull import view_sides
 from render.launch import run, stage, upload, view
 from scenes.camera import Camera

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from recon.fit.model import Knots, scaled, small_poses
+from recon.fit.shutter import shifts_of
 from recon.frames import Frames, View
-from recon.model import Knots, scaled, small_poses
-from recon.shutter import shifts_of
 from scenes.camera import Camera, RigCamera
 from scenes.gaussians import Placed
 from scenes.poses import inverse

@@ -11,8 +11,8 @@ import torch
 from scipy import ndimage
 
 from recon.frames import View
-from recon.seed import Cloud
-from recon.sweep import swept_depth
+from recon.seeds.points import Cloud
+from recon.seeds.sweep import swept_depth
 from scenes.camera import Camera
 
 FAR = 250.0

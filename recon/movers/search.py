@@ -12,11 +12,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from recon.actors import MARGIN, SWEPT_MARGIN, inside
-from recon.boxing import boxed
-from recon.following import FEWEST, Cluster, Followed, follow
-from recon.freespace import RangeImage, range_image, tally
 from recon.ground import estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
+from recon.movers.boxing import boxed
+from recon.movers.following import FEWEST, Cluster, Followed, follow
+from recon.movers.freespace import RangeImage, range_image, tally
 from recon.tracks import named
 from scenes.ground import Ground
 from scenes.poses import inverse

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from recon.colmap import colmap_lens
 from recon.frames import Frames, View
 from recon.log import Log, SparsePoints
-from recon.sfm import triangulate
+from recon.readers.colmap import colmap_lens
+from recon.readers.sfm import triangulate
 from scenes.poses import inverse
 
 AHEAD = (1, 2, 4, 8)

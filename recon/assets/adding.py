@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from recon.assets import moved, thumbnail
-from recon.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
+from recon.assets.extract import moved, thumbnail
+from recon.assets.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
 from render.progress import Progress
 from scenes.asset import Asset
 from scenes.databank import Databank

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from recon.model import FIELDS, Splats
+from recon.fit.model import FIELDS, Splats
 
 FAINT = 0.02
 """Opacity under which a splat is dropped."""

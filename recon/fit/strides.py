@@ -7,9 +7,9 @@ import math
 import torch
 import torch.nn.functional as F
 
+from recon.fit.motion import Motion
 from recon.frames import Frames, View
 from recon.log import Track
-from recon.motion import Motion
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 

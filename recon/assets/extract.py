@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.cleaning import cleaned
+from recon.assets.cleaning import cleaned
 from render import Frame, rasterize
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera

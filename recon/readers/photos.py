@@ -12,9 +12,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from recon.colmap import find_model, read_colmap
 from recon.log import Log, image_size
-from recon.sfm import solve
+from recon.readers.colmap import find_model, read_colmap
+from recon.readers.sfm import solve
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from recon.following import Cluster
 from recon.log import Track
+from recon.movers.following import Cluster
 from scenes.ground import Ground
 from scenes.poses import pose_from
 

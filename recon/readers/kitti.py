@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
-from recon.spin import untwisted
+from recon.readers.spin import untwisted
 from recon.tracks import Boxes, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, translation, yaw

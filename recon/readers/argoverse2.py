@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.arrow import read_table
 from recon.log import LidarPoints, Log, LogCamera, Sweep, lengthened
+from recon.readers.arrow import read_table
 from recon.tracks import Boxes, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.gauge import find_gauge
 from recon.log import Log, LogCamera, SparsePoints
-from recon.sfm import Model, ModelCamera, ModelImage, is_model, read_model
+from recon.readers.gauge import find_gauge
+from recon.readers.sfm import Model, ModelCamera, ModelImage, is_model, read_model
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
 from scenes.trajectory import Trajectory

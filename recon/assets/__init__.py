@@ -1,0 +1,1 @@
+"""Assets for the databank: cut out of a scene, or made of a mesh or of splats."""

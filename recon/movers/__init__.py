@@ -1,0 +1,1 @@
+"""What moves in a drive that has no boxes, found in its lidar."""
