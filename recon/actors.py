@@ -52,12 +52,14 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     for sweep in sweeps:
         points = sweep.read()
         keep = np.ones(len(points.xyz), dtype=bool)
+        x, y = np.ascontiguousarray(points.xyz[:, :2].T)
         for track in tracks:
             at = stamps[track.name].get(sweep.time_us)
             if at is None:
                 continue
             pose = track.world_from_box[at]
-            near = np.flatnonzero(np.abs(points.xyz[:, :2] - pose[:2, 3].numpy()).max(1) < track.size.max() + 1)
+            reach = track.size.max() + 1
+            near = np.flatnonzero((np.abs(x - float(pose[0, 3])) < reach) & (np.abs(y - float(pose[1, 3])) < reach))
             if not len(near):
                 continue
             back = inverse(pose).numpy()

@@ -134,14 +134,10 @@ def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np
     trajectory = track.trajectory()
     if len(points) < 100:
         skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
-        when = frames.of(0)
-        nearest = min(when, key=lambda v: _separation(log, track, v)).index if when else 0
-        points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), nearest)])
-
-    def pose(view: View) -> torch.Tensor | None:
-        return trajectory.at(view.time_us) if trajectory.covers(view.time_us) else None
-
-    seen = colours(log, frames, points, sweep, [], pose)
+        points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), _nearest(log, track, frames.of(0)))])
+    times = sorted({v.time_us for v in frames.training() if trajectory.covers(v.time_us)})
+    poses = dict(zip(times, trajectory.at_each(torch.tensor(times, dtype=torch.int64)), strict=True))
+    seen = colours(log, frames, points, sweep, [], lambda view: poses.get(view.time_us))
     rgb = merged_colours(seen, gains)
     known = np.isfinite(rgb[:, 0])
     if not known.any():
@@ -150,12 +146,15 @@ def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np
     return splats_from(cloud, sides, sh_count, 0.15)
 
 
-def _separation(log: Log, track: Track, view: View) -> float:
-    """Metres between body and box at a view's time; inf where there is no box then."""
+def _nearest(log: Log, track: Track, views: list[View]) -> int:
+    """Index of the view during which a box is nearest to the body, of those in whose time there is one; the first where there is none."""
     trajectory = track.trajectory()
-    if not trajectory.covers(view.time_us):
-        return float("inf")
-    return float((trajectory.at(view.time_us)[:3, 3] - log.ego.at(view.time_us)[:3, 3]).norm())
+    there = [v for v in views if trajectory.covers(v.time_us)]
+    if not there:
+        return views[0].index if views else 0
+    times = torch.tensor([v.time_us for v in there])
+    apart = (trajectory.at_each(times) - log.ego.at_each(times))[:, :3, 3].norm(dim=1)
+    return there[int(apart.argmin())].index
 
 
 def box_skin(size: np.ndarray, step: float) -> np.ndarray:

@@ -6,6 +6,8 @@ the depth of what stands below them in the image, since facades and poles are up
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -56,11 +58,7 @@ def _from_below(depth: np.ndarray) -> np.ndarray:
     below = np.minimum.accumulate(below[::-1], 0)[::-1]
     filled = np.where(below < len(depth), np.take_along_axis(depth, np.minimum(below, len(depth) - 1), 0), np.nan)
     # a single near lidar hit (a wire, a lamp) must not pull a whole column to it: the median of the columns around decides
-    padded = ndimage.generic_filter(filled[::1], _median, size=(1, 5), mode="nearest") if np.isnan(filled).any() else filled
-    filled = np.where(known, depth, padded)
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(filled, ((0, 0), (2, 2)), mode="edge"), 5, axis=1)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where nothing is known there is no median
+        filled = np.where(known, depth, np.nanmedian(beside, axis=2))
     return np.where(np.isfinite(filled), filled, FAR)
-
-
-def _median(values: np.ndarray) -> float:
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) else np.nan

@@ -17,6 +17,7 @@ from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import inverse, quat_from_matrix
+from scenes.trajectory import all_at
 
 T = TypeVar("T")
 
@@ -73,26 +74,27 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
 def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
     """Depth `[H, W]`, as the lens means it, of the nearest corner of the boxes in whose image rectangles a pixel lies; inf in none."""
     depth = np.full((camera.height, camera.width), np.inf)
-    from_world = inverse(camera.world_from_cam)
-    for track in tracks:
-        trajectory = track.trajectory()
-        if not trajectory.covers(camera.time_us):
-            continue
-        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * track.size
-        pose = (from_world @ trajectory.at(camera.time_us)).numpy()
-        local = corners @ pose[:3, :3].T + pose[:3, 3]
-        if local[:, 2].max() < 0.2:
-            continue
-        local[:, 2] = np.maximum(local[:, 2], 0.2)
-        pixels = camera.lens.project(torch.from_numpy(local)).numpy()
-        low = np.floor(pixels.min(0)).clip(0, [camera.width, camera.height]).astype(int)
-        high = np.ceil(pixels.max(0)).clip(0, [camera.width, camera.height]).astype(int)
-        part = (slice(low[1], high[1]), slice(low[0], high[0]))
+    paths = [track.trajectory() for track in tracks]
+    there = [i for i, path in enumerate(paths) if path.covers(camera.time_us)]
+    if not there:
+        return depth
+    poses = (inverse(camera.world_from_cam) @ torch.stack(all_at([paths[i] for i in there], camera.time_us))).numpy()
+    sizes = np.array([tracks[i].size for i in there])
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * sizes[:, None]
+    local = corners @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    before = local[..., 2].max(1) >= 0.2
+    poses, sizes, local = poses[before], sizes[before], local[before]
+    local[..., 2] = np.maximum(local[..., 2], 0.2)
+    points = torch.from_numpy(local)
+    pixels, depths = camera.lens.project(points).numpy(), camera.lens.depth(points).numpy().min(1)
+    low = np.floor(pixels.min(1)).clip(0, [camera.width, camera.height]).astype(int)
+    high = np.ceil(pixels.max(1)).clip(0, [camera.width, camera.height]).astype(int)
+    for pose, size, least, (left, top), (right, bottom) in zip(poses, sizes, depths, low, high, strict=True):
+        part = (slice(top, bottom), slice(left, right))
         eye = -pose[:3, :3].T @ pose[:3, 3]
-        away = float(np.linalg.norm(eye - eye.clip(track.size * [-0.5, -0.5, 0], track.size * [0.5, 0.5, 1])))
+        away = float(np.linalg.norm(eye - eye.clip(size * [-0.5, -0.5, 0], size * [0.5, 0.5, 1])))
         # z is least at a corner; the distance, which some lenses mean by depth, need not be
-        least = float(camera.lens.depth(torch.from_numpy(local)).min())
-        depth[part] = np.minimum(depth[part], min(least, max(away, 0.2)))
+        depth[part] = np.minimum(depth[part], min(float(least), max(away, 0.2)))
     return depth
 
 
