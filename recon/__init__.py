@@ -3,7 +3,7 @@
 import importlib
 
 _HOME = {
-    "FitConfig": "fit.fit",
+    "FitConfig": "fit",
     "Log": "log",
     "extract_assets": "assets.extract",
     "open_log": "readers",

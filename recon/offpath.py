@@ -11,6 +11,7 @@ from scipy import ndimage
 from recon.actors import split_points
 from recon.log import Log, Sweep
 from recon.project import project
+from recon.skies import HIDDEN, always_hidden, cells, looks_of
 from render import render_frame
 from render.rays import world_directions
 from render.warp import warp
@@ -43,14 +44,17 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
     depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, d being the expected
-    depth; points: how many those are. holes: share of pixels below the horizon with alpha under 0.9. flicker: mean absolute
-    difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
+    depth; points: how many those are. holes: share of pixels below the horizon with alpha under 0.9; holes_above: the same above it, where
+    from the recorded path no sky is ever seen (None where it is seen everywhere): between a tree and the house behind it, and through
+    windows. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in
+    both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
     static = [(s, split_points(log, [s], movers).static) for s in sweeps]
+    hidden = always_hidden(looks_of(scene))
     rows = []
     for shift in shifts:
-        errors, below, open_ = [], 0, 0
+        errors, holes = [], {"holes": np.zeros(2), "holes_above": np.zeros(2)}
         paths = [scene.ego.shifted(lateral=side) for side in (shift, -shift)]
         for k, (sweep, points) in enumerate(static):
             for name in scene.rig:
@@ -61,13 +65,15 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                     frame = render_frame(scene, camera, ("alpha", "depth"))
                 assert frame.alpha is not None and frame.depth is not None
                 alpha, depth = frame.alpha.cpu(), frame.depth.cpu()
-                ground = world_directions(camera)[..., 2] < 0
-                below += int(ground.sum())
-                open_ += int((ground & (alpha < SOLID)).sum())
+                directions = world_directions(camera)
+                ground = directions[..., 2] < 0
+                for which, solid in (("holes", ground), ("holes_above", ~ground & hidden[cells(directions, HIDDEN)])):
+                    holes[which] += [int((solid & (alpha < SOLID)).sum()), int(solid.sum())]
                 errors.append(depth_errors(depth.numpy(), points, camera))
         found = np.concatenate(errors) if errors else np.zeros(0)
         row = {"shift_m": shift, "depth_error": float(np.median(found)) if len(found) else None, "points": len(found)}
-        rows.append(row | {"holes": open_ / below if below else None, "flicker": flicker_along(scene, shift)})
+        row |= {which: float(open_ / solid) if solid else None for which, (open_, solid) in holes.items()}
+        rows.append(row | {"flicker": flicker_along(scene, shift)})
     return rows
 
 
@@ -112,9 +118,9 @@ def _planes(image: torch.Tensor | None) -> torch.Tensor:
 
 def off_path_text(rows: Sequence[dict]) -> str:
     """The rows for people."""
-    lines = [f"{'off the path':<14} {'depth error':>12} {'lidar points':>13} {'holes':>8} {'flicker, levels':>16}"]
+    lines = [f"{'off the path':<14} {'depth error':>12} {'lidar points':>13} {'holes':>8} {'above':>8} {'flicker, levels':>16}"]
     for r in rows:
-        error, holes = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "holes"))
+        error, holes, above = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "holes", "holes_above"))
         where = f"{r['shift_m']:g} m aside" if r["shift_m"] else "as recorded"
-        lines.append(f"{where:<14} {error:>12} {r['points']:>13} {holes:>8} {r['flicker']:>16.2f}")
+        lines.append(f"{where:<14} {error:>12} {r['points']:>13} {holes:>8} {above:>8} {r['flicker']:>16.2f}")
     return "\n".join(lines)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -17,6 +19,8 @@ LOOKS = 12
 FREE = 0.05
 """Of all looks in a direction, those that must meet nothing for the sky there to be believed."""
 
+HIDDEN = 128
+"""Rows of the grid of directions in which the sky is never seen: 1.4 degrees each."""
 
 TINT, BRIGHTEST = 32, 0.8
 """Of an overcast sky: levels between its channels at most, and part of the light of the picture's brightest fiftieth that it has."""
@@ -82,10 +86,31 @@ def _cells(mask: np.ndarray, camera: Camera, height: int) -> tuple[np.ndarray, n
     """Row and column of the equirectangular grid `[height, 2 height]` that each masked pixel looks at."""
     rows, columns = np.nonzero(mask)
     pixels = torch.from_numpy(np.stack([columns, rows], 1) + 0.5)
-    x, y, z = (camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T).numpy().T
-    c = ((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * height).astype(np.int64) % (2 * height)
-    r = ((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(np.int64).clip(0, height - 1)
-    return r, c
+    row, column = cells(camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T, height)
+    return row.numpy(), column.numpy()
+
+
+def cells(directions: torch.Tensor, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Row and column of an equirectangular grid `[height, 2 height]` that world directions `[..., 3]` of any length point at."""
+    x, y, z = directions.unbind(-1)
+    column = ((0.5 - torch.atan2(y, x) / (2 * torch.pi)) * 2 * height).long() % (2 * height)
+    row = ((0.5 - torch.atan2(z, torch.hypot(x, y)) / torch.pi) * height).long().clamp(0, height - 1)
+    return row, column
+
+
+def always_hidden(looks: Iterable[tuple[np.ndarray, Camera]]) -> torch.Tensor:
+    """bool `[HIDDEN, 2 HIDDEN]`: directions that some looks show and none shows the sky in, nor right beside; a look is the mask `[h, w]`
+    of what may be sky, and a camera of its size.
+
+    Where the sky was never seen, light from it in a view from elsewhere is a hole: between a tree and the house behind it, say.
+    """
+    looked, open_ = np.zeros((2, HIDDEN, 2 * HIDDEN), bool)
+    for sky, camera in looks:
+        looked[_cells(np.ones_like(sky), camera, HIDDEN)] = True
+        open_[_cells(sky, camera, HIDDEN)] = True
+    looked, open_ = (np.pad(mask, ((0, 0), (2, 2)), mode="wrap") for mask in (looked, open_))
+    looked = ndimage.binary_closing(looked, np.ones((3, 3))) | looked  # a small picture's pixels lie farther apart than directions
+    return torch.from_numpy((looked & ~ndimage.binary_dilation(open_, np.ones((3, 3))))[:, 2:-2])
 
 
 def seen_sky(scene: Scene) -> Sky:
@@ -97,6 +122,18 @@ def seen_sky(scene: Scene) -> Sky:
     assert scene.sky is not None
     own = srgb_from_linear(scene.sky.linear).numpy()
     looks, free = np.zeros(own.shape[:2]), np.zeros(own.shape[:2])
+    for sky, camera in looks_of(scene):
+        np.add.at(looks, _cells(np.ones_like(sky), camera, len(own)), 1)
+        np.add.at(free, _cells(sky, camera, len(own)), 1)
+    picture = SkyPicture(len(own))
+    picture.count = np.where(free > FREE * looks, free, 0)
+    picture.sum = own * picture.count[..., None]
+    return Sky(linear_from_srgb(picture.picture().clamp(0, 1)))
+
+
+@torch.no_grad()
+def looks_of(scene: Scene) -> Iterator[tuple[np.ndarray, Camera]]:
+    """Masks `[h, w]` of where light comes from the sky, at `LOOKS` moments of each of a scene's cameras, and the cameras of their size."""
     for name in scene.rig:
         times = scene.frame_times(name)
         for k in np.unique(np.linspace(0, len(times) - 1, LOOKS).astype(int)):
@@ -104,9 +141,4 @@ def seen_sky(scene: Scene) -> Sky:
             camera = camera.resized(max(16, camera.width // 2), max(16, camera.height // 2))
             alpha = render_frame(scene, camera, ("alpha",)).alpha
             assert alpha is not None
-            np.add.at(looks, _cells(np.ones(alpha.shape, bool), camera, len(own)), 1)
-            np.add.at(free, _cells((alpha < 0.5).cpu().numpy(), camera, len(own)), 1)
-    picture = SkyPicture(len(own))
-    picture.count = np.where(free > FREE * looks, free, 0)
-    picture.sum = own * picture.count[..., None]
-    return Sky(linear_from_srgb(picture.picture().clamp(0, 1)))
+            yield (alpha < 0.5).cpu().numpy(), camera

@@ -23,6 +23,8 @@ from recon.frames import Frames, View
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.measured import Measured, mistake
+from recon.seeds.points import spread
+from recon.skies import HIDDEN, always_hidden, cells
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
@@ -78,7 +80,11 @@ SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
 
 ASIDE, ASIDE_EVERY, ASIDE_WEIGHT = 3.0, 2, 0.3
-"""Metres to either side of the path from which the road must be closed too, every how many steps that is looked at, and its weight."""
+"""Metres to either side of the path from which the road must be closed too, and what always hides the sky; every how many steps that is
+looked at, and its weight."""
+
+LOOKS = 40
+"""Pictures of a camera by which it is known where the sky is never seen."""
 
 HORIZON = -0.01
 """Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
@@ -120,6 +126,7 @@ class Fit:
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
+        self._hidden = self._never_sky()
         self._optimise()
 
     def _chances(self) -> torch.Tensor:
@@ -217,6 +224,15 @@ class Fit:
         placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
         return self.limbs.bent(placed, view.time_us)
 
+    def _never_sky(self) -> torch.Tensor:
+        """Directions in which no picture shows the sky, though some look there."""
+        looks = []
+        for c in range(len(self.frames.names)):
+            for view in spread(self.frames.of(c), LOOKS):
+                h, w = view.sky.shape
+                looks.append((view.sky.numpy(), self.motion.camera(view).resized(w, h)))
+        return always_hidden(looks).to(self.device)
+
     def _below(self, camera: Camera, view: View) -> torch.Tensor:
         """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
@@ -230,10 +246,11 @@ class Fit:
         return replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
 
     def _gaps(self, shown: Splats, view: View, camera: Camera) -> torch.Tensor:
-        """Mean of 1 - alpha below the horizon as a camera sees a view's moment."""
+        """Mean of 1 - alpha below the horizon, and where the sky is never seen, as a camera sees a view's moment."""
         placed = self._placed(shown, view, camera)
         (alpha,) = draw(placed, camera, "alpha")
-        return ((1 - alpha) * (world_directions(camera, self.device)[..., 2] < HORIZON)).mean()
+        directions = world_directions(camera, self.device)
+        return ((1 - alpha) * ((directions[..., 2] < HORIZON) | self._hidden[cells(directions, HIDDEN)])).mean()
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)

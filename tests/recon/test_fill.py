@@ -6,7 +6,7 @@ import torch
 from recon.frames import View
 from recon.seeds.fill import FAR, unexplained
 from recon.seeds.sweep import companions, swept_depth
-from recon.skies import SkyPicture, like_sky, seen_sky, sky_mask
+from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, like_sky, seen_sky, sky_mask
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
 
@@ -125,3 +125,15 @@ def test_a_sky_that_something_always_hid_is_spread_from_where_it_was_seen():
     assert (seen[26:38, 66:72] - blue).abs().max() < 1e-5
     untouched = seen_sky(Scene(Placed(wall.select(torch.zeros(0, dtype=torch.long)), still), (), sky, ego, rig)).linear
     assert (untouched[looked] - noise[looked]).abs().max() < 1e-5, "with no wall all of it was seen"
+
+
+def test_directions_in_which_no_look_shows_the_sky_are_known():
+    """Two looks ahead: one past a house on the left, one that a bus hides from there on to the right."""
+    first, second = np.zeros((2, 60, 80), bool)
+    first[:30, 30:] = True
+    second[:30, :20] = True
+    hidden = always_hidden([(first, camera()), (second, camera())])
+    rays = camera().lens.unproject(torch.tensor([[25.5, 12.5], [10.5, 12.5], [60.5, 12.5], [40.5, 50.5], [31.5, 28.5]]))
+    ahead = rays.double() @ camera().world_from_cam[:3, :3].T
+    assert hidden[cells(ahead, HIDDEN)].tolist() == [True, False, False, True, False]
+    assert not hidden[cells(-ahead, HIDDEN)].any(), "nobody looked back"

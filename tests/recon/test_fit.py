@@ -11,12 +11,13 @@ from PIL import Image
 from recon import open_log, reconstruct, stopped_early
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path
-from recon.fit.fit import Fit, FitConfig
+from recon.fit.fit import HORIZON, Fit, FitConfig
 from recon.fit.model import Knots, Splats, small_poses
 from recon.seeds.measured import Measured, mistake
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
+from render.rays import world_directions
 from scenes import Scene, load
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
@@ -173,6 +174,20 @@ def test_depth_follows_what_was_measured(drive):
             fit.step()
         after.append(_mistakes(fit) / before)
     assert after[0] > 0.9 and after[1] < 0.8 * after[0]
+
+
+def test_from_aside_nothing_may_be_open_where_the_sky_is_never_seen(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    view = fit.training[0]
+    camera = fit._aside(view, fit.motion.camera(view))
+    nothing = fit.splats.select(torch.zeros(0, dtype=torch.long), 1)
+    below = float((world_directions(camera)[..., 2] < HORIZON).float().mean())
+    open_ = float(fit._gaps(nothing, view, camera))
+    assert below + 0.1 < open_ < 0.9, "houses above the horizon count, and the sky does not"
+    fit._hidden[:] = False
+    assert float(fit._gaps(nothing, view, camera)) == pytest.approx(below)
 
 
 def test_a_drive_without_lidar_whose_pictures_show_no_features_is_refused(own_drive, tmp_path):

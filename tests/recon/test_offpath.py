@@ -7,6 +7,7 @@ import torch
 from recon import open_log
 from recon.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
 from scenes import Gaussians
+from tests.street import splats
 
 
 def without(scene, which):
@@ -42,6 +43,26 @@ def test_a_torn_road_shows_as_holes_and_a_wrong_one_as_depth_error(street, log):
     pose[1, 3] = 4.0
     aside = replace(street, background=replace(street.background, world_from_local=pose))
     assert off_path_table(aside, log, sweeps, (0.0,))[0]["depth_error"] > 2 * right["depth_error"]
+
+
+def board(x, width, height, hole=0.0):
+    """An upright board across the road `x` metres ahead, without a strip `hole` wide in its middle."""
+    y, z = torch.meshgrid(torch.arange(-width / 2, width / 2, 0.25), torch.arange(0.1, height, 0.25), indexing="ij")
+    points = torch.stack([torch.full_like(y, x), y, z], -1).reshape(-1, 3)
+    return splats(points[points[:, 1].abs() >= hole / 2], (0.5, 0.4, 0.3), (0.02, 0.2, 0.2))
+
+
+def test_a_gap_before_the_sky_that_opens_only_beside_the_path_shows_as_a_hole_above(street, log):
+    """A wall ahead with a slit in it that a board hides from the path."""
+    rows = []
+    for hole in (6.0, 0.0):
+        ahead = Gaussians.cat([board(40, 110, 40, hole), board(16, 3.0, 16)])
+        scene = replace(
+            street, background=replace(street.background, gaussians=ahead), actors=(), rig={"front_camera": street.rig["front_camera"]}
+        )
+        rows.append([r["holes_above"] for r in off_path_table(scene, log, held_out_sweeps(log, 4), (0.0, 2.0))])
+    (on_it, beside), closed = rows
+    assert on_it == 0 and beside > 0.005 and closed == [0, 0]
 
 
 def test_points_behind_nearer_points_do_not_count(street):
