@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,9 @@ from scenes.trajectory import Trajectory
 
 SEED_PART = 0.5
 """Of the splat budget that lidar may take: the rest grows where pictures ask for it."""
+
+ACTORS_PART, MOST_OF_ONE = 0.15, 3000
+"""Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
 SKY_HEIGHT = 256
 FILL_VIEWS = 6
@@ -93,9 +96,10 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
 
     groups, reaches, tracks = [], [], []
+    most = even_limit([len(points) for points, _ in split.actors.values()], int(budget * ACTORS_PART))
     for track in split.tracks:
         points, index = split.actors.get(track.name, (np.zeros((0, 3)), np.zeros(0, np.int64)))
-        made = _actor(log, frames, track, points, index, gains, sh_count)
+        made = _actor(log, frames, track, points, index, gains, sh_count, min(most, MOST_OF_ONE))
         if len(made):
             groups.append(made)
             tracks.append(track)
@@ -129,8 +133,21 @@ def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory
     return Trajectory(torch.tensor(times), torch.stack(poses))
 
 
-def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np.ndarray, gains: np.ndarray, sh_count: int) -> Gaussians:
-    """Seeds of a mover in its box frame: its own lidar points, and where they are few, the skin of its box."""
+def even_limit(counts: Sequence[int], total: int) -> int:
+    """How many each may have at most, so that all together have no more than `total`: those of few keep theirs."""
+    left, limit = total, total
+    for i, count in enumerate(rising := sorted(counts)):
+        limit = left // (len(rising) - i)
+        if count > limit:
+            return limit
+        left -= count
+    return max([limit, *counts])
+
+
+def _actor(
+    log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np.ndarray, gains: np.ndarray, sh_count: int, most: int
+) -> Gaussians:
+    """Seeds of a mover in its box frame, about `most`: its own lidar points, and where they are few, the skin of its box."""
     trajectory = track.trajectory()
     if len(points) < 100:
         skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
@@ -142,7 +159,7 @@ def _actor(log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np
     known = np.isfinite(rgb[:, 0])
     if not known.any():
         return Gaussians.empty(sh_count)
-    cloud, sides = thin(Cloud(points[known], rgb[known]), np.ones(known.sum()), 3000)
+    cloud, sides = thin(Cloud(points[known], rgb[known]), np.ones(known.sum()), most)
     return splats_from(cloud, sides, sh_count, 0.15)
 
 

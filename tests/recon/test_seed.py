@@ -4,6 +4,7 @@ import torch
 from recon import open_log
 from recon.frames import load_frames
 from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.start import even_limit
 from scenes.poses import matrix_from_quat
 
 ALL = (0, 2**62)
@@ -75,3 +76,13 @@ def test_seeds_of_a_plane_lie_flat_in_it():
 
 def test_views_are_spread_from_first_to_last():
     assert spread(list(range(10)), 4) == [0, 3, 6, 9] and spread([1], 5) == [1]
+
+
+def test_what_all_movers_may_have_goes_to_each_as_evenly_as_they_can_use_it():
+    generator = np.random.default_rng(0)
+    for total in (50, 400, 5000):
+        counts = generator.integers(0, 300, 20).tolist()
+        limit = even_limit(counts, total)
+        shared, more = (sum(min(n, which) for n in counts) for which in (limit, limit + 1))
+        assert shared <= total and (more > total or limit >= max(counts)), "no more than all may have, and no less than they could"
+    assert even_limit([5, 5], 20) >= 5 and even_limit([1, 100, 100], 101) == 50 and even_limit([], 10) > 0
