@@ -11,7 +11,7 @@ from scipy import ndimage
 from recon.actors import split_points
 from recon.log import Log, Sweep
 from recon.project import project
-from recon.skies import HIDDEN, always_hidden, cells, looks_of
+from recon.skies import always_hidden, cells, looks_of
 from render import render_frame
 from render.rays import world_directions
 from render.warp import warp
@@ -67,7 +67,7 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 alpha, depth = frame.alpha.cpu(), frame.depth.cpu()
                 directions = world_directions(camera)
                 ground = directions[..., 2] < 0
-                for which, solid in (("holes", ground), ("holes_above", ~ground & hidden[cells(directions, HIDDEN)])):
+                for which, solid in (("holes", ground), ("holes_above", ~ground & hidden[cells(directions, len(hidden))])):
                     holes[which] += [int((solid & (alpha < SOLID)).sum()), int(solid.sum())]
                 errors.append(depth_errors(depth.numpy(), points, camera))
         found = np.concatenate(errors) if errors else np.zeros(0)

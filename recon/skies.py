@@ -61,9 +61,9 @@ class SkyPicture:
 
     def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray) -> None:
         """Count the masked pixels of a uint8 image, divided by its camera's gain."""
-        cells = _cells(mask, camera, len(self.sum))
-        np.add.at(self.sum, cells, image[mask] / 255 / gain)
-        np.add.at(self.count, cells, 1)
+        row, column = (places[mask] for places in _cells(camera, len(self.sum)))
+        np.add.at(self.sum, (row, column), image[mask] / 255 / gain)
+        np.add.at(self.count, (row, column), 1)
 
     def picture(self) -> torch.Tensor:
         """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too
@@ -82,11 +82,9 @@ class SkyPicture:
         return torch.from_numpy(np.where(np.isnan(out), mean, out)).float()
 
 
-def _cells(mask: np.ndarray, camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of the equirectangular grid `[height, 2 height]` that each masked pixel looks at."""
-    rows, columns = np.nonzero(mask)
-    pixels = torch.from_numpy(np.stack([columns, rows], 1) + 0.5)
-    row, column = cells(camera.lens.unproject(pixels) @ camera.world_from_cam[:3, :3].T, height)
+def _cells(camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column `[H, W]` of the equirectangular grid `[height, 2 height]` that each pixel looks at."""
+    row, column = cells(camera.lens.unproject(camera.pixel_centres()) @ camera.world_from_cam[:3, :3].T, height)
     return row.numpy(), column.numpy()
 
 
@@ -106,8 +104,9 @@ def always_hidden(looks: Iterable[tuple[np.ndarray, Camera]]) -> torch.Tensor:
     """
     looked, open_ = np.zeros((2, HIDDEN, 2 * HIDDEN), bool)
     for sky, camera in looks:
-        looked[_cells(np.ones_like(sky), camera, HIDDEN)] = True
-        open_[_cells(sky, camera, HIDDEN)] = True
+        row, column = _cells(camera, HIDDEN)
+        looked[row, column] = True
+        open_[row[sky], column[sky]] = True
     looked, open_ = (np.pad(mask, ((0, 0), (2, 2)), mode="wrap") for mask in (looked, open_))
     looked = ndimage.binary_closing(looked, np.ones((3, 3))) | looked  # a small picture's pixels lie farther apart than directions
     return torch.from_numpy((looked & ~ndimage.binary_dilation(open_, np.ones((3, 3))))[:, 2:-2])
@@ -123,8 +122,9 @@ def seen_sky(scene: Scene) -> Sky:
     own = srgb_from_linear(scene.sky.linear).numpy()
     looks, free = np.zeros(own.shape[:2]), np.zeros(own.shape[:2])
     for sky, camera in looks_of(scene):
-        np.add.at(looks, _cells(np.ones_like(sky), camera, len(own)), 1)
-        np.add.at(free, _cells(sky, camera, len(own)), 1)
+        place = _cells(camera, len(own))
+        np.add.at(looks, place, 1)
+        np.add.at(free, place, sky)
     picture = SkyPicture(len(own))
     picture.count = np.where(free > FREE * looks, free, 0)
     picture.sum = own * picture.count[..., None]

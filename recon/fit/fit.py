@@ -24,7 +24,7 @@ from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.measured import Measured, mistake
 from recon.seeds.points import spread
-from recon.skies import HIDDEN, always_hidden, cells
+from recon.skies import always_hidden, cells
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
@@ -83,7 +83,7 @@ ASIDE, ASIDE_EVERY, ASIDE_WEIGHT = 3.0, 2, 0.3
 """Metres to either side of the path from which the road must be closed too, and what always hides the sky; every how many steps that is
 looked at, and its weight."""
 
-LOOKS = 40
+SKY_LOOKS = 40
 """Pictures of a camera by which it is known where the sky is never seen."""
 
 HORIZON = -0.01
@@ -228,7 +228,7 @@ class Fit:
         """Directions in which no picture shows the sky, though some look there."""
         looks = []
         for c in range(len(self.frames.names)):
-            for view in spread(self.frames.of(c), LOOKS):
+            for view in spread(self.frames.of(c), SKY_LOOKS):
                 h, w = view.sky.shape
                 looks.append((view.sky.numpy(), self.motion.camera(view).resized(w, h)))
         return always_hidden(looks).to(self.device)
@@ -250,7 +250,7 @@ class Fit:
         placed = self._placed(shown, view, camera)
         (alpha,) = draw(placed, camera, "alpha")
         directions = world_directions(camera, self.device)
-        return ((1 - alpha) * ((directions[..., 2] < HORIZON) | self._hidden[cells(directions, HIDDEN)])).mean()
+        return ((1 - alpha) * ((directions[..., 2] < HORIZON) | self._hidden[cells(directions, len(self._hidden))])).mean()
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
