@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch.nn import functional as F
 
+from enhance.shards import to_bytes
 from recon.log import LogCamera
 from render import render_frame
 from render.frame_types import Frame
@@ -55,6 +57,8 @@ class Clip:
         times = [scene_time(scene, camera.name, int(camera.times_us[i])) for i in self.indices]
         self.cameras = [scene.camera(camera.name, t).resized(config.width, height) for t in times]
         self.photos = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in self.indices])
+        if camera.ego_mask is not None and camera.ego_mask.any():
+            self._leave_out(torch.from_numpy(camera.ego_mask))
         # Seeded by name: a clip is the same whichever others are made beside it.
         digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()
         self.seed = int.from_bytes(digest[:6], "little")
@@ -62,6 +66,13 @@ class Clip:
         times = [c.time_us for c in self.cameras]
         self.meta = {"split": split, "camera": camera.name, "start": start, "times_us": times, "seed": seed} | rights
         self._geometry: dict[str, torch.Tensor] | None = None
+
+    def _leave_out(self, ego: torch.Tensor) -> None:
+        """What the scene shows where the photos show the recording car itself, bool `[h, w]`."""
+        ego = F.interpolate(ego[None, None].float(), self.photos.shape[1:3])[0, 0] > 0
+        for photo, frame in zip(self.photos, self.render(self.scene, "rgb"), strict=True):
+            assert frame.rgb is not None
+            photo[ego] = to_bytes(frame.rgb[ego])
 
     @property
     def name(self) -> str:

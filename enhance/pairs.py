@@ -17,6 +17,7 @@ from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.assets.extract import FEWEST_SPLATS, candidates
 from recon.early import SHORT as EARLY
+from recon.egomask import with_ego_masks
 from recon.log import Log
 from render.references import References
 from scenes.atomic import atomic_file
@@ -68,6 +69,7 @@ def make_pairs(
     out = Path(out)
     _claim(out, {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every})
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
+    log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
     for done, (camera, start) in enumerate(starts):
         name = f"{camera.name}_{start:04d}"
@@ -99,6 +101,7 @@ def prepare_sources(
     check_kinds(kinds)
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
+    log = with_ego_masks(log, names, PairConfig.width)
     less = Less.drawn(seed)
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
     early = stopped_early(log, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []

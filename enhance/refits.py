@@ -93,7 +93,7 @@ def refits(
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
     """The pictures of a recording that `as_reconstructed` brought to the poses of a `scene`, with that scene's exposures."""
     return [
-        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure), partial(camera.image, i))
+        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure), partial(camera.image, i), camera.ego_mask)
         for name, camera in log.cameras.items()
         for i in range(len(camera))
     ]
@@ -166,7 +166,8 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
                 steps.step()
             lens = camera.lens.scaled(size[0] / camera.width, size[1] / camera.height)
             poses = torch.stack([v.world_from_cam for v in views])
-            cameras[name] = replace(camera, lens=lens, width=size[0], height=size[1], files=files, world_from_cam=poses)
+            own = replace(camera, lens=lens, width=size[0], height=size[1], files=files, world_from_cam=poses)
+            cameras[name] = replace(own, ego_mask=np.zeros((1, 1), bool))
     return replace(log, ego=ego, cameras=cameras)
 
 

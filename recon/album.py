@@ -33,10 +33,21 @@ def keep_album(scene: Scene, frames: Frames, rig: dict[str, RigCamera], folder: 
             mine = [v for v in frames.views if v.camera == c]
             for view, time_us in zip(mine, scene.frame_times(name).tolist(), strict=True):
                 if not view.held_out:
-                    yield name, time_us, at_once(scene, scene.camera(name, time_us), rig[name], view.image.float() / 255)
+                    camera = scene.camera(name, time_us)
+                    yield name, time_us, without_ego(scene, camera, at_once(scene, camera, rig[name], view.image.float() / 255), view.ego)
                     report()
 
     keep_photos(folder, photos())
+
+
+@torch.no_grad()
+def without_ego(scene: Scene, camera: Camera, photo: torch.Tensor, ego: torch.Tensor | None) -> torch.Tensor:
+    """A photo `[H, W, 3]` with what the scene shows where it shows the recording car itself (`ego` bool `[H, W]`)."""
+    if ego is None:
+        return photo
+    rgb = render_frame(scene, camera).rgb
+    assert rgb is not None
+    return torch.where(ego[..., None], rgb.cpu().clamp(0, 1), photo)
 
 
 @torch.no_grad()

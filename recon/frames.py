@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import ndimage
+from torch.nn import functional as F
 
+from recon.egomask import ego_mask
 from recon.gains import picture_gains
-from recon.log import Log
+from recon.log import Log, LogCamera
 from recon.project import project
 from recon.skies import like_sky, sky_mask
 from scenes.camera import Camera
@@ -33,7 +36,8 @@ STRUCK, AROUND = 0.1, 7
 class View:
     """One frame: the camera's place in `Frames.names`, its index in the log, time, uint8 image `[H, W, 3]`; held out or not.
 
-    sky: bool `[h, w]`, a coarse mask of what is surely sky.
+    sky: bool `[h, w]`, a coarse mask of what is surely sky. ego: bool `[H, W]`, where its camera always sees the recording car (one tensor
+    for all its views); None where nowhere.
     """
 
     camera: int
@@ -42,15 +46,17 @@ class View:
     image: torch.Tensor
     held_out: bool
     sky: torch.Tensor
+    ego: torch.Tensor | None = None
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its picture on a device."""
-        return replace(self, image=self.image.to(device), sky=self.sky.to(device))
+        return replace(self, image=self.image.to(device), sky=self.sky.to(device), ego=None if self.ego is None else self.ego.to(device))
 
-    def is_sky(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Whether pixels of the image are surely sky, bool of the shape of `row` and `column`."""
+    def shows_street(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Whether pixels of the image are neither surely sky nor the recording car; bool of the shape of `row` and `column`."""
         step = np.array(self.image.shape[:2]) / self.sky.shape
-        return self.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+        street = ~self.sky.numpy()[(row / step[0]).astype(np.int64), (column / step[1]).astype(np.int64)]
+        return street if self.ego is None else street & ~self.ego.numpy()[row, column]
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,8 @@ class Frames:
     def sky_of(self, view: View) -> np.ndarray:
         """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
         found = sky_mask(view.image.numpy(), self.overcast)
+        if view.ego is not None:
+            found &= ~view.ego.numpy()
         if not self.overcast:
             return found
         rows, columns = (np.arange(n) * of // n for n, of in zip(found.shape, view.sky.shape, strict=True))
@@ -103,10 +111,13 @@ def load_frames(
     for c, name in enumerate(names):
         camera = log.camera(name)
         chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
+        images = {}
         for i in chosen:
-            image = torch.from_numpy(camera.image(i, *size).copy())
-            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, _sky(image)))
+            images[i] = torch.from_numpy(camera.image(i, *size).copy())
             report()
+        ego = _ego(camera, images, size)
+        for i, image in images.items():
+            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, _sky(image, ego), ego))
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
     views, overcast = _under_their_sky(log, names, views)
@@ -126,7 +137,7 @@ def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[lis
     points = [s.read().xyz for s in chosen]
     grey = []
     for view in views:
-        sky = _sky(view.image, overcast=True).numpy()
+        sky = _sky(view.image, view.ego, overcast=True).numpy()
         if chosen:
             nearest = min(range(len(chosen)), key=lambda i: abs(chosen[i].time_us - view.time_us))
             camera = log.camera(names[view.camera]).camera(view.index, sky.shape[1], sky.shape[0])
@@ -171,9 +182,20 @@ def divided(image: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
     return (image.float() / gain).round().clamp(0, 255).to(torch.uint8)
 
 
-def _sky(image: torch.Tensor, overcast: bool = False) -> torch.Tensor:
+def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:
+    """The recording car in a camera's images of `size` (width, height), bool `[H, W]`; None where they show nothing of it. Says so."""
+    small = ego_mask(camera, list(images), lambda i: images[i].numpy())
+    if small is None:
+        return None
+    part = f"{camera.name}: the lowest part of its pictures, {small.mean():.1%}, shows the recording car itself and is left out"
+    print(part, file=sys.stderr)
+    return F.interpolate(torch.from_numpy(small)[None, None].float(), (size[1], size[0]))[0, 0] > 0
+
+
+def _sky(image: torch.Tensor, ego: torch.Tensor | None, overcast: bool = False) -> torch.Tensor:
     """The sky of an image on a grid about 240 cells wide: without its rim, but for what of that looks like it, where splats of its colour
-    would stand before walls as soon as it is seen from elsewhere."""
+    would stand before walls as soon as it is seen from elsewhere. Nothing of it is in the recording car."""
     step = max(1, image.shape[1] // 240)
     coarse = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy())
-    return torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse, overcast), border_value=1), RIM))
+    found = torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse, overcast), border_value=1), RIM))
+    return found if ego is None else found & ~ego[step // 2 :: step, step // 2 :: step]

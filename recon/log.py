@@ -37,6 +37,7 @@ class LogCamera:
 
     shutter "rows" or "columns": they are read one after the other, from top (left) to bottom (right) within `readout_us`, the middle one at
     the frame's time; the other way round where `readout_us` is negative.
+    ego_mask: bool `[h, w]` at any size, where all frames show the recording car itself; None where nobody says.
     """
 
     name: str
@@ -48,6 +49,7 @@ class LogCamera:
     world_from_cam: torch.Tensor
     shutter: str = "global"
     readout_us: int = 0
+    ego_mask: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.files)

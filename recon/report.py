@@ -23,6 +23,7 @@ def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> l
     """A row a camera, all held-out frames and those while driving: PSNR and SSIM of the scene and of the mean training image.
 
     rig: the log's cameras, which say how the photos' rows were read; the scene's take all at once, and are drawn here as those were.
+    What shows the recording car itself does not count.
 
     Rows: camera, frames ("0-72" or "driving"), count, psnr, ssim, mean_psnr, mean_ssim; figures are means over frames.
     """
@@ -31,15 +32,16 @@ def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> l
         training = frames.of(c)
         mean = torch.stack([v.image for v in training]).sum(0, dtype=torch.int32).float() / (255 * len(training))
         began = dict(zip([v.index for v in frames.views if v.camera == c], scene.frame_times(name).tolist(), strict=True))
-        scored = []
+        scored: list[tuple] = []
         for view in frames.of(c, held_out=True):
             recorded = view.image.float() / 255
             with torch.no_grad():
                 camera = scene.camera(name, began[view.index])
                 rgb = render_frame(read_out(scene, camera, rig[name]), camera).rgb
             assert rgb is not None
-            rgb = rgb.cpu()
-            scored.append((view, psnr(rgb, recorded), ssim(rgb, recorded), psnr(mean, recorded), ssim(mean, recorded)))
+            rgb, street = rgb.cpu(), None if view.ego is None else ~view.ego
+            figures = [metric(shown, recorded, street) for shown in (rgb, mean) for metric in (psnr, ssim)]
+            scored.append((view, *figures))
         rows += [_row(name, "all", scored), _row(name, "driving", [s for s in scored if _driving(scene, s[0])])]
     return [r for r in rows if r is not None]
 

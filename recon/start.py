@@ -195,6 +195,8 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
             camera = cameras[view.index]
             placed = [Placed(background, world)]
             hidden = np.isfinite(nearest_box(camera, tracks))
+            if view.ego is not None:
+                hidden |= view.ego.numpy()
             for track, splats in zip(tracks, actors, strict=True):
                 trajectory = track.trajectory()
                 if trajectory.covers(view.time_us):

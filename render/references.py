@@ -76,10 +76,11 @@ KEPT = 12
 @dataclass(frozen=True)
 class Shot:
     """A photo that a scene was made from: the scene's camera there, at the photo's own size, and `read(width, height)`, which gives it at
-    a size as uint8 `[H, W, 3]`."""
+    a size as uint8 `[H, W, 3]`. ego: bool `[h, w]` at any size, where it shows the recording car itself; None where nowhere."""
 
     camera: Camera
     read: Callable[[int, int], np.ndarray]
+    ego: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,9 @@ class References:
             photo = torch.from_numpy(np.array(shot.read(camera.width, camera.height))).to(device).float() / 255
             placed = [replace(p, instance=int(self.ids[p.instance])) for p in self.recorded.placed(camera.time_us)]
             instance = torch.where(_mixed(frame), GONE, self.ids.to(device)[frame.instance.long()])
+            if shot.ego is not None:
+                ego = torch.from_numpy(shot.ego).to(device)[None, None].float()
+                instance = torch.where(F.interpolate(ego, instance.shape)[0, 0] > 0, GONE, instance)
             self.kept[key] = _Seen.of(frame, F.pad(photo - frame.rgb.clamp(0, 1), (0, 1)), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:

@@ -168,6 +168,8 @@ class Fit:
         which, shown = self._in_sight(view, camera, ends, aside, rates)
         known = self.measured.views.get((view.camera, view.index)) if self.config.depth_weight else None
         rgb, alpha, depth = self._render(shown, view, camera, ends, known is not None)
+        if view.ego is not None:
+            rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
@@ -265,6 +267,11 @@ class Fit:
             self._pyramid = {k: v for k, v in self._pyramid.items() if k[0] == shrink}
             self._pyramid[key] = small.contiguous()
         return self._pyramid[key] / 255
+
+    def _ego(self, view: View, camera: Camera) -> torch.Tensor:
+        """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`."""
+        assert view.ego is not None
+        return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
         """Where similarity is taken: all of a small picture, a random part of a large one."""

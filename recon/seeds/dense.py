@@ -89,7 +89,7 @@ def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: l
         camera = log.camera(name).camera(view.index, frames.width, frames.height)
         points = sparse.xyz[sparse.seen[name][view.index]]
         row, column, depth, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
-        inside &= depth < nearest_box(camera, movers)[row, column]
+        inside &= (depth < nearest_box(camera, movers)[row, column]) & view.shows_street(row, column)
         made.append(Cloud(points[inside], view.image.numpy()[row[inside], column[inside]] / 255))
     return made
 
@@ -195,7 +195,7 @@ def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
     """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
     x, y = np.nan_to_num(own.plate.at.numpy()).transpose(2, 0, 1)
     column, row = x.clip(0, camera.width - 1).astype(np.int64), y.clip(0, camera.height - 1).astype(np.int64)
-    clear = ~own.view.is_sky(row, column)
+    clear = own.view.shows_street(row, column)
     if not movers:
         return clear
     depth = camera.lens.depth(own.plate.rays().double() * torch.from_numpy(own.depth)[..., None]).numpy()

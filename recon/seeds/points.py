@@ -66,7 +66,7 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
             if movers:
                 seen &= z <= nearest_box(cam, movers)[row, column]
             # a point whose pixel is sky stands on an edge that the pixel misses
-            seen &= ~view.is_sky(row, column)
+            seen &= view.shows_street(row, column)
             out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
     return out
 

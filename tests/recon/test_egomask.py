@@ -1,0 +1,108 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from recon.egomask import ego_mask, with_ego_masks
+from recon.log import Log, LogCamera
+from recon.readers.colmap import CAM_FROM_BODY
+from render.rays import camera_rays
+from scenes.lenses import Fisheye, Pinhole
+from scenes.trajectory import Trajectory
+
+SIZE = W, H = 320, 180
+EYE, FINE = 1.5, 3
+ACROSS, DOWN = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
+BONNET = DOWN > 150 + ((ACROSS - W / 2) / 40) ** 2
+SHINY = np.random.default_rng(7)
+
+
+def drive(count: int = 30, step: float = 0.8, turn: float = 0.0, lens=None) -> LogCamera:
+    """A camera 1.5 m above a plane, going straight on, or turning left by so many radians a frame."""
+    angles = turn * np.arange(count)
+    at = np.cumsum(step * np.stack([np.cos(angles), np.sin(angles)], 1), 0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, 0, 0] = poses[:, 1, 1] = torch.from_numpy(np.cos(angles))
+    poses[:, 1, 0] = torch.from_numpy(np.sin(angles))
+    poses[:, 0, 1] = -poses[:, 1, 0]
+    poses[:, :2, 3], poses[:, 2, 3] = torch.from_numpy(at), EYE
+    poses = poses @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+    lens = lens or Pinhole(200, 200, W / 2, 80)
+    return LogCamera("front", lens, *SIZE, (Path("none"),) * count, 100_000 * torch.arange(count), poses)
+
+
+def street(camera: LogCamera, i: int, bonnet: np.ndarray | None = BONNET, ahead: bool = False) -> np.ndarray:
+    """Asphalt with two unbroken lines, far hills, and what rides along: a car ahead, and a bonnet in which something else shines each time."""
+    pose = camera.world_from_cam[i].numpy()
+    rays = camera_rays(camera.camera(i, FINE * W, FINE * H)).double().numpy() @ pose[:3, :3].T
+    falls = rays[..., 2] < -0.02
+    far = np.where(falls, -pose[2, 3] / np.where(falls, rays[..., 2], -1), 0)
+    x, y = (pose[k, 3] + far * rays[..., k] for k in (0, 1))
+    grain = np.random.default_rng(3).integers(60, 120, (512, 512))
+    picture = np.where(falls, grain[(x * 8).astype(int) % 512, (y * 8).astype(int) % 512], 200.0)
+    picture[falls & (np.abs(np.abs(y) - 1.8) < 0.1)] = 230
+    across, down = np.meshgrid((np.arange(FINE * W) + 0.5) / FINE, (np.arange(FINE * H) + 0.5) / FINE)
+    picture[~falls & (down > 80 - 15 * np.abs(np.sin(across / 30)))] = 90
+    picture = picture.reshape(H, FINE, W, FINE).mean((1, 3))
+    if ahead:
+        picture[95:125, 140:180] = 40
+    if bonnet is not None:
+        picture[bonnet] = 25 + SHINY.integers(0, 20)
+    return np.repeat(picture.clip(0, 255).astype(np.uint8)[..., None], 3, 2)
+
+
+def found(camera: LogCamera, **what) -> np.ndarray | None:
+    return ego_mask(camera, range(len(camera)), lambda i: street(camera, i, **what))
+
+
+@pytest.mark.parametrize("lens", [None, Fisheye(190, 190, W / 2, 80, 0.02, 0.0, 0.0, 0.0)], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize("turn", [0.0, 0.004], ids=["straight", "turning"])
+def test_a_bonnet_is_found_and_little_else(lens, turn):
+    mask = found(drive(turn=turn, lens=lens))
+    assert mask is not None and mask.shape == (H, W)
+    assert mask[BONNET].mean() > 0.99
+    assert mask[~BONNET].mean() < 0.06
+
+
+def test_a_narrow_bonnet_begins_at_the_lower_edge():
+    narrow = BONNET & (DOWN > 150 + ((ACROSS - W / 2) / 12) ** 2)
+    mask = found(drive(), bonnet=narrow)
+    assert mask is not None and mask[narrow].mean() > 0.9 and mask[:, :40].mean() < 0.06
+
+
+@pytest.mark.parametrize("what", [{}, {"ahead": True}], ids=["empty", "behind a car"])
+@pytest.mark.parametrize("turn", [0.0, 0.004], ids=["straight", "turning"])
+def test_a_street_without_one_shows_none(what, turn):
+    assert found(drive(turn=turn), bonnet=None, **what) is None
+
+
+def test_a_car_that_stands_or_has_few_pictures_tells_nothing():
+    assert found(drive(step=0.0)) is None
+    assert found(drive(count=9)) is None
+
+
+def test_what_the_camera_says_counts():
+    said = np.zeros((9, 16), bool)
+    assert found(replace(drive(), ego_mask=said)) is None
+    said[-1] = True
+    assert found(replace(drive(), ego_mask=said), bonnet=None) is said
+
+
+def test_a_log_is_told_once(monkeypatch):
+    camera, reads = drive(), []
+
+    def image(self, i, width=None, height=None):
+        reads.append(i)
+        return street(self, i)
+
+    monkeypatch.setattr(LogCamera, "image", image)
+    ego = Trajectory(camera.times_us, camera.world_from_cam)
+    log = Log("drive", Path("drive"), {"front": camera, "rear": drive()}, (), (), ego, {}, ("front",))
+    told = with_ego_masks(log, ["front"], W)
+    assert told.camera("front").ego_mask[BONNET].all() and told.camera("rear").ego_mask is None
+    count = len(reads)
+    assert 12 <= count <= 30
+    again = with_ego_masks(told, ["front"], W)
+    assert len(reads) == count and np.array_equal(again.camera("front").ego_mask, told.camera("front").ego_mask)
