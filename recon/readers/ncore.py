@@ -122,7 +122,9 @@ def _camera(loader, name: str, sensor, home: torch.Tensor, file: Path) -> LogCam
     width, height = (int(n) for n in model.resolution)
     poses = home @ _poses(loader, name, middles, file)
     readout = way * round(float(np.median(last - first)))
-    return LogCamera(name, lens_of(model, f"{file}, {name}"), width, height, files, torch.from_numpy(middles), poses, shutter, readout)
+    mask = sensor.get_mask_images().get("ego")
+    ego = None if mask is None else np.asarray(mask.convert("L")) > 0
+    return LogCamera(name, lens_of(model, f"{file}, {name}"), width, height, files, torch.from_numpy(middles), poses, shutter, readout, ego)
 
 
 def _picture(sensor, index: int) -> bytes:

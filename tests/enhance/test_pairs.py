@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from street import car
 
 from enhance.clips import PairConfig
@@ -136,6 +137,27 @@ def test_without_being_told_kinds_are_those_that_can_be_made(street, recording):
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]}, actors=())
     assert kinds_for(street, recording) == KINDS
     assert set(KINDS) - set(kinds_for(alone, recording)) == {"crossref", "shadow", "reinsert"}
+
+
+def test_the_recording_car_is_no_target(street, recording, tmp_path):
+    ego = np.zeros((18, 32), bool)
+    ego[14:] = True
+    cameras = {name: replace(c, ego_mask=ego, files=tuple(_white(f, tmp_path) for f in c.files)) for name, c in recording.cameras.items()}
+    shard = PairSet(make_pairs(street, replace(recording, cameras=cameras), tmp_path / "pairs", ["clean"], config=CONFIG)).shards[0]
+    target = shard.frame("target", 0)[0]
+    with torch.no_grad():
+        wanted = render_frame(street, street.camera(shard.meta["camera"], shard.meta["times_us"][0]).resized(96, 54)).rgb
+    assert (target[43:].float() / 255 - wanted[43:].clamp(0, 1)).abs().max() < 0.01
+    assert (target[:40].float() / 255 - wanted[:40].clamp(0, 1)).abs().mean() < 0.02
+
+
+def _white(file, folder):
+    """The picture with its lower part white."""
+    with Image.open(file) as picture:
+        pixels = np.array(picture)
+    pixels[len(pixels) * 14 // 18 :] = 255
+    Image.fromarray(pixels).save(folder / file.name)
+    return folder / file.name
 
 
 def test_kinds_may_be_added_to_a_folder(street, recording, tmp_path):

@@ -1,13 +1,21 @@
 from dataclasses import replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from recon import FitConfig, open_log, reconstruct
 from recon.egomask import ego_mask, with_ego_masks
-from recon.log import Log, LogCamera
+from recon.frames import load_frames
+from recon.log import Log, LogCamera, Packed
 from recon.readers.colmap import CAM_FROM_BODY
+from render import render_frame
+from render.album import references_of
+from render.compare import psnr
 from render.rays import camera_rays
 from scenes.lenses import Fisheye, Pinhole
 from scenes.trajectory import Trajectory
@@ -34,7 +42,7 @@ def drive(count: int = 30, step: float = 0.8, turn: float = 0.0, lens=None) -> L
 
 
 def street(camera: LogCamera, i: int, bonnet: np.ndarray | None = BONNET, ahead: bool = False) -> np.ndarray:
-    """Asphalt with two unbroken lines, far hills, and what rides along: a car ahead, and a bonnet in which something else shines each time."""
+    """Asphalt with two unbroken lines, far hills, and what rides along: a car ahead, and a bonnet that shines ever differently."""
     pose = camera.world_from_cam[i].numpy()
     rays = camera_rays(camera.camera(i, FINE * W, FINE * H)).double().numpy() @ pose[:3, :3].T
     falls = rays[..., 2] < -0.02
@@ -106,3 +114,50 @@ def test_a_log_is_told_once(monkeypatch):
     assert 12 <= count <= 30
     again = with_ego_masks(told, ["front"], W)
     assert len(reads) == count and np.array_equal(again.camera("front").ego_mask, told.camera("front").ego_mask)
+
+
+SMALL = (96, 54)
+RED = np.arange(54)[:, None] >= 42 + np.zeros((1, 96))
+
+
+def _red(camera: LogCamera, i: int) -> bytes:
+    picture, packed = camera.image(i, *SMALL).copy(), BytesIO()
+    picture[RED] = 200, 0, 0
+    Image.fromarray(picture).save(packed, "png")
+    return packed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def behind_red(drive):
+    """The made-up drive, the lower parts of whose pictures are red, which its camera says."""
+    log = open_log(drive)
+    camera = log.camera("front_camera")
+    files = tuple(Packed(f"picture {i}", partial(_red, camera, i)) for i in range(len(camera)))
+    lens = camera.lens.scaled(SMALL[0] / camera.width, SMALL[1] / camera.height)
+    red = replace(camera, files=files, width=SMALL[0], height=SMALL[1], lens=lens, ego_mask=RED)
+    return replace(log, cameras={**log.cameras, "front_camera": red})
+
+
+def test_the_views_of_a_fit_know_it_and_it_is_no_street(behind_red, capsys):
+    frames = load_frames(behind_red, ["front_camera"], (0, 2**62), SMALL, 4)
+    view = frames.views[1]
+    assert torch.equal(view.ego, torch.from_numpy(RED)) and view.to("cpu").ego is not None
+    row, column = np.array([50, 30, 0]), np.array([10, 10, 48])
+    assert view.shows_street(row, column).tolist() == [False, True, not view.sky[0, 24 * view.sky.shape[1] // 48]]
+    assert not (frames.sky_of(view) & RED).any()
+    assert "22.2%, shows the recording car" in capsys.readouterr().err
+
+
+def test_nothing_of_it_gets_into_the_scene_its_report_and_its_photos(behind_red, street, tmp_path):
+    config = FitConfig(steps=120, budget=11_000, stages=((0.0, 2), (0.5, 1)), grow_every=6)
+    scene = reconstruct(behind_red, tmp_path / "scene", ["front_camera"], size=SMALL, held_out=4, config=config)
+    mask = torch.from_numpy(RED)
+    for t in scene.frame_times("front_camera")[[2, 4]].tolist():
+        with torch.no_grad():
+            shown = render_frame(scene, scene.camera("front_camera", t)).rgb
+            truth = render_frame(street, street.camera("front_camera", t).resized(*SMALL)).rgb
+        assert psnr(shown, truth, mask) > 20  # red is at 6
+    row = scene.meta["held_out"][0]
+    assert row["psnr"] > 25 and row["ssim"] < 0.995
+    photo = references_of(tmp_path / "scene", scene).shots[0].read(*SMALL)
+    assert (photo[RED][:, 0].astype(int) - photo[RED][:, 1]).max() < 120

@@ -1,9 +1,10 @@
+import shutil
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_ncore import NAMES, READOUT_US, Camera, Graph, Lidar, Loader, install, write_ncore
+from made_ncore import EGO, NAMES, READOUT_US, write_ncore
 from made_tape import check, tape
 
 from recon import open_log
@@ -16,10 +17,9 @@ def recorded(street):
     return tape(street)
 
 
-@pytest.fixture
-def sequence(tmp_path, recorded, monkeypatch):
-    install(monkeypatch, recorded)
-    return write_ncore(tmp_path / "sequence")
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory, recorded):
+    return write_ncore(tmp_path_factory.mktemp("ncore") / "sequence", recorded)
 
 
 def test_a_sequence_reads_as_it_was_recorded(sequence, recorded):
@@ -49,31 +49,33 @@ def test_every_lens_is_read_in_its_own_convention():
         lens_of(model("mirror"), "front")
 
 
+def test_the_recording_car_is_masked_where_the_sequence_says(sequence):
+    front, right = (open_log(sequence).cameras[NAMES[side]] for side in ("front", "right"))
+    np.testing.assert_array_equal(front.ego_mask, np.array(EGO))
+    assert right.ego_mask is None
+
+
 def test_without_the_package_the_fix_is_named(sequence, monkeypatch):
     monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
     with pytest.raises(ValueError, match="pip install nvidia-ncore"):
         open_log(sequence)
 
 
-def test_a_sequence_that_does_not_open_is_named(sequence, monkeypatch):
-    def broken(reader):
-        raise AssertionError("PosesComponent group 'default' not found")
-
-    monkeypatch.setattr(sys.modules["ncore.data.v4"], "SequenceLoaderV4", broken)
-    with pytest.raises(ValueError, match="made.json does not open as an NCore sequence .PosesComponent"):
-        open_log(sequence)
+@pytest.mark.parametrize("broken", ["missing", "cut off", "elsewhere"])
+def test_a_sequence_that_does_not_open_is_named(sequence, tmp_path, broken):
+    copy = shutil.copytree(sequence, tmp_path / "copy")
+    store = sorted(copy.glob("*.itar"))[0]
+    if broken == "missing":
+        store.unlink()
+    elif broken == "cut off":
+        store.write_bytes(store.read_bytes()[:1000])
+    else:
+        (copy / "made.json").write_text((copy / "made.json").read_text().replace(".zarr.itar", ".gone.itar"))
+    with pytest.raises(ValueError, match="made.json does not open as an NCore sequence .+fetch its component stores again"):
+        open_log(copy)
 
 
 def test_other_json_files_are_no_sequence(tmp_path):
     (tmp_path / "notes.json").write_text('{"component_stores": 1}')
     with pytest.raises(ValueError, match="not a known layout"):
         open_log(tmp_path)
-
-
-def test_the_stand_in_has_the_packages_own_names():
-    compat = pytest.importorskip("ncore.impl.data.v4.compat", reason="needs nvidia-ncore: pip install nvidia-ncore")
-    loader = compat.SequenceLoaderV4
-    graph = type("", (), {"evaluate_poses": compat.PoseGraphInterpolator.evaluate_poses})
-    for ours, theirs in ((Loader, loader), (Camera, loader.CameraSensor), (Lidar, loader.LidarSensor), (Graph, graph)):
-        missing = {name for name in dir(ours) if not name.startswith("_")} - set(dir(theirs)) - {"tape", "name", "stamps"}
-        assert not missing, (ours, missing)

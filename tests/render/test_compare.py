@@ -24,9 +24,18 @@ def test_a_mask_leaves_the_rest_out():
     assert psnr(a, b, mask) == pytest.approx(20, abs=1e-4)
 
 
-def test_an_empty_mask_is_refused():
+def test_ssim_of_a_mask_is_that_of_its_pixels():
+    a = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
+    b, mask = a.clone(), torch.zeros(40, 40, dtype=torch.bool)
+    b[:, 20:] = 1 - a[:, 20:]
+    mask[:, :20] = True
+    assert ssim(a, b, mask) == pytest.approx(1.0) and ssim(a, b, ~mask) < -0.5 < ssim(a, b) < 0.5
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_an_empty_mask_is_refused(metric):
     with pytest.raises(ValueError, match="no pixel"):
-        psnr(torch.zeros(2, 2, 3), torch.zeros(2, 2, 3), torch.zeros(2, 2, dtype=torch.bool))
+        metric(torch.zeros(12, 12, 3), torch.zeros(12, 12, 3), torch.zeros(12, 12, dtype=torch.bool))
 
 
 def test_images_of_different_sizes_are_refused():

@@ -1,7 +1,9 @@
 """What photos add to rendered views."""
 
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
@@ -66,6 +68,24 @@ def test_a_predicted_frames_photo_and_those_to_come_are_not_looked_at(street, un
     (first,) = References(shots(street), unclear).along(frames[:1], cameras)
     (wanted,) = alone.along(frames[:1])
     assert torch.equal(first.reference, wanted.reference) and torch.equal(first.trust, wanted.trust)
+
+
+def test_of_the_recording_car_in_a_photo_nothing_is_carried_over(street, unclear):
+    ego = np.zeros((9, 16), bool)
+    ego[6:] = True
+
+    def painted(read, width, height):
+        photo = read(width, height).copy()
+        photo[2 * height // 3 :] = 255
+        return photo
+
+    frames = views(unclear, street.frame_times(CAMERA)[3:4])
+    told = [replace(s, read=partial(painted, s.read), ego=ego) for s in shots(street)]
+    (found,) = References(told, unclear).along(frames)
+    (untold,) = References([replace(s, ego=None) for s in told], unclear).along(frames)
+    low = slice(2 * found.rgb.shape[0] // 3 + 2, None)
+    assert not found.trust[low].any() and found.trust[: low.start - 8].any()
+    assert (untold.reference[low] - found.rgb[low]).max() > 0.3
 
 
 def test_without_photos_nothing_is_trusted(street):
