@@ -43,6 +43,11 @@ def scene_time(scene: Scene, camera: str, time_us: int) -> int:
     return nearest if abs(nearest - time_us) <= CLOCKS_DIFFER else time_us
 
 
+def clip_label(camera: str, start: int) -> str:
+    """The name of a camera's clip that starts with a frame."""
+    return f"{camera}_{start:04d}"
+
+
 class Clip:
     """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there. Scenes are rendered on `device`;
     photos, scenes and what comes of them are on the host."""
@@ -77,6 +82,11 @@ class Clip:
     @property
     def name(self) -> str:
         return self.meta["camera"]
+
+    @property
+    def label(self) -> str:
+        """By which a clip is known among those of its recording."""
+        return clip_label(self.name, self.start)
 
     def photo(self, t: int) -> torch.Tensor:
         """Photo `t` as float32 `[H, W, 3]` in 0..1."""

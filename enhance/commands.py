@@ -30,6 +30,9 @@ class Pairs:
     """Cameras to use; the front camera's pairs are never trained on."""
     skies: tuple[Path, ...] = ()
     """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
+    relit: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Folder in which NVIDIA's DiffusionRenderer, run by yourself, is handed photos and gives them back under other skies, for relight;
+    this command says what to run. Without, relight goes by the splats' normals."""
     databank: Path | None = None
     """Assets that shadow puts in, beside those cut out of the scene."""
     photos: tuple[Path, ...] = ()
@@ -52,12 +55,15 @@ class Pairs:
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
         check_kinds(self.kinds or ())
+        if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
+            raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
         for path, data in zip(self.scenes, self.data, strict=True):
             scene, log = open_reconstruction(path), open_log(data)
             kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
-            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device, self.seed)
+            relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / path.name
+            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device, self.seed, relit)
             with Progress(f"pairs {path.name}") as steps:
 
                 def say(done: int, total: int, name: str, steps: Progress = steps) -> None:

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from enhance.clips import Clip
 from enhance.compositing import NoPlace, put_back, put_in
 from enhance.degrade import random_underfit, unfinish
+from enhance.diffusion_renderer import Relit
 from enhance.isp import Isp, alter, random_isp, random_pipeline
 from enhance.lighting import Illumination, random_sky, relit, smoothed, under
 from enhance.refits import Refit
@@ -30,6 +31,7 @@ class Sources:
     shots   the recording's photos, which underfit's views may be compared with
     refits  by kind the reconstructions from less (`enhance.refits`)
     skies   HDR skies, for relight and shadow, beside made-up ones
+    relit   the recording's photos under other skies, by which relight lights objects anew (without, by their splats' normals)
     own     assets cut out of the scene, by track, for reinsert
     assets  those that may be put anywhere, for shadow
     """
@@ -38,6 +40,7 @@ class Sources:
     shots: Sequence[Shot] = ()
     refits: Mapping[str, Sequence[Refit]] = field(default_factory=dict)
     skies: Sequence[Sky] = ()
+    relit: Relit | None = None
     own: Mapping[str, Asset] = field(default_factory=dict)
     assets: Sequence[Asset] = ()
 
@@ -126,8 +129,10 @@ def _processed(clip: Clip, region: torch.Tensor, isp: Isp) -> torch.Tensor:
 
 
 def _relight(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
-    """Instances in the light of another sky, by the normals of their splats."""
+    """Instances in the light of another sky: by the normals of their splats, or as DiffusionRenderer shows them."""
     region, chosen = _some(clip, rng)
+    if sources.relit is not None:
+        return _relit(clip, rng, sources.relit, region, chosen)
     sky, gain = random_sky(rng, sources.skies), float(2 ** rng.uniform(-0.6, 0.6))
     damaged = clip.photos.clone()
     if chosen:
@@ -137,6 +142,18 @@ def _relight(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
             normals = smoothed(frame.normal @ frame.camera.world_from_cam[:3, :3].T.float(), (region[t] > 0).float())
             damaged[t] = to_bytes(relit(clip.photo(t), normals, region[t], before, after, gain))
     return Damage(damaged, clip.photos, region, {"instances": chosen, "gain": gain})
+
+
+def _relit(clip: Clip, rng: np.random.Generator, relit: Relit, region: torch.Tensor, chosen: list[int]) -> Damage:
+    count, height, width = clip.photos.shape[:3]
+    lights = relit.lights(clip.label, count)
+    if not lights:
+        raise ValueError(f"{relit.folder} has no photos of {clip.label} under another sky; run make_pairs, which says what is to be done")
+    light = lights[int(rng.integers(len(lights)))]
+    seen = relit.read(light, clip.label, count, (width, height))
+    photos = clip.photos.float() / 255
+    damaged = torch.lerp(photos, seen.float() / 255, region[..., None])
+    return Damage(to_bytes(damaged), clip.photos, region, {"instances": chosen, "light": light})
 
 
 def _shadow(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:

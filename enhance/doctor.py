@@ -96,6 +96,7 @@ NEEDS = (
     _package("zstandard", "convert to and from .spz"),
     Need("weights", "render --enhance, enhance, demo", "git checkout enhance/weights, or install again", WEIGHTS),
     _package("pyarrow", "recon of Argoverse 2 and Waymo", extra="arrow"),
+    _package("nvidia-ncore", "recon of NVIDIA NCore", module="ncore", extra="ncore"),
     _package("pycolmap", "recon of COLMAP folders, photos, videos, and drives without lidar", extra="colmap"),
     _package("diffusers", "enhance and render with --weights of Difix", extra="public"),
 )
@@ -104,7 +105,7 @@ UNVERIFIED = (
     "unverified: the public models as --weights (NVIDIA Harmonizer and Fixer, Cosmos-Predict2, Difix, Ke et al.'s Harmonizer). Their files "
     "were not at hand: layouts and graphs are tested on small random ones, against diffusers' own classes where there are any; no released "
     "weight was ever read, no picture of theirs compared. Of harmonizer_nontemporal.pt it is not published what it takes: "
-    "[1, 3, 576, 1024] in -1..1 is a guess"
+    "[1, 3, 576, 1024] in -1..1 is a guess. DiffusionRenderer (pairs --relit) was never run: its files' layout is that of its source"
 )
 """What works only as far as it could be tried, said to whoever asks what works."""
 

@@ -10,15 +10,16 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from enhance.clips import Clip, PairConfig
+from enhance.clips import Clip, PairConfig, clip_label
 from enhance.damage import Damage, Sources, make
+from enhance.diffusion_renderer import Relit
 from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, refits, shots_of
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.assets.extract import FEWEST_SPLATS, candidates
 from recon.early import SHORT as EARLY
 from recon.egomask import with_ego_masks
-from recon.log import Log
+from recon.log import Log, LogCamera
 from render.references import References
 from scenes.atomic import atomic_file
 from scenes.databank import Databank
@@ -71,8 +72,10 @@ def make_pairs(
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
     log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
+    if "relight" in kinds and sources.relit is not None:
+        _ask(sources.relit, starts, config)
     for done, (camera, start) in enumerate(starts):
-        name = f"{camera.name}_{start:04d}"
+        name = clip_label(camera.name, start)
         missing = [kind for kind in kinds if not (out / kind / f"{name}.json").exists()]
         clip = Clip(scene, camera, start, config, seed, rights, device) if missing else None
         for kind in missing:
@@ -85,6 +88,17 @@ def make_pairs(
     return out
 
 
+def _ask(relit: Relit, starts: list[tuple[LogCamera, int]], config: PairConfig) -> None:
+    """Put there the photos of clips that were not lit anew yet; ValueError that says what to run, where there are any."""
+    clips = [(camera, start, range(start, min(start + config.frames, len(camera)))) for camera, start in starts]
+    lacking = [clip for clip in clips if not relit.lights(clip_label(clip[0].name, clip[1]), len(clip[2]))]
+    for camera, start, indices in lacking:
+        relit.ask(camera, clip_label(camera.name, start), indices)
+    if lacking:
+        told = f"{relit.folder} lacks {len(lacking)} of {len(clips)} clips under other skies; their photos are in its photos/ now"
+        raise ValueError(f"{told}. In a checkout of cosmos1-diffusion-renderer run\n{relit.commands()}\nthen this again")
+
+
 def prepare_sources(
     scene: Scene,
     log: Log,
@@ -94,10 +108,11 @@ def prepare_sources(
     databank: str | Path | None = None,
     device: str = "cpu",
     seed: int = 0,
+    relit: str | Path | None = None,
 ) -> Sources:
     """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once; each seed leaves out other
-    things), assets cut out of the scene and those of a databank, and .hdr skies. Raises ValueError for an unknown kind, and where the rig
-    has too few cameras for one."""
+    things), assets cut out of the scene and those of a databank, and .hdr skies; `relit` is the folder in which DiffusionRenderer is met.
+    Raises ValueError for an unknown kind, and where the rig has too few cameras for one."""
     check_kinds(kinds)
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
@@ -113,7 +128,8 @@ def prepare_sources(
     bank = Databank(databank) if databank is not None else None
     stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
     anywhere = [c.asset for c in found if not c.flaw] + stored
-    return Sources(unfinished, shots, made, [_sky(path) for path in skies], own, anywhere)
+    lit = None if relit is None else Relit(Path(relit))
+    return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere)
 
 
 def kinds_for(scene: Scene, log: Log) -> tuple[str, ...]:

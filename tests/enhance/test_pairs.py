@@ -17,26 +17,11 @@ from enhance.pairs import kinds_for, make_pairs, prepare_sources
 from enhance.photo_pairs import make_photo_pairs
 from enhance.refits import REFITS, Refit, shots_of
 from enhance.shards import KINDS, PairSet
-from recon.log import Log, LogCamera
 from render import render_frame
 from render.references import References
 from render.video import write_image
 
 CONFIG = PairConfig(width=96, frames=3, every=4)
-
-
-@pytest.fixture(scope="module")
-def recording(street, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("recording")
-    cameras = {}
-    for name, rig in street.rig.items():
-        views = [street.camera(name, int(t)) for t in rig.times_us]
-        files = tuple(folder / f"{name}_{i}.png" for i in range(len(views)))
-        for file, view in zip(files, views, strict=True):
-            write_image(file, render_frame(street, view).rgb)
-        poses = torch.stack([v.world_from_cam for v in views])
-        cameras[name] = LogCamera(name, rig.lens, rig.width, rig.height, files, rig.times_us, poses)
-    return Log("street", folder, cameras, (), (), street.ego, {})
 
 
 @pytest.fixture(scope="module")
