@@ -18,6 +18,16 @@ SWEPT_MARGIN = 0.4
 """Metres around a moving box within which points are kept out of the static background."""
 
 
+FEW = 5
+"""Points by whose times a box is dated, at least."""
+
+REACH = 1.5
+"""Metres that an object may be from where it is at a sweep's stamp when its points are taken."""
+
+APART_US = 750_000
+"""Between a track's boxes at most, for it to be known between them: nuScenes annotates every half second."""
+
+
 @dataclass(frozen=True)
 class Split:
     """Points sorted by what they belong to.
@@ -43,48 +53,80 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
 
     A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the
     points of that moment. So each box's time becomes the median time of the points inside it, where there are enough.
+    In sweeps between those that boxes were drawn in, an object is where it must have been when its points were taken.
     """
-    static, static_sweep = [], []
+    rest = []
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
     for sweep in sweeps:
         points = sweep.read()
-        keep = np.ones(len(points.xyz), dtype=bool)
-        x, y = np.ascontiguousarray(points.xyz[:, :2].T)
+        keep = _beside_body(log, sweep, points.xyz)
+        near = _Near(points.xyz)
         for track in tracks:
             at = stamps[track.name].get(sweep.time_us)
             if at is None:
                 continue
-            pose = track.world_from_box[at]
-            reach = track.size.max() + 1
-            near = np.flatnonzero((np.abs(x - float(pose[0, 3])) < reach) & (np.abs(y - float(pose[1, 3])) < reach))
-            if not len(near):
-                continue
-            back = inverse(pose).numpy()
-            local = points.xyz[near] @ back[:3, :3].T + back[:3, 3]
-            keep[near[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
-            # the floor is left out: those are points of the road
-            own = inside(local, track.size, MARGIN, below=-0.08)
+            which, local = near.box(track, track.world_from_box[at])
+            keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
+            own = _own(local, track)
             if own.any():
                 found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
-            sensor = points.sensor[near] == track.sensor[at]
-            timed = own & sensor if (own & sensor).sum() >= 5 else own
-            if timed.sum() >= 5:
-                scanned[track.name][at] = np.median(points.times_us[near][timed])
+            sensor = points.sensor[which] == track.sensor[at]
+            timed = own & sensor if (own & sensor).sum() >= FEW else own
+            if timed.sum() >= FEW:
+                scanned[track.name][at] = np.median(points.times_us[which][timed])
                 offsets.append(scanned[track.name][at] - sweep.time_us)
-        keep &= _beside_body(log, sweep, points.xyz)
-        static.append(points.xyz[keep])
-        static_sweep.append(np.full(keep.sum(), sweep.index))
+        rest.append((points.xyz[keep], points.times_us[keep]))
     usual = float(np.median(offsets)) if offsets else 0.0
     corrected = tuple(_retimed(t, scanned[t.name], usual) for t in tracks)
+    static = []
+    for sweep, (xyz, times) in zip(sweeps, rest, strict=True):
+        between = [t for t in corrected if sweep.time_us not in stamps[t.name] and _between(t, sweep.time_us)]
+        keep, near = np.ones(len(xyz), dtype=bool), _Near(xyz)
+        for track in between:
+            path = track.trajectory()
+            which, local = near.box(track, path.at(sweep.time_us), REACH)
+            around = inside(local, track.size, REACH, below=-0.08)
+            if around.sum() >= FEW:  # it moved in the time from its points to the stamp
+                which, local = near.box(track, path.near(int(np.median(times[which][around]))))
+            keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
+            own = _own(local, track)
+            if own.any():
+                found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+        static.append(xyz[keep])
     return Split(
         np.concatenate(static) if static else np.zeros((0, 3)),
-        np.concatenate(static_sweep) if static_sweep else np.zeros(0, np.int64),
+        np.repeat([s.index for s in sweeps], [len(xyz) for xyz in static]) if static else np.zeros(0, np.int64),
         {name: (np.concatenate([p for p, _ in got]), np.concatenate([s for _, s in got])) for name, got in found.items() if got},
         corrected,
     )
+
+
+class _Near:
+    """Points `[N, 3]`, asked for those near a box: x and y on their own, which are looked through for every box."""
+
+    def __init__(self, xyz: np.ndarray):
+        self.xyz, (self.x, self.y) = xyz, np.ascontiguousarray(xyz[:, :2].T)
+
+    def box(self, track: Track, pose: torch.Tensor, more: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the points that may be in a track's box at `pose`, or so many metres around it, and where they are in its frame."""
+        reach = track.size.max() + 1 + more
+        which = np.flatnonzero((np.abs(self.x - float(pose[0, 3])) < reach) & (np.abs(self.y - float(pose[1, 3])) < reach))
+        back = inverse(pose).numpy()
+        return which, self.xyz[which] @ back[:3, :3].T + back[:3, 3]
+
+
+def _own(local: np.ndarray, track: Track) -> np.ndarray:
+    # the floor is left out: those are points of the road
+    return inside(local, track.size, MARGIN, below=-0.08)
+
+
+def _between(track: Track, time_us: int) -> bool:
+    """Whether a track's boxes shortly before and after a moment tell where it is then."""
+    later = int(np.searchsorted(track.times_us, time_us))
+    return 0 < later < len(track.times_us) and track.times_us[later] - track.times_us[later - 1] <= APART_US
 
 
 def _beside_body(log: Log, sweep: Sweep, xyz: np.ndarray) -> np.ndarray:

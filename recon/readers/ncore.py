@@ -165,20 +165,20 @@ def _points(loader, lidar, index: int, number: int, home: torch.Tensor, file: Pa
 
 
 def _tracks(loader, home: torch.Tensor, ego: Trajectory, file: Path) -> tuple[Track, ...]:
-    """Tracks of the cuboids, at the times of the lidar frames that they were drawn in; `split_points` finds the moments within those."""
+    """Tracks of the cuboids, at the moments that they are of, which may lie within the frames that they were drawn in or between them."""
     from scipy.spatial.transform import Rotation
 
     seen: dict[str, dict[int, object]] = {}
     for o in loader.get_cuboid_track_observations():
-        seen.setdefault(o.track_id, {}).setdefault(o.reference_frame_timestamp_us, o)
+        seen.setdefault(o.track_id, {}).setdefault(o.timestamp_us, o)
     found = []
     for track, by_time in seen.items():
         observations: list = [by_time[t] for t in sorted(by_time)]
         times = np.array(sorted(by_time), dtype=np.int64)
-        drawn_in = np.array([o.reference_frame_id for o in observations])
+        drawn_in, drawn_at = (np.array([getattr(o, f"reference_frame_{of}") for o in observations]) for of in ("id", "timestamp_us"))
         frames = torch.zeros(len(times), 4, 4, dtype=torch.float64)
         for name in np.unique(drawn_in):
-            frames[torch.from_numpy(drawn_in == name)] = _poses(loader, str(name), times[drawn_in == name], file)
+            frames[torch.from_numpy(drawn_in == name)] = _poses(loader, str(name), drawn_at[drawn_in == name], file)
         local = np.tile(np.eye(4), (len(times), 1, 1))
         local[:, :3, :3] = Rotation.from_euler("xyz", [o.bbox3.rot for o in observations]).as_matrix()
         local[:, :3, 3] = [o.bbox3.centroid for o in observations]

@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import inside, split_points
+from recon.actors import _between, inside, split_points
+from recon.log import Track
 
 
 @pytest.fixture(scope="module")
@@ -40,3 +44,45 @@ def test_no_sweeps_leave_no_points(split):
     log, _ = split
     empty = split_points(log, [], list(log.tracks))
     assert empty.static.shape == (0, 3) and empty.actors == {}
+
+
+def every_other(track: Track) -> Track:
+    """Its boxes of every second sweep, as where only some sweeps are annotated."""
+    kept = slice(None, None, 2)
+    poses = track.world_from_box[kept]
+    return replace(track, times_us=track.times_us[kept], world_from_box=poses, sensor=track.sensor[kept])
+
+
+def test_between_annotated_sweeps_a_mover_is_where_it_must_have_been(split):
+    log, whole = split
+    mover = next(t for t in log.tracks if t.moving)
+    thinned = split_points(log, list(log.sweeps), [every_other(mover)])
+    first, last = mover.times_us[[2, 6]]  # the made-up lidar finds the mover in the first sweep where it is not yet
+    for k in (s.index for s in log.sweeps if first <= s.time_us <= last):
+        same, wanted = (s.actors[mover.name][0][s.actors[mover.name][1] == k] for s in (thinned, whole))
+        assert len(same) == len(wanted) and np.abs(same.max(0) - wanted.max(0)).max() < 0.05
+        assert (thinned.static_sweep == k).sum() == (whole.static_sweep == k).sum()
+
+
+def test_boxes_of_moments_between_sweeps_find_their_points(split, street):
+    log, whole = split
+    mover, path = next(t for t in log.tracks if t.moving), street.actors[0].trajectory
+    times = np.arange(int(mover.times_us[0]), int(mover.times_us[-1]), 30_000) + 7
+    home = mover.world_from_box[2] @ torch.linalg.inv(path.near(int(mover.times_us[2]) + SCANNED_US))
+    poses = home @ torch.stack([path.near(int(t)) for t in times])
+    dated = replace(mover, times_us=times, world_from_box=poses, sensor=np.full(len(times), -1))
+    found = split_points(log, list(log.sweeps), [dated])
+    assert np.array_equal(found.tracks[0].times_us, times)
+    for k in (s.index for s in log.sweeps if times[0] < s.time_us < times[-1]):
+        same, wanted = (s.actors[mover.name][0][s.actors[mover.name][1] == k] for s in (found, whole))
+        assert len(same) == len(wanted) and np.abs(same.max(0) - wanted.max(0)).max() < 0.08
+
+
+def test_boxes_far_apart_in_time_tell_nothing_between_them(split):
+    log, _ = split
+    mover = next(t for t in log.tracks if t.moving)
+    ends = [0, len(mover.times_us) - 1]
+    rare = replace(mover, times_us=mover.times_us[ends] * [1, 2], world_from_box=mover.world_from_box[ends], sensor=mover.sensor[ends])
+    moment = int(mover.times_us[1]) + 50_000
+    assert _between(mover, moment) and not _between(rare, moment)
+    assert not _between(mover, int(mover.times_us[0]) - 1) and not _between(mover, int(mover.times_us[-1]) + 1)
