@@ -26,21 +26,24 @@ WIDTH = 320
 LOOKS, FEWEST = 48, 12
 """Pictures that are looked at, evenly along the way, and how many it takes."""
 
-FAINT, ALONG = 3.0, 0.15
+FAINT, ALONG = 2.0, 0.25
 """Levels a pixel of such a picture: fainter edges count less, as dust and reflections in a windscreen are; and of an edge the part across
 the motion under which it counts less, as a lane line's, along which the car does not quite go."""
 
-STAYS = 0.3
+SOFT = 9
+"""Pixels of such a picture over which a change of brightness is no edge: the road in the car's own headlights is brighter near by."""
+
+STAYS = 0.25
 """Mean of edges, from -1 to 1, from which on one stays: among as many pictures of a street one in a thousand reaches 0.15."""
 
 DOWN = 0.05
 """Sine of the angle below the horizon from which on what is seen is near enough to move."""
 
-BROKEN, LOST, HIGHER = 0.5, 0.2, 0.1
+BROKEN, LOST, HIGHER = 0.5, 0.17, 0.1
 """What an outline must show of edges that stay where it goes at all; how much less in the mean; and how much more a line counts at the
 picture's top than at its foot."""
 
-STEEP, BEND, SMOOTH = 2, 0.3, 0.05
+STEEP, BEND, SMOOTH = 2, 0.5, 0.05
 """Rows that it may rise or fall from column to column, what each costs, and over which part of the width it is smoothed at the end."""
 
 WIDE, MOST, RIM = 0.15, 0.4, 0.02
@@ -75,6 +78,7 @@ def ego_mask(camera: LogCamera, indices: Sequence[int], picture: Callable[[int],
         view = camera.camera(at, small.shape[1], small.shape[0])
         way, below = _ways(view, camera.world_from_cam[after, :3, 3] - camera.world_from_cam[before, :3, 3])
         slope = np.stack([ndimage.sobel(small, 1), ndimage.sobel(small, 0)], -1) / 8
+        slope -= ndimage.uniform_filter(slope, (SOFT, SOFT, 0))
         across = (slope * way).sum(-1)
         total = total + np.where(below, across / (np.abs(across) + ALONG * np.linalg.norm(slope, axis=-1) + FAINT), 0)
         seen = seen + below
