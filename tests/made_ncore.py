@@ -43,9 +43,9 @@ class Sensor:
     mask: Image.Image | None = None
 
 
-def write_sequence(folder: Path, name: str, times_us, poses, cameras: dict, lidars: dict, cuboids: list) -> Path:
+def write_sequence(folder: Path, name: str, times_us, poses, cameras: dict, lidars: dict, cuboids: list | None) -> Path:
     """A sequence in `folder`: `world_from_rig` `[F, 4, 4]` at `times_us`, cameras (what they took: JPEG bytes), lidars (ray directions,
-    moments and distances; raw, NaN where nothing came back), and what stands where."""
+    moments and distances; raw, NaN where nothing came back), and what stands where; without masks and cuboids where those are None."""
     folder.mkdir(parents=True)
     times = np.asarray(times_us, np.uint64)
     span = HalfClosedInterval.from_start_end(int(times[0]), int(times[-1]))
@@ -54,13 +54,15 @@ def write_sequence(folder: Path, name: str, times_us, poses, cameras: dict, lida
     def of(component, instance="default"):
         return writer.register_component_writer(component.Writer, instance, None if instance == "default" else instance)
 
-    graph, intrinsics, masks = of(PosesComponent), of(IntrinsicsComponent), of(MasksComponent)
+    graph, intrinsics = of(PosesComponent), of(IntrinsicsComponent)
+    masks = None if cuboids is None else of(MasksComponent)
     graph.store_dynamic_pose("rig", "world", np.asarray(poses, np.float64), times)
     for sensor, s in (cameras | lidars).items():
         graph.store_static_pose(sensor, "rig", np.asarray(s.mount, np.float64))
     for camera, s in cameras.items():
         intrinsics.store_camera_intrinsics(camera, s.model)
-        masks.store_camera_masks(camera, {"ego": s.mask} if s.mask else {})
+        if masks is not None:
+            masks.store_camera_masks(camera, {"ego": s.mask} if s.mask else {})
         frames = of(CameraSensorComponent, camera)
         for first, last, jpeg in s.frames:
             frames.store_frame(jpeg, "jpeg", np.array([first, last], np.uint64), {}, {})
@@ -70,7 +72,8 @@ def write_sequence(folder: Path, name: str, times_us, poses, cameras: dict, lida
             bright = np.where(np.isfinite(distances), 0.5, np.nan)[None].astype(np.float32)
             rays = directions.astype(np.float32), moments.astype(np.uint64), None, distances[None].astype(np.float32), bright
             frames.store_frame(*rays, np.array([first, last], np.uint64), {}, {})
-    of(CuboidsComponent).store_observations(cuboids)
+    if cuboids is not None:
+        of(CuboidsComponent).store_observations(cuboids)
     meta = SequenceComponentGroupsReader(writer.finalize()).get_sequence_meta().to_dict()
     (folder / f"{name}.json").write_text(json.dumps(meta))
     return folder
@@ -91,8 +94,8 @@ def pinhole(lens, size: tuple[int, int], shutter: ShutterType) -> OpenCVPinholeC
     return OpenCVPinholeCameraModelParameters(resolution=np.array(size, np.uint64), shutter_type=shutter, **numbers)
 
 
-def write_ncore(folder: Path, tape: Tape) -> Path:
-    """The tape; the lidar turns once before each stamp, and the third turn is lost."""
+def write_ncore(folder: Path, tape: Tape, annotated: bool = True) -> Path:
+    """The tape, with what is known of its pictures or without; the lidar turns once before each stamp, and the third turn is lost."""
 
     def pictures(name: str):
         for t in STAMPS.tolist():
@@ -118,4 +121,4 @@ def write_ncore(folder: Path, tape: Tape) -> Path:
         for k, pose in tape.cameras.items()
     }
     lidars = {LIDAR: Sensor(BODY_FROM_LIDAR, turns())}
-    return write_sequence(folder, "made", tape.ego.times_us, MAP @ tape.ego.world_from_body, cameras, lidars, seen)
+    return write_sequence(folder, "made", tape.ego.times_us, MAP @ tape.ego.world_from_body, cameras, lidars, seen if annotated else None)

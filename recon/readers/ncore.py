@@ -93,11 +93,15 @@ def _rank(name: str) -> tuple[int, str]:
 
 def _loader(file: Path):
     try:
-        from ncore.data.v4 import SequenceComponentGroupsReader, SequenceLoaderV4
+        from ncore.data.v4 import CuboidsComponent, MasksComponent, SequenceComponentGroupsReader, SequenceLoaderV4
     except ModuleNotFoundError:
         raise ValueError(f"{file}: {FIX}") from None
     try:
-        return SequenceLoaderV4(SequenceComponentGroupsReader([file]))
+        stores = SequenceComponentGroupsReader([file])
+        # the loader insists on masks and cuboids, which a sequence need not have, unless it is told that there are none
+        parts = {"masks": MasksComponent.Reader, "cuboids": CuboidsComponent.Reader}
+        have = {f"{k}_component_group_name": "default" if stores.open_component_readers(part) else None for k, part in parts.items()}
+        return SequenceLoaderV4(stores, **have)
     except (AssertionError, OSError, KeyError, ValueError) as problem:
         why = str(problem).splitlines()[0][:160] if str(problem) else type(problem).__name__
         raise ValueError(f"{file} does not open as an NCore sequence ({why}); fetch its component stores again") from None

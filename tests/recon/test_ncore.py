@@ -55,6 +55,12 @@ def test_the_recording_car_is_masked_where_the_sequence_says(sequence):
     assert right.ego_mask is None
 
 
+def test_a_sequence_need_not_have_masks_and_cuboids(tmp_path, recorded):
+    log = open_log(write_ncore(tmp_path / "bare", recorded, annotated=False))
+    assert not log.tracks and log.cameras[NAMES["front"]].ego_mask is None
+    check(log, recorded, NAMES)
+
+
 def test_without_the_package_the_fix_is_named(sequence, monkeypatch):
     monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
     with pytest.raises(ValueError, match="pip install nvidia-ncore"):
