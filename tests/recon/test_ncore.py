@@ -4,12 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_ncore import EGO, NAMES, READOUT_US, write_ncore
 from made_tape import check, tape
 
 from recon import open_log
 from recon.readers.ncore import lens_of
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
+
+pytest.importorskip("ncore", reason="needs nvidia-ncore, which Python 3.14 cannot install: pip install 'sidestep[ncore]'")
+from made_ncore import EGO, NAMES, READOUT_US, write_ncore  # noqa: E402
 
 
 @pytest.fixture(scope="module")
