@@ -99,9 +99,9 @@ def _loader(file: Path):
     try:
         stores = SequenceComponentGroupsReader([file])
         # the loader insists on masks and cuboids, which a sequence need not have, unless it is told that there are none
-        parts = {"masks": MasksComponent.Reader, "cuboids": CuboidsComponent.Reader}
-        have = {f"{k}_component_group_name": "default" if stores.open_component_readers(part) else None for k, part in parts.items()}
-        return SequenceLoaderV4(stores, **have)
+        masks, cuboids = (bool(stores.open_component_readers(part.Reader)) for part in (MasksComponent, CuboidsComponent))
+        named = {True: "default", False: None}
+        return SequenceLoaderV4(stores, masks_component_group_name=named[masks], cuboids_component_group_name=named[cuboids])
     except (AssertionError, OSError, KeyError, ValueError) as problem:
         why = str(problem).splitlines()[0][:160] if str(problem) else type(problem).__name__
         raise ValueError(f"{file} does not open as an NCore sequence ({why}); fetch its component stores again") from None
