@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.nn import functional as F
 
 from enhance.shards import to_bytes
+from recon.egomask import at_size
 from recon.log import LogCamera
 from render import render_frame
 from render.frame_types import Frame
@@ -63,7 +63,7 @@ class Clip:
         self.cameras = [scene.camera(camera.name, t).resized(config.width, height) for t in times]
         self.photos = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in self.indices])
         if camera.ego_mask is not None and camera.ego_mask.any():
-            self._leave_out(torch.from_numpy(camera.ego_mask))
+            self._leave_out(at_size(camera.ego_mask, height, config.width))
         # Seeded by name: a clip is the same whichever others are made beside it.
         digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()
         self.seed = int.from_bytes(digest[:6], "little")
@@ -73,8 +73,7 @@ class Clip:
         self._geometry: dict[str, torch.Tensor] | None = None
 
     def _leave_out(self, ego: torch.Tensor) -> None:
-        """What the scene shows where the photos show the recording car itself, bool `[h, w]`."""
-        ego = F.interpolate(ego[None, None].float(), self.photos.shape[1:3])[0, 0] > 0
+        """What the scene shows where the photos show the recording car itself, bool `[H, W]`."""
         for photo, frame in zip(self.photos, self.render(self.scene, "rgb"), strict=True):
             assert frame.rgb is not None
             photo[ego] = to_bytes(frame.rgb[ego])

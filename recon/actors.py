@@ -84,6 +84,9 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     static = []
     for sweep, (xyz, times) in zip(sweeps, rest, strict=True):
         between = [t for t in corrected if sweep.time_us not in stamps[t.name] and _between(t, sweep.time_us)]
+        if not between:
+            static.append(xyz)
+            continue
         keep, near = np.ones(len(xyz), dtype=bool), _Near(xyz)
         for track in between:
             path = track.trajectory()

@@ -85,6 +85,11 @@ def ego_mask(camera: LogCamera, indices: Sequence[int], picture: Callable[[int],
     return _outlined(np.where(seen >= FEWEST, np.abs(total) / np.maximum(seen, 1), 0))
 
 
+def at_size(mask: np.ndarray, height: int, width: int) -> torch.Tensor:
+    """A mask `[h, w]` for pictures of a size, bool `[height, width]`."""
+    return F.interpolate(torch.from_numpy(mask)[None, None].float(), (height, width))[0, 0] > 0
+
+
 def _along_the_way(camera: LogCamera, indices: list[int]) -> list[tuple[int, int, int]]:
     """Places of pictures evenly along the way, each between the ones before and after it."""
     way = camera.world_from_cam[indices, :3, 3].diff(dim=0).norm(dim=1).cumsum(0).numpy() if len(indices) > 2 else np.zeros(1)

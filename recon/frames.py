@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy import ndimage
-from torch.nn import functional as F
 
-from recon.egomask import ego_mask
+from recon.egomask import at_size, ego_mask
 from recon.gains import picture_gains
 from recon.log import Log, LogCamera
 from recon.project import project
@@ -189,7 +188,7 @@ def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, in
         return None
     part = f"{camera.name}: the lowest part of its pictures, {small.mean():.1%}, shows the recording car itself and is left out"
     print(part, file=sys.stderr)
-    return F.interpolate(torch.from_numpy(small)[None, None].float(), (size[1], size[0]))[0, 0] > 0
+    return at_size(small, size[1], size[0])
 
 
 def _sky(image: torch.Tensor, ego: torch.Tensor | None, overcast: bool = False) -> torch.Tensor:
