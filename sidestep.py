@@ -80,6 +80,7 @@ class Insert:
             raise UsageError("say where the asset goes with --at X,Y, as --at 20m,-3.5m, or with --trajectory t.csv; one of the two")
         from scenes import Databank
         from scenes.insert import insert
+        from scenes.seen import seeing, unseen_warning
         from scenes.usd_edit import add_edit
 
         scene, _ = open_scene(self.scene)
@@ -87,7 +88,8 @@ class Insert:
         result = insert(scene, Databank(self.databank).load(self.asset), placement, int(scene.ego.times_us[0]) + self.start)
         about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}
         add_edit(self.scene, result.actor.track, [result.actor], about)
-        warn(result.warnings)
+        recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
+        warn([*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))])
         layer, fix = self.scene / "edits" / f"{result.actor.track}.usda", f"sidestep edit {self.scene} --undo {result.actor.track}"
         print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit: delete it, or {fix}, to undo it")
 
@@ -135,10 +137,11 @@ class Render:
     def run(self) -> None:
         for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
-        from render.clip import clip_cameras, clip_times, in_view
+        from render.clip import clip_cameras, clip_times
         from render.record import record
         from scenes import Databank
         from scenes.insert import insert
+        from scenes.seen import seeing, unseen_warning
 
         check_device(self.device)
         scene, warnings = open_view(self.scene, self.drop_invalid)
@@ -148,8 +151,10 @@ class Render:
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
-            if not in_view(result.actor, cameras):
+            witnesses = seeing(result.actor, cameras)
+            if not witnesses:
                 warnings.append(f"{placement.asset} is never in view of {camera}: X is metres forward, Y metres to the left")
+            warnings += unseen_warning(result.actor, witnesses)
         warn(warnings)
         width, height = self.size or (None, None)
         stages: Stages = {}

@@ -19,6 +19,7 @@ from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
 from recon.fit.strides import stride_of
 from recon.frames import Frames, load_frames
+from recon.live import Live
 from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
@@ -105,19 +106,28 @@ def reconstruct(
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
+    live = Live(fit, saved[1].get("live", ()) if saved else ())
+
+    def seconds() -> float:
+        return spent_before + time.monotonic() - began
 
     def keep() -> None:
-        save_checkpoint(checkpoint, options, start, fit.tensors() | {"seconds": spent_before + time.monotonic() - began})
+        save_checkpoint(checkpoint, options, start, fit.tensors() | {"seconds": seconds(), "live": live.curve})
 
     with Progress("fit", total=config.steps) as steps:
         steps.step(fit.step_count)
-        run(fit, keep, lambda f: steps.step(note=f"loss {f.recent_loss:.4f}  {len(f.splats)} splats"))
+
+        def report(fit: Fit) -> None:
+            live.look(fit, seconds())
+            steps.step(note="  ".join(filter(None, (str(live), f"loss {fit.recent_loss:.4f}", f"{len(fit.splats)} splats"))))
+
+        run(fit, keep, report)
     keep()  # the report and the writing below may be interrupted too
     scene = assemble(fit, start, log, {"options": options})
     there = scene.to(device)
     rows = held_out_table(there, fit.frames, start.rig)
     scene.meta["held_out"] = rows
-    scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(spent_before + time.monotonic() - began, 1)}
+    scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(seconds(), 1), "live": live.curve}
     print(table_text(rows), file=sys.stderr)
     within = [s for s in unseen if span[0] <= s.time_us <= span[1]]
     if within:

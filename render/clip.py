@@ -10,10 +10,8 @@ from render.frame import DEFAULT, render_frame
 from render.frame_types import Frame, RenderConfig
 from render.outputs import check_outputs
 from render.room import Room, one_ahead
-from scenes.asset import Actor
 from scenes.camera import Camera
 from scenes.metres import require_metres
-from scenes.poses import inverse
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory
 
@@ -82,22 +80,6 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
         asked = f"--start {start_us / 1e6:g}s" + ("" if duration_us is None else f" --duration {duration_us / 1e6:g}s")
         raise ValueError(f"{asked} leaves no frame: {has}; start before that and last at least 100ms")
     return times
-
-
-def in_view(actor: Actor, cameras: Sequence[Camera]) -> bool:
-    """Whether a corner or the middle of the actor's box falls into the image of any camera, hidden or not."""
-    length, width, height = (float(v) for v in actor.asset.size)
-    corners = [[a * length / 2, b * width / 2, c * height] for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (0, 0.5, 1)]
-    box = torch.tensor(corners, dtype=torch.float64)
-    for camera in cameras:
-        if actor.trajectory.covers(camera.time_us):
-            cam_from_asset = inverse(camera.world_from_cam) @ actor.trajectory.at(camera.time_us)
-            points = box @ cam_from_asset[:3, :3].T + cam_from_asset[:3, 3]
-            pixels = camera.lens.project(points[points[:, 2] > 0.1])
-            size = torch.tensor([camera.width, camera.height])
-            if ((pixels >= 0) & (pixels <= size)).all(1).any():
-                return True
-    return False
 
 
 def frame_rate(times_us: torch.Tensor) -> float:

@@ -24,6 +24,7 @@ from scenes.lenses import Pinhole
 from scenes.match import ground_linear
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene
+from scenes.seen import SECTORS, sector, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
 
@@ -37,9 +38,6 @@ FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10
 FULL_SIDE = 0.85
 """Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
-
-SECTORS = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")
-"""From where an object was seen: eighths of the turn about it, counted to the left from its nose."""
 
 FARTHEST = 20.0
 """Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
@@ -57,7 +55,8 @@ class Candidate:
 
 
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
-    """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first.
+    """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first: those of which
+    the fewest sides are unseen, and of these those of the most splats.
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
@@ -66,7 +65,7 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
         if not isinstance(loaded, Scene):
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
         scene = loaded
-    found = sorted(candidates(scene), key=lambda c: -len(c.asset.gaussians))
+    found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids = Databank(databank), []
     for candidate in found:
         if candidate.flaw:
@@ -146,7 +145,7 @@ def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
         close = away <= FARTHEST
         views += int(close.sum())
         for (ahead, beside), metres in zip(eyes[close].tolist(), away[close].tolist(), strict=True):
-            sectors[SECTORS[round(math.atan2(beside, ahead) / (2 * math.pi) * len(SECTORS)) % len(SECTORS)]] += 1
+            sectors[sector(ahead, beside)] += 1
             sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / metres**3
     return Sight(views, nearest, sides[0], sides[1], sectors)
 
@@ -233,13 +232,16 @@ def completed(gaussians: Gaussians, left: float, right: float) -> tuple[Gaussian
 
 
 def thumbnail(asset: Asset) -> bytes:
-    """A PNG of the asset in three-quarter view from behind on its left, on neutral grey."""
+    """A PNG of the asset on neutral grey, in three-quarter view from that corner of which, and of whose sides, the most photos were taken;
+    from behind on its left where none were."""
     from PIL import Image
 
+    counts = [asset.meta.get("sectors", {}).get(name, 0) for name in SECTORS]
+    corners = {i: counts[i - 1] + 3 * counts[i] + counts[(i + 1) % len(SECTORS)] for i in (3, 1, 5, 7)}
     length, width, height = asset.size.tolist()
     centre = torch.tensor([0.0, 0.0, height / 2], dtype=torch.float64)
     distance = 1.7 * math.hypot(length, width, height)
-    azimuth, elevation = math.radians(145), math.radians(18)
+    azimuth, elevation = math.radians({1: 35, 3: 145, 5: 215, 7: 325}[max(corners, key=lambda i: corners[i])]), math.radians(18)
     direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)
     with torch.no_grad():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -165,9 +165,13 @@ class Fit:
         aside = self._aside(view, camera) if self.step_count % ASIDE_EVERY == 0 else None
         ends = self.motion.readout(view, camera)
         rates = self._rates()
-        which, shown = self._in_sight(view, camera, ends, aside, rates)
+        which = self._in_sight(view, camera, ends, aside)
+        self.descent.catch_up(self.splats, which, self.sh_count(), rates)
+        shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
         known = self.measured.views.get((view.camera, view.index)) if self.config.depth_weight else None
-        rgb, alpha, depth = self._render(shown, view, camera, ends, known is not None)
+        by_lot = self._drawn_by_lot(shown)
+        shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
+        rgb, alpha, depth = self._render(by_lot, view, camera, ends, shift, known is not None)
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
@@ -188,8 +192,16 @@ class Fit:
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
 
-    def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None, rates: Rates) -> tuple[torch.Tensor, Splats]:
-        """Indices of the splats that a step may see, which catch up, and copies of them to be differentiated."""
+    @torch.no_grad()
+    def picture(self, view: View) -> torch.Tensor:
+        """A view `[H, W, 3]`, held out or not, as the splats show it by now; the fit goes on as if nobody had looked."""
+        camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
+        ends = self.motion.readout(view, camera)
+        shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
+        return self._render(shown, view, camera, ends, (0, 0), False)[0]
+
+    def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
+        """Indices of the splats that a picture of a view, and one from aside, may show."""
         middle = inverse(camera.world_from_cam.detach())
         first, last = (back for back, _ in ends) if ends else (middle, middle)
         eyes: list[Eye] = [(camera, first, last)]
@@ -198,17 +210,15 @@ class Fit:
             beside = inverse(aside.world_from_cam)
             eyes.append((aside, beside, beside))
             actors += self.motion.near(view, aside).tolist()
-        which = in_sight(self.splats, eyes, [i + 1 for i in actors])
-        self.descent.catch_up(self.splats, which, self.sh_count(), rates)
-        return which, self.splats.select(which, self.sh_count())
+        return in_sight(self.splats, eyes, [i + 1 for i in actors])
 
     def _render(
-        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], with_depth: bool
+        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], shift: Sequence[int], with_depth: bool
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted."""
-        placed = self._placed(self._drawn_by_lot(shown), view, camera)
+        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted;
+        shift: of the sky's samples (`developed`)."""
+        placed = self._placed(shown, view, camera)
         rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
-        shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha, depth[0] if depth else None
 
     def _drawn_by_lot(self, shown: Splats) -> Splats:

@@ -7,9 +7,10 @@ import torch
 from street import box, splats
 
 from recon.assets.cleaning import cleaned, lies_on_road, of_object, outliers
-from recon.assets.extract import SECTORS, seen, shown_colours
+from recon.assets.extract import seen, shown_colours
 from scenes import Gaussians, Trajectory
 from scenes.poses import translation, yaw
+from scenes.seen import SECTORS
 
 SIZE = torch.tensor([4.2, 1.8, 1.5], dtype=torch.float64)
 CAR = box((4.2, 1.8, 1.5), (0.8, 0.1, 0.1), step=0.15)

@@ -156,7 +156,7 @@ def _mistakes(fit):
     for view in fit.training:
         camera = fit.motion.camera(view).resized(*SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-        _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), True)
+        _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), (0, 0), True)
         found.append(float(mistake(depth, alpha, fit.measured.views[view.camera, view.index])))
     return np.mean(found)
 

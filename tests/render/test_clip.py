@@ -3,13 +3,11 @@ import weakref
 
 import pytest
 import torch
-from street import START_US, STEP_US, car
+from street import START_US, STEP_US
 
 from render import render_clip, render_frame
-from render.clip import clip_cameras, clip_times, frame_rate, in_view
+from render.clip import clip_cameras, clip_times, frame_rate
 from scenes import Trajectory
-from scenes.insert import insert
-from scenes.placement import Placement
 
 
 def test_a_clip_has_the_recorded_frames(street):
@@ -54,12 +52,6 @@ def test_other_sizes_show_the_same_view(street):
     assert large.rgb.shape == (108, 192, 3)
     halved = large.rgb.reshape(54, 2, 96, 2, 3).mean((1, 3))
     assert (halved - small.rgb).abs().mean() < 0.02
-
-
-@pytest.mark.parametrize(("x", "y", "seen"), [(12, 3, True), (3, 0, True), (-8, 0, False), (3, 12, False)])
-def test_it_is_known_whether_an_actor_is_ever_in_view(street, x, y, seen):
-    actor = insert(street, car(), Placement("car", x, y)).actor
-    assert in_view(actor, clip_cameras(street, "front_camera")) == seen
 
 
 def test_frames_are_not_kept(street):
