@@ -62,7 +62,7 @@ def unseen_warning(actor: Actor, cameras: Iterable[Camera]) -> list[str]:
     if not named:
         return []
     id = actor.asset.meta.get("id", actor.track)
-    return [f"{id} is shown from {_listed(named)}, where no photo of it was taken: what stands there is a guess; turn it (yaw=180deg), or"
+    return [f"{id} is shown from its {_listed(named)}, from where no photo of it was taken: what stands there is a guess; turn it (yaw=180deg), or"
             f" take another one (sidestep assets show {id} says from where it was seen)"]  # fmt: skip
 
 

@@ -47,6 +47,6 @@ def test_who_shows_an_unseen_side_is_told(street):
     assert unseen_warning(ahead, seeing(ahead, recorded(street))) == [], "it shows its rear"
     oncoming = insert(street, asset, Placement("car/0007", 12, 0, yaw=torch.pi)).actor
     (said,) = unseen_warning(oncoming, seeing(oncoming, recorded(street)))
-    assert said.startswith("car/0007 is shown from front, where no photo") and "assets show car/0007" in said
+    assert said.startswith("car/0007 is shown from its front, from where no photo") and "assets show car/0007" in said
     assert unseen_warning(oncoming, []) == []
     assert unseen_warning(insert(street, car(), Placement("car", 12, 0, yaw=torch.pi)).actor, recorded(street)) == []
