@@ -19,7 +19,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 6
+VERSION = 7
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -69,7 +69,7 @@ def _plain_start(start: Start) -> dict:
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
-        "measured": [start.measured.views, start.measured.weight],
+        "measured": [[m.views, m.weight] for m in start.measured],
     }  # fmt: skip
 
 
@@ -97,4 +97,4 @@ def _start(plain: dict, fit: dict) -> Start:
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
-    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, Measured(*plain["measured"]))
+    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, tuple(Measured(*m) for m in plain["measured"]))

@@ -20,6 +20,7 @@ from recon.seeds.dense import cloud_from_pictures
 from recon.seeds.fill import unexplained
 from recon.seeds.measured import Measured, by_lidar
 from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.standing import by_all_sweeps
 from recon.seeds.sweep import companions
 from recon.seeds.triangulate import triangulated
 from recon.skies import SkyPicture, like_sky
@@ -58,7 +59,7 @@ class Start:
     ego: Trajectory
     ground: Ground
     rig: dict[str, RigCamera]
-    measured: Measured
+    measured: tuple[Measured, ...]
 
 
 def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_count: int, report: Callable[[str], None]) -> Start:
@@ -76,7 +77,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
         ground = estimate_ground(sparse.xyz, log.ego)
-        cloud, measured = cloud_from_pictures(log, frames, sparse, ground, movers)
+        cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers)
         gains = np.ones((len(frames.names), 3))
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
@@ -87,7 +88,9 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
         known = np.isfinite(rgb[:, 0])
         if not known.any():
             raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
-        cloud, measured = Cloud(split.static[known], rgb[known]), by_lidar(log, frames, sweeps, split, movers)
+        cloud = Cloud(split.static[known], rgb[known])
+        report("measuring depth")
+        measured = [by_lidar(log, frames, sweeps, split, movers), by_all_sweeps(log, frames, split, movers)]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
@@ -114,7 +117,7 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     reach = torch.maximum(reach, filled.log_scales.exp().amax(1) / LARGEST)
     exposures = torch.zeros(len(frames.names), 3, 4)
     exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, measured)
+    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured))
 
 
 def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:

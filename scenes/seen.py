@@ -62,8 +62,8 @@ def unseen_warning(actor: Actor, cameras: Iterable[Camera]) -> list[str]:
     if not named:
         return []
     id = actor.asset.meta.get("id", actor.track)
-    return [f"{id} is shown from its {_listed(named)}, from where no photo of it was taken: what stands there is a guess; turn it (yaw=180deg), or"
-            f" take another one (sidestep assets show {id} says from where it was seen)"]  # fmt: skip
+    said = f"{id} is shown from its {_listed(named)}, from where no photo of it was taken: what stands there is a guess; "
+    return [f"{said}turn it (yaw=180deg), or take another one (sidestep assets show {id} says from where it was seen)"]
 
 
 def _listed(names: Sequence[str]) -> str:

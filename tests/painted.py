@@ -1,4 +1,5 @@
-"""A made-up drive of two cameras without lidar towards a wall: ground and wall painted with blotches, so that every depth is known."""
+"""A made-up drive of two cameras without lidar towards a wall: ground and wall painted with blotches, so that every depth is known; and
+sweeps that a lidar would add to it."""
 
 from io import BytesIO
 from pathlib import Path
@@ -7,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from recon.log import Log, LogCamera, Packed
+from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
 from recon.readers.colmap import CAM_FROM_BODY
 from render.rays import world_directions
 from scenes.camera import Camera
@@ -74,3 +75,15 @@ def drive(steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bo
         pictures = tuple(_picture(v, blotches, board_left(i) if board else None) for i, v in enumerate(views))
         cameras[name] = LogCamera(name, lens, *SIZE, pictures, times, poses)
     return Log("bare", Path("bare"), cameras, (), (), Trajectory(times, bodies), {}, names)
+
+
+def sweep_of(time_us: int, *parts: np.ndarray) -> Sweep:
+    """A sweep at a time of points `[N, 3]`."""
+    xyz = np.concatenate(parts)
+    return Sweep(0, time_us, lambda: LidarPoints(xyz, np.full(len(xyz), time_us), np.zeros(len(xyz), np.int64)))
+
+
+def wall(x: float, low: float, high: float, step: float = 0.05) -> np.ndarray:
+    """Points on an upright wall x metres ahead, from y low to high, 0.5 to 2.5 m above the ground."""
+    y, z = np.meshgrid(np.arange(low, high, step), np.arange(0.5, 2.5, step))
+    return np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])

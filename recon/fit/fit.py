@@ -113,10 +113,11 @@ class Fit:
         exposures: torch.Tensor,
         limbs: Limbs,
         config: FitConfig,
-        measured: Measured,
+        measured: Sequence[Measured],
     ):
         self.device = splats.reach.device
-        self.frames, self.motion, self.limbs, self.config, self.measured = frames, motion, limbs, config, measured.to(self.device)
+        self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
+        self.measured = [m.to(self.device) for m in measured]
         self.splats, self.sky, self.exposures = splats, sky.to(self.device), exposures.to(self.device)
         self.first_sky = self.sky.clone()
         self.step_count = 0
@@ -168,10 +169,10 @@ class Fit:
         which = self._in_sight(view, camera, ends, aside)
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
-        known = self.measured.views.get((view.camera, view.index)) if self.config.depth_weight else None
+        known = self._known(view)
         by_lot = self._drawn_by_lot(shown)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
-        rgb, alpha, depth = self._render(by_lot, view, camera, ends, shift, known is not None)
+        rgb, alpha, depth = self._render(by_lot, view, camera, ends, shift, bool(known))
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
@@ -179,8 +180,9 @@ class Fit:
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
         if aside is not None:
             haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
-        if known is not None and depth is not None:
-            haze = haze + self.config.depth_weight * self.measured.weight * mistake(depth, alpha, known)
+        if depth is not None:
+            for weight, there in known:
+                haze = haze + self.config.depth_weight * weight * mistake(depth, alpha, there)
         unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
@@ -191,6 +193,12 @@ class Fit:
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
+
+    def _known(self, view: View) -> list[tuple[float, torch.Tensor]]:
+        """The depths that a view is held to, and their weights."""
+        if not self.config.depth_weight:
+            return []
+        return [(m.weight, m.views[view.camera, view.index]) for m in self.measured if (view.camera, view.index) in m.views]
 
     @torch.no_grad()
     def picture(self, view: View) -> torch.Tensor:

@@ -65,12 +65,17 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split, mo
         static = split.static[split.static_sweep == sweeps[k].index]
         for view in views:
             camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
-            row, column, found, inside = project(static, inverse(camera.world_from_cam).numpy(), camera)
-            depth = np.full((camera.height, camera.width), np.inf)
-            np.minimum.at(depth, (row[inside], column[inside]), found[inside])
-            hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > nearest_box(camera, movers))
-            measured[view.camera, view.index] = _known(np.where(hidden, np.nan, depth))
+            measured[view.camera, view.index] = as_known(nearest_points(static, camera, nearest_box(camera, movers)))
     return Measured(measured, LIDAR)
+
+
+def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np.ndarray:
+    """Depth `[h, w]` of points `[N, 3]` that a camera sees, NaN where it sees none; neither behind others nor behind what is `before`."""
+    row, column, found, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
+    depth = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(depth, (row[inside], column[inside]), found[inside])
+    hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > before)
+    return np.where(hidden, np.nan, depth)
 
 
 def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor:
@@ -83,10 +88,11 @@ def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor
         h, w = depth.shape
         inside = (rays[..., 2] > 0) & (at > 0).all(-1) & (at[..., 0] < w) & (at[..., 1] < h)
         column, row = np.where(inside[..., None], at, 0).astype(np.int64).transpose(2, 0, 1)
-        return _known(np.where(inside, depth[row, column] / rays[..., 2], np.nan))
+        return as_known(np.where(inside, depth[row, column] / rays[..., 2], np.nan))
 
 
-def _known(depth: np.ndarray) -> torch.Tensor:
+def as_known(depth: np.ndarray) -> torch.Tensor:
+    """Depth as it is kept: NaN where it is not finite."""
     return torch.from_numpy(np.where(np.isfinite(depth), depth, np.nan)).half()
 
 

@@ -157,7 +157,7 @@ def _mistakes(fit):
         camera = fit.motion.camera(view).resized(*SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
         _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), (0, 0), True)
-        found.append(float(mistake(depth, alpha, fit.measured.views[view.camera, view.index])))
+        found.append(float(mistake(depth, alpha, fit.measured[0].views[view.camera, view.index])))
     return np.mean(found)
 
 
@@ -167,8 +167,8 @@ def test_depth_follows_what_was_measured(drive):
     after = []
     for weight in (0.0, 1.0):
         _, fit = begin(log, names, span, SIZE, replace(CONFIG, steps=400, depth_weight=weight), 4)
-        assert len(fit.measured.views) == len(fit.training)
-        fit.measured = Measured({k: 1.15 * depth for k, depth in fit.measured.views.items()}, 0.5)
+        assert [len(m.views) for m in fit.measured] == 2 * [len(fit.training)]
+        fit.measured = [Measured({k: 1.15 * depth for k, depth in fit.measured[0].views.items()}, 0.5)]
         before = _mistakes(fit)
         for _ in range(40):
             fit.step()

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from painted import SIZE, drive
+from painted import SIZE, drive, sweep_of, wall
 
 from recon.actors import split_points
 from recon.frames import load_frames
-from recon.log import LidarPoints, Sweep, Track
+from recon.log import Track
 from recon.seeds.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake
 from recon.seeds.stereo import plate_of
 from scenes.camera import Camera
@@ -17,18 +17,8 @@ from scenes.poses import translation
 ALL = (0, 10**18)
 
 
-def _sweep(time_us: int, *parts: np.ndarray) -> Sweep:
-    xyz = np.concatenate(parts)
-    return Sweep(0, time_us, lambda: LidarPoints(xyz, np.full(len(xyz), time_us), np.zeros(len(xyz), np.int64)))
-
-
 def _by_lidar(log, frames, sweeps, movers):
     return by_lidar(log, frames, sweeps, split_points(log, sweeps, movers), movers)
-
-
-def _wall(x: float, low: float, high: float, step: float = 0.05) -> np.ndarray:
-    y, z = np.meshgrid(np.arange(low, high, step), np.arange(0.5, 2.5, step))
-    return np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])
 
 
 def test_lidar_measures_what_the_camera_sees_and_stands_still():
@@ -44,7 +34,7 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
         np.zeros(2),
         (),
     )
-    sweep = _sweep(20_000, _wall(12.0, -3, 3), _wall(8.0, 0, 1), _wall(6.0, -4, -2))
+    sweep = sweep_of(20_000, wall(12.0, -3, 3), wall(8.0, 0, 1), wall(6.0, -4, -2))
     measured = _by_lidar(log, frames, [sweep], [car]).views
     depth = measured[0, 0].float().numpy()
     known = depth[np.isfinite(depth)]
@@ -56,9 +46,9 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     assert not (np.abs(board[np.isfinite(board)] - 12) < 0.05)[: near.sum() // 2].all()
     # a lens that sees far aside means the distance
     round_ = replace(log, cameras={"front": replace(log.cameras["front"], lens=Fisheye(100, 100, 160, 90))})
-    distance = _by_lidar(round_, frames, [_sweep(20_000, _wall(12.0, -12, 12))], []).views[0, 0].float().numpy()
+    distance = _by_lidar(round_, frames, [sweep_of(20_000, wall(12.0, -12, 12))], []).views[0, 0].float().numpy()
     assert np.nanmax(distance) == pytest.approx(17.0, abs=0.3) and np.nanmin(distance) == pytest.approx(12.0, abs=0.1)
-    assert (0, 1) in measured and (0, 2) not in _by_lidar(log, frames, [_sweep(200_000 - SOON_US - 1, _wall(12.0, -3, 3))], []).views
+    assert (0, 1) in measured and (0, 2) not in _by_lidar(log, frames, [sweep_of(200_000 - SOON_US - 1, wall(12.0, -3, 3))], []).views
     assert _by_lidar(log, frames, [], []).views == {}
 
 

@@ -1,0 +1,67 @@
+"""What stands is as far as lidar ever measured it, and goes on upwards."""
+
+import numpy as np
+import torch
+from painted import SIZE, drive, sweep_of
+from painted import wall as wall_points
+
+from recon.actors import split_points
+from recon.frames import load_frames
+from recon.seeds.standing import BESIDE, CLOSE, FURTHER, RISES, by_all_sweeps, upwards
+
+RISE = np.repeat(np.linspace(0.4, -0.2, 60)[:, None], 30, 1)  # 0.01 a row, the uppermost first
+
+
+def depth_with(**columns: tuple[int, float]) -> np.ndarray:
+    """NaN but for a metre value from a row on downwards, a column each, as c7=(30, 12.0)."""
+    depth = np.full(RISE.shape, np.nan)
+    for column, (row, metres) in columns.items():
+        depth[row:, int(column[1:])] = metres
+    return depth
+
+
+def wall(row: int, metres: float) -> np.ndarray:
+    return depth_with(**{f"c{c}": (row, metres) for c in range(30)})
+
+
+def test_a_wall_goes_on_above_the_highest_beam_for_a_while():
+    nothing = np.zeros(RISE.shape, bool)
+    found = upwards(wall(30, 12.0), RISE, nothing)
+    known = np.isfinite(found[:, 15])
+    assert (found[known] == 12).all() and known[30:].all()
+    assert abs(known.sum() - 30 - FURTHER / 0.01) < 2, "not for ever"
+    assert not np.isfinite(upwards(wall(30, CLOSE + 1), RISE, nothing)[:30]).any(), "behind what is far stand towers"
+    below = upwards(wall(50, 12.0), RISE, nothing)  # its highest point is a little below the horizon
+    assert not np.isfinite(below[:50][RISE[:50] < RISES]).any()
+
+
+def test_it_ends_at_the_sky_and_does_not_begin_again_behind_it():
+    sky = np.zeros(RISE.shape, bool)
+    sky[24:26] = True
+    found = upwards(wall(30, 12.0), RISE, sky)
+    assert np.isfinite(found[26:]).all() and not np.isfinite(found[:26]).any()
+
+
+def test_one_beam_that_met_a_wire_does_not_decide():
+    depth = wall(30, 12.0)
+    depth[28, 15] = 4.0
+    found = upwards(depth, RISE, np.zeros(RISE.shape, bool))
+    assert found[28, 15] == 4.0, "what is measured stays"
+    assert (found[20:27, 15 - BESIDE : 15 + BESIDE + 1] == 4.0).any() or np.isfinite(found[20:27]).all()
+    lone = upwards(depth_with(c15=(30, 12.0)), RISE, np.zeros(RISE.shape, bool))
+    assert np.isfinite(lone[29]).sum() == 2 * BESIDE + 1 and not np.isfinite(lone[29, : 15 - BESIDE]).any()
+
+
+def test_other_sweeps_tell_how_far_a_wall_is_above_the_horizon():
+    log = drive([0.0, 0.5, 0.5], ("front",))
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    sweeps = [sweep_of(240_000, wall_points(12.0, -3, 3))]  # at no picture's moment
+    measured = by_all_sweeps(log, frames, split_points(log, sweeps, []), [])
+    assert set(measured.views) == {(0, v.index) for v in frames.training()}
+    depth = measured.views[0, 0].float()
+    camera = log.camera("front").camera(0, *SIZE)
+    known = depth.isfinite()
+    assert known.any() and (depth[known] - (12 - float(camera.world_from_cam[0, 3]))).abs().max() < 0.05
+    rows = known.any(1).nonzero()[:, 0]
+    assert rows.max() < depth.shape[0] / 2 + 1, "below the horizon the sweep of the moment decides"
+    assert torch.equal(measured.views[0, 1].isfinite(), measured.views[0, 1] > 0)
