@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import check_device, fresh
 from scenes.options import FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+
+if TYPE_CHECKING:
+    from scenes import Asset
 
 
 @dataclass
@@ -107,11 +110,11 @@ class Show:
         from scenes import Databank
 
         bank = Databank(self.databank)
-        e, meta = bank.entry(self.id), bank.load(self.id).meta
+        e, asset = bank.entry(self.id), bank.load(self.id)
         thumb = self.databank / e.thumb if e.thumb else "none"
         told = {
             "asset": e.id, "class": e.label, "size": "{:.2f} m long, {:.2f} m wide, {:.2f} m high".format(*e.size), "splats": e.splats,
-            "views": "unknown" if e.views is None else e.views, **_seen_from(meta),
+            "views": "unknown" if e.views is None else e.views, **_seen_from(asset),
             "licence": e.licence, "attribution": e.attribution, "source": e.source,
             "file": self.databank / e.asset, "thumbnail": thumb,
         }  # fmt: skip
@@ -119,12 +122,14 @@ class Show:
             print(f"{key:<12} {value}")
 
 
-def _seen_from(meta: dict) -> dict:
-    """Where an asset was seen from, for `assets show`: from how many frames each sector."""
-    sectors = {name: count for name, count in meta.get("sectors", {}).items() if count}
-    seen = ", ".join(f"{name} {count}" for name, count in sectors.items())
-    mirrored = " (the other side is its mirror image)" if meta.get("mirrored") else ""
-    return {"seen from": seen + mirrored} if seen else {}
+def _seen_from(asset: Asset) -> dict[str, str]:
+    """Where an asset was seen from, for `assets show`: from how many frames each sector, and from where its look is a guess."""
+    from scenes.seen import unseen_sides
+
+    seen = ", ".join(f"{name} {count}" for name, count in asset.meta.get("sectors", {}).items() if count)
+    mirrored = " (the other side is its mirror image)" if asset.meta.get("mirrored") else ""
+    told = {"seen from": seen + mirrored, "a guess from": ", ".join(unseen_sides(asset))}
+    return {key: value for key, value in told.items() if value}
 
 
 @dataclass

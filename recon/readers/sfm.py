@@ -122,7 +122,17 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> i
         # two pictures of a drive lie one behind the other, which the defaults do not begin a world with
         options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
         made.mkdir()
-        models = colmap.incremental_mapping(database, pictures, made, options)
+        placed = 0
+
+        def tell(count: int) -> None:
+            nonlocal placed
+            placed = count
+            steps.step(0, note=f"poses: {placed} of {len(names)} pictures placed")
+
+        models = colmap.incremental_mapping(
+            database, pictures, made, options,
+            initial_image_pair_callback=lambda: tell(2), next_image_callback=lambda: tell(placed + 1),
+        )  # fmt: skip
     best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
     count = 0 if best is None else best.num_reg_images()
     if best is None or count < max(FEWEST_PLACED, len(names) // 4):
