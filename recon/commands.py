@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import check_device, fresh
-from scenes.options import FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+from scenes.options import AngleOrNone, FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 
 if TYPE_CHECKING:
     from scenes import Asset
@@ -36,6 +36,9 @@ class Recon:
     """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
     metres_per_unit: Ratio = None
     """The same for a COLMAP folder by number: metres that one unit of its model has."""
+    angle_of_view: AngleOrNone = None
+    """Of photos or a video: how wide their camera sees, from the left side to the right, as 58deg; else it is found, which a straight road
+    does not allow."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     resume: Flag = False
@@ -54,7 +57,7 @@ class Recon:
         if self.output.exists() and not is_scene(self.output):
             raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
         check_device(self.device)
-        log = open_log(self.data, self.camera_height, self.metres_per_unit)
+        log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
         try:
             reconstruct(
                 log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,

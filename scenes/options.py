@@ -65,6 +65,7 @@ def names(text: str) -> tuple[str, ...]:
 Length = Annotated[float, written(units.length, "LENGTH", "0m")]
 LengthOrNone = Annotated[float | None, written(units.length, "LENGTH", "none")]
 Ratio = Annotated[float | None, written(_ratio, "NUMBER", "none")]
+AngleOrNone = Annotated[float | None, written(units.angle, "ANGLE", "none")]
 Angle = Annotated[float, written(units.angle, "ANGLE", "0deg")]
 Speed = Annotated[float, written(units.speed, "SPEED", "0m/s")]
 Time = Annotated[int, written(units.duration_us, "TIME", "0s")]

@@ -16,13 +16,16 @@ from recon.readers.photos import is_photos, is_video, read_photos
 from recon.readers.waymo import is_waymo, read_waymo
 
 
-def open_log(path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
+def open_log(
+    path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None, angle_of_view: float | None = None
+) -> Log:
     """The drive in a folder, by the layout of its files, or a video; reads no image and no sweep yet, but of photos
     and videos whose poses must be found first.
 
     camera_height, metres_per_unit: what makes a world that pictures alone made metric: metres of the cameras above the ground, or
-    metres a unit of the model. Raises FileNotFoundError where there is no such folder and ValueError where its layout is not known,
-    a file is corrupt, or metres are given to a log that has its own.
+    metres a unit of the model. angle_of_view: radians from the left to the right side of photos or a video, found where None. Raises
+    FileNotFoundError where there is no such folder and ValueError where its layout is not known, a file is corrupt, or metres or an angle
+    are given to a log that has its own.
     """
     path = Path(path)
     read = metric_reader(path)
@@ -30,18 +33,25 @@ def open_log(path: str | Path, camera_height: float | None = None, metres_per_un
         given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
         if given:
             raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
+        _knows_its_lenses(path, angle_of_view)
         return read(path)
     if is_video(path):
-        return read_photos(path, camera_height, metres_per_unit)
+        return read_photos(path, camera_height, metres_per_unit, angle_of_view)
     if not path.is_dir():
         raise FileNotFoundError(f"{path} is neither a folder nor a video; give the folder of one drive, as pandaset/002")
     if find_model(path) is not None:
+        _knows_its_lenses(path, angle_of_view)
         return read_colmap(path, camera_height, metres_per_unit)
     if is_photos(path):
-        return read_photos(path, camera_height, metres_per_unit)
+        return read_photos(path, camera_height, metres_per_unit, angle_of_view)
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
     hint = f" Did you mean {inside[0]}?" if inside else ""
     raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")
+
+
+def _knows_its_lenses(path: Path, angle_of_view: float | None) -> None:
+    if angle_of_view is not None:
+        raise ValueError(f"{path} tells its lenses itself; leave out --angle-of-view, which is for photos and videos")
 
 
 READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Log]]] = {

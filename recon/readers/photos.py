@@ -24,6 +24,9 @@ FEWEST = 3
 RATE, MOST = 10.0, 150
 """Frames a second that are taken from a video, and how many of it at most: more say little more, and matching takes long."""
 
+NARROWEST, WIDEST, SAME = math.radians(5), math.radians(150), 0.01
+"""Radians of an angle of view that a lens of this kind has, and the part by which two may differ that mean the same."""
+
 
 def is_photos(path: Path) -> bool:
     return path.is_dir() and sum(p.suffix.lower() in PHOTOS for p in path.iterdir()) >= FEWEST
@@ -33,19 +36,31 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEOS
 
 
-def read_photos(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None) -> Log:
+def read_photos(
+    path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, angle_of_view: float | None = None
+) -> Log:
     """The log of a folder of photos or of a video; `camera_height` and `metres_per_unit` as in `read_colmap`.
 
-    ValueError where too few of the pictures can be placed, PermissionError where the workspace cannot be written.
+    angle_of_view: radians from the pictures' left to their right side, found with the poses where None. ValueError where too few of the
+    pictures can be placed, or were placed with another angle before, PermissionError where the workspace cannot be written.
     """
+    if angle_of_view is not None and not NARROWEST <= angle_of_view <= WIDEST:
+        low, high = (f"{math.degrees(a):.0f}deg" for a in (NARROWEST, WIDEST))
+        raise ValueError(f"--angle-of-view must lie from {low} to {high}, got {math.degrees(angle_of_view):g}deg")
     workspace = path.with_name(path.name + ".sfm")
     if find_model(workspace) is None:
-        _make(path, workspace)
+        _make(path, workspace, angle_of_view)
     pictures = workspace / "images" if is_video(path) else path
-    return read_colmap(workspace, camera_height, metres_per_unit, pictures)
+    log = read_colmap(workspace, camera_height, metres_per_unit, pictures)
+    camera = log.camera(log.front[0])
+    found = 2 * math.atan(camera.width / 2 / camera.lens.focal()[0])
+    if angle_of_view is not None and abs(found - angle_of_view) > SAME * angle_of_view:
+        fix = f"delete it to begin again with {math.degrees(angle_of_view):g}deg"
+        raise ValueError(f"{workspace} was made with an angle of view of {math.degrees(found):.1f}deg; {fix}")
+    return log
 
 
-def _make(path: Path, workspace: Path) -> None:
+def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
     """Find the poses and write the workspace: whole, or not at all."""
     partial = workspace.with_name(workspace.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -57,11 +72,11 @@ def _make(path: Path, workspace: Path) -> None:
         print(f"finding where {path} was taken; it is kept in {workspace}", file=sys.stderr)
         if is_video(path):
             times = _frames(path, partial / "images")
-            placed = solve(partial / "images", list(times), partial, ordered=True)
+            placed = solve(partial / "images", list(times), partial, True, angle_of_view)
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
             names = _of_one_size(path)
-            placed = solve(path, names, partial, ordered=False)
+            placed = solve(path, names, partial, False, angle_of_view)
             times = dict.fromkeys(names, 0)
         print(f"placed {placed} of {len(times)} pictures", file=sys.stderr)
         partial.rename(workspace)

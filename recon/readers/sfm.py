@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from recon.log import image_size
 from render.progress import Progress
 
 PARTS = ("cameras", "images", "points3D")
@@ -98,9 +100,10 @@ def read_model(folder: Path) -> Model:
     return Model(cameras, tuple(images), xyz, any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values()))
 
 
-def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> int:
+def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None = None) -> int:
     """Find the poses of the named pictures and their common lens; writes `workspace`/sparse/0. Returns how many were placed.
 
+    angle_of_view: radians from the left to the right side, where the focal length need not be found.
     SIFT features, matched between all pictures, or where they are `ordered` (a video) between near ones, then incremental mapping
     (Schönberger and Frahm 2016), all on the CPU. The largest of the models is kept. ValueError where it holds too few pictures.
     """
@@ -109,6 +112,9 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> i
     with Progress("structure from motion") as steps:
         steps.step(note="features")
         reader = colmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+        if angle_of_view is not None:
+            width, height = image_size(pictures / names[0])
+            reader.camera_params = f"{width / 2 / math.tan(angle_of_view / 2)},{width / 2},{height / 2},0"
         single, cpu = colmap.CameraMode.SINGLE, colmap.Device.cpu
         colmap.extract_features(database, pictures, names, camera_mode=single, reader_options=reader, device=cpu)
         steps.step(note="matches")
@@ -121,6 +127,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool) -> i
         options.random_seed = 0
         # two pictures of a drive lie one behind the other, which the defaults do not begin a world with
         options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = angle_of_view is None
         made.mkdir()
         placed = 0
 

@@ -1,3 +1,4 @@
+import math
 import shutil
 
 import pytest
@@ -7,6 +8,7 @@ from PIL import Image
 
 from recon import open_log
 from recon.readers import photos as reader
+from recon.readers.sfm import read_model
 from render.video import VideoWriter
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
@@ -22,8 +24,8 @@ def solved(walk, monkeypatch):
     """Structure from motion that knows its answer; the calls it got."""
     calls = []
 
-    def solve(pictures, names, workspace, ordered):
-        calls.append((names, ordered))
+    def solve(pictures, names, workspace, ordered, angle_of_view):
+        calls.append((names, ordered, angle_of_view))
         shutil.copytree(walk / "sparse", workspace / "sparse")
         images = workspace / "sparse/0/images.txt"
         text = images.read_text()
@@ -44,6 +46,28 @@ def test_photos_are_placed_once_and_read_from_then_on(walk, solved, tmp_path):
     assert first.meta["metric"] is False and second.meta["metric"] is True
 
 
+def test_a_known_angle_of_view_is_kept_and_another_one_begins_anew(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    camera = open_log(tmp_path / "walk").camera("camera")
+    angle = 2 * math.atan(camera.width / 2 / camera.lens.focal()[0])
+    assert solved[0][2] is None
+    open_log(tmp_path / "walk", angle_of_view=1.005 * angle)
+    assert len(solved) == 1
+    with pytest.raises(ValueError, match="walk.sfm was made with an angle of view of .*delete it to begin again with 20deg"):
+        open_log(tmp_path / "walk", angle_of_view=math.radians(20))
+    shutil.rmtree(tmp_path / "walk.sfm")
+    open_log(tmp_path / "walk", angle_of_view=angle)
+    assert solved[1][2] == angle
+    with pytest.raises(ValueError, match="from 5deg to 150deg, got 200deg"):
+        open_log(tmp_path / "walk", angle_of_view=math.radians(200))
+
+
+def test_who_knows_his_lenses_needs_no_angle_of_view(walk, drive):
+    for path in (walk, drive):
+        with pytest.raises(ValueError, match="leave out --angle-of-view"):
+            open_log(path, angle_of_view=1.0)
+
+
 def test_photos_of_another_size_are_left_out_and_said(walk, solved, tmp_path, capsys):
     shutil.copytree(walk / "images", tmp_path / "walk")
     Image.new("RGB", (54, 96)).save(tmp_path / "walk/turned.png")
@@ -56,7 +80,7 @@ def test_a_video_keeps_its_clock(solved, tmp_path):
         for i in range(12):
             video.write(torch.full((54, 96, 3), i / 12))
     camera = open_log(tmp_path / "drive.mp4").camera("camera")
-    assert solved[0] == ([f"{i:06d}.jpg" for i in range(0, 12, 2)], True)  # 25 frames a second, every second one
+    assert solved[0] == ([f"{i:06d}.jpg" for i in range(0, 12, 2)], True, None)  # 25 frames a second, every second one
     assert camera.times_us.diff().unique().tolist() == [80_000] and camera.image(1).shape == (54, 96, 3)
 
 
@@ -93,14 +117,21 @@ def test_pictures_without_overlap_are_refused_with_the_fix(tmp_path):
         open_log(folder)
 
 
-def test_real_photos_are_placed(shared, tmp_path):
-    """Six photos of a street, 4 metres apart."""
+@pytest.mark.parametrize("told", [False, True])
+def test_real_photos_are_placed(shared, tmp_path, told):
+    """Six photos of a street, 4 metres apart, which know the focal length, or whose angle of view is told."""
     folder = tmp_path / "street"
     folder.mkdir()
     for i in range(8, 14):
         with Image.open(shared / f"lund/images/{i:02d}.jpg") as photo:
-            photo.resize((640, 480)).save(folder / f"{i:02d}.jpg", quality=95, exif=photo.info["exif"])  # which knows the focal length
-    log = open_log(folder)
-    camera = log.camera("camera")  # how many of so few are placed is luck: matching draws lots
+            knows = {} if told else {"exif": photo.info["exif"]}
+            photo.resize((640, 480)).save(folder / f"{i:02d}.jpg", quality=95, **knows)
+    (known,) = read_model(shared / "lund/colmap_sparse").cameras.values()
+    angle = 2 * math.atan(known.width / 2 / known.params[0])
+    log = open_log(folder, angle_of_view=angle if told else None)
+    camera = log.camera("camera")
+    if told:
+        assert camera.lens.focal()[0] == pytest.approx(known.params[0] * 640 / known.width)
+    # how many of so few are placed is luck: matching draws lots
     assert len(camera) >= 3 and len(log.points.xyz) > 50 and camera.lens.kind == "opencv"
     assert torch.isfinite(log.ego.world_from_body).all() and camera.image(0).shape == (480, 640, 3)
