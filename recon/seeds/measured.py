@@ -75,7 +75,7 @@ def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np
     depth = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(depth, (row[inside], column[inside]), found[inside])
     hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > before)
-    return np.where(hidden, np.nan, depth)
+    return np.where(hidden | np.isinf(depth), np.nan, depth)
 
 
 def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor:

@@ -40,32 +40,35 @@ def by_all_sweeps(log: Log, frames: Frames, split: Split, movers: list[Track]) -
     found = {}
     for view in frames.training():
         camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
-        rays = (camera.lens.unproject(camera.pixel_centres()) @ camera.world_from_cam[:3, :3].T).numpy()
-        rise = rays[..., 2] / np.hypot(rays[..., 0], rays[..., 1])
+        local = camera.lens.unproject(camera.pixel_centres())
+        rays = (local @ camera.world_from_cam[:3, :3].T).numpy()
+        level = np.hypot(rays[..., 0], rays[..., 1])
+        rise, away = rays[..., 2] / level, level / camera.lens.depth(local).numpy()  # metres over the ground in one of depth
         above = points[points[:, 2] > float(camera.world_from_cam[2, 3])]
         depth = np.where(rise > 0, nearest_points(above, camera, nearest_box(camera, movers)), np.nan)
-        found[view.camera, view.index] = as_known(upwards(depth, rise, _on_grid(view, camera)))
+        found[view.camera, view.index] = as_known(upwards(depth * away, rise, _on_grid(view, camera)) / away)
     return Measured(found, STANDING)
 
 
-def upwards(depth: np.ndarray, rise: np.ndarray, sky: np.ndarray) -> np.ndarray:
-    """Depth `[h, w]`, NaN where it is not known, with what stands as far as the highest known below it: walls, poles and trees are upright.
+def upwards(metres: np.ndarray, rise: np.ndarray, sky: np.ndarray) -> np.ndarray:
+    """Metres over the ground `[h, w]`, NaN where they are not known, with what stands above as far away as the highest known below it: walls
+    and poles are upright.
 
     rise: the tangents of the pixels' elevations. It ends at the `sky`, `FURTHER` above what is known, and beyond `CLOSE`.
     """
-    out, beside = depth.copy(), _median_beside(depth)
-    carried, began = np.full((2, depth.shape[1]), np.nan)
-    for row in range(len(depth) - 1, -1, -1):
+    out, beside = metres.copy(), _median_beside(metres)
+    carried, began = np.full((2, metres.shape[1]), np.nan)
+    for row in range(len(metres) - 1, -1, -1):
         known = np.isfinite(beside[row])
         carried, began = np.where(known, beside[row], carried), np.where(known, rise[row], began)
-        carried[sky[row] | (rise[row] < RISES) | (rise[row] > began + FURTHER) | (carried > CLOSE)] = np.nan
-        out[row] = np.where(np.isnan(depth[row]), carried, depth[row])
+        carried[sky[row] | ~(rise[row] >= RISES) | (rise[row] > began + FURTHER) | (carried > CLOSE)] = np.nan
+        out[row] = np.where(np.isnan(metres[row]), carried, metres[row])
     return out
 
 
-def _median_beside(depth: np.ndarray) -> np.ndarray:
+def _median_beside(metres: np.ndarray) -> np.ndarray:
     """The (lower) median of what is known of `BESIDE` columns to either side, NaN where nothing is."""
-    padded = np.pad(depth, ((0, 0), (BESIDE, BESIDE)), constant_values=np.nan)
+    padded = np.pad(metres, ((0, 0), (BESIDE, BESIDE)), constant_values=np.nan)
     around = np.sort(np.lib.stride_tricks.sliding_window_view(padded, 2 * BESIDE + 1, axis=1), axis=2)  # NaN last
     middle = np.maximum(np.isfinite(around).sum(2) - 1, 0) // 2
     return np.take_along_axis(around, middle[..., None], 2)[..., 0]

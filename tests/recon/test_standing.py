@@ -1,13 +1,19 @@
 """What stands is as far as lidar ever measured it, and goes on upwards."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 from painted import SIZE, drive, sweep_of
 from painted import wall as wall_points
 
 from recon.actors import split_points
 from recon.frames import load_frames
+from recon.seeds.measured import grid_of
 from recon.seeds.standing import BESIDE, CLOSE, FURTHER, RISES, by_all_sweeps, upwards
+from scenes.lenses import Fisheye, Pinhole
 
 RISE = np.repeat(np.linspace(0.4, -0.2, 60)[:, None], 30, 1)  # 0.01 a row, the uppermost first
 
@@ -50,6 +56,26 @@ def test_one_beam_that_met_a_wire_does_not_decide():
     assert (found[20:27, 15 - BESIDE : 15 + BESIDE + 1] == 4.0).any() or np.isfinite(found[20:27]).all()
     lone = upwards(depth_with(c15=(30, 12.0)), RISE, np.zeros(RISE.shape, bool))
     assert np.isfinite(lone[29]).sum() == 2 * BESIDE + 1 and not np.isfinite(lone[29, : 15 - BESIDE]).any()
+
+
+@pytest.mark.parametrize("lens", [Pinhole(100, 100, 160, 90), Fisheye(100, 100, 160, 90)])
+@pytest.mark.parametrize("pitch", [0.0, 0.3])
+def test_upright_means_as_far_over_the_ground_for_every_lens_and_camera(lens, pitch):
+    log = drive([0.0, 0.5, 0.5], ("front",))
+    front = log.cameras["front"]
+    up = torch.tensor([[1, 0, 0, 0], [0, math.cos(pitch), math.sin(pitch), 0], [0, -math.sin(pitch), math.cos(pitch), 0], [0, 0, 0, 1]])
+    log = replace(log, cameras={"front": replace(front, lens=lens, world_from_cam=front.world_from_cam @ up.double())})
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    frames = replace(frames, views=[replace(v, sky=torch.zeros_like(v.sky)) for v in frames.views])
+    sweeps = [sweep_of(240_000, wall_points(12.0, -8, 8))]
+    depth = by_all_sweeps(log, frames, split_points(log, sweeps, []), []).views[0, 0].double().numpy()
+    camera = grid_of(log.camera("front").camera(0, *SIZE))
+    local = camera.lens.unproject(camera.pixel_centres())
+    at = (local / camera.lens.depth(local)[..., None] @ camera.world_from_cam[:3, :3].T).numpy() * depth[..., None]
+    known = np.isfinite(depth)
+    heights, middle = at[known][:, 2] + float(camera.world_from_cam[2, 3]), np.abs(at[known][:, 1]) < 1
+    assert (heights > 3.0).any(), "it goes on above the wall's points"
+    np.testing.assert_allclose(at[known][middle, 0], 12.0 - float(camera.world_from_cam[0, 3]), rtol=0.02)
 
 
 def test_other_sweeps_tell_how_far_a_wall_is_above_the_horizon():
