@@ -51,8 +51,8 @@ def by_all_sweeps(log: Log, frames: Frames, split: Split, movers: list[Track]) -
 
 
 def upwards(metres: np.ndarray, rise: np.ndarray, sky: np.ndarray) -> np.ndarray:
-    """Metres over the ground `[h, w]`, NaN where they are not known, with what stands above as far away as the highest known below it: walls
-    and poles are upright.
+    """Metres over the ground `[h, w]`, NaN where not known, with what stands above as far away as the highest known below it: walls and
+    poles are upright.
 
     rise: the tangents of the pixels' elevations. It ends at the `sky`, `FURTHER` above what is known, and beyond `CLOSE`.
     """

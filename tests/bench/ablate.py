@@ -27,7 +27,7 @@ from enhance.net import Net, told_of
 from enhance.precision import autocast, channels_last
 from enhance.run import TrainConfig
 from enhance.samples import Sampler
-from enhance.shards import KINDS, PairSet, Shard, to_bytes, write_shard
+from enhance.shards import KINDS, RENDERED, PairSet, Shard, to_bytes, write_shard
 from enhance.step import Steps
 from enhance.train import train
 from enhance.weights_file import BUILTIN, load_net, save_net
@@ -198,10 +198,18 @@ def table(rows: dict[str, dict[str, list[float]]], kinds: list[str]) -> str:
     return "\n".join(lines)
 
 
+def suited(enhancer: Steps | Alone | None, kind: str) -> Steps | Alone | None:
+    """The enhancer as it treats frames of a kind: photos, into which something was put, are not repaired."""
+    if isinstance(enhancer, Enhancer) and kind not in RENDERED:
+        return enhancer.for_photos()
+    return replace(enhancer, enhancer=suited(enhancer.enhancer, kind)) if isinstance(enhancer, Alone) else enhancer
+
+
 def _measured(name: str, enhancer, pairs: PairSet, kinds: list[str], limit: int) -> dict[str, list[float]]:
     features, found = shipped_features(), {}
     for kind in kinds:
-        row: Row = measured(kind, "identity" if name == "identity" else TOLD, spread(pairs.of(kind, "held out"), limit), enhancer, features)
+        method, clips = "identity" if name == "identity" else TOLD, spread(pairs.of(kind, "held out"), limit)
+        row: Row = measured(kind, method, clips, suited(enhancer, kind), features)
         found[kind] = [row.mean("frame" if kind == "clean" else "region"), row.mean("warp error")]
     return found
 

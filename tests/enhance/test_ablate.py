@@ -1,9 +1,12 @@
 """What the table of the training's parts stands on."""
 
 import torch
+from small_net import stirred
 
+from enhance.enhancer import Enhancer
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
-from tests.bench.ablate import CONFIG, halved, table, variants
+from enhance.weights_file import REPAIR_GAIN
+from tests.bench.ablate import CONFIG, Alone, halved, suited, table, variants
 from tests.bench.nafnet import NafNet
 
 
@@ -11,6 +14,15 @@ def test_an_untrained_nafnet_changes_nothing_and_is_as_large_as_ours():
     net, rgb = NafNet(), torch.rand(1, 3, 32, 48)
     assert torch.equal(net(rgb, torch.zeros(1, 2, 32, 48)), rgb)
     assert abs(sum(p.numel() for p in net.parameters()) / 4.31e6 - 1) < 0.05
+
+
+def test_every_rows_network_repairs_what_is_rendered_and_nothing_else():
+    enhancer = Enhancer(stirred(), {REPAIR_GAIN: [0.0, 0.0]}, repair=True)
+    for of in (enhancer, Alone(enhancer)):
+        shown = [suited(of, kind) for kind in ("sparse", "clean")]
+        inside = [getattr(s, "enhancer", s).repairs for s in shown]
+        assert all(inside[0]) and not any(inside[1]) and type(shown[1]) is type(of)
+    assert suited(None, "clean") is None
 
 
 def test_every_row_leaves_out_one_thing():
