@@ -43,6 +43,8 @@ FARTHEST = 20.0
 """Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
 
 THUMB = (320, 240)
+CORNERS = {3: 145, 1: 35, 5: 215, 7: 325}
+"""Degrees to the left of its nose from which a corner of `SECTORS` is pictured."""
 
 
 @dataclass(frozen=True)
@@ -237,11 +239,11 @@ def thumbnail(asset: Asset) -> bytes:
     from PIL import Image
 
     counts = [asset.meta.get("sectors", {}).get(name, 0) for name in SECTORS]
-    corners = {i: counts[i - 1] + 3 * counts[i] + counts[(i + 1) % len(SECTORS)] for i in (3, 1, 5, 7)}
+    corner = max(CORNERS, key=lambda i: counts[i - 1] + 3 * counts[i] + counts[(i + 1) % len(SECTORS)])
     length, width, height = asset.size.tolist()
     centre = torch.tensor([0.0, 0.0, height / 2], dtype=torch.float64)
     distance = 1.7 * math.hypot(length, width, height)
-    azimuth, elevation = math.radians({1: 35, 3: 145, 5: 215, 7: 325}[max(corners, key=lambda i: corners[i])]), math.radians(18)
+    azimuth, elevation = math.radians(CORNERS[corner]), math.radians(18)
     direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)
     with torch.no_grad():

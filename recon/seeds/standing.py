@@ -27,7 +27,8 @@ RISES, FURTHER = 0.05, 0.15
 """Tangents of the elevation from which on that is done, and by which it reaches above the highest that is known."""
 
 BESIDE = 2
-"""Columns to either side whose median tells how far a thing is: one beam that met a wire shall not decide."""
+"""Columns to either side whose median, of what a row knows, tells how far a thing is: one beam among others that met a wire shall not
+decide, though one alone above all others does."""
 
 STANDING = 0.002
 """What mistakes weigh. It costs drive 002's held-out pictures some 0.05 dB; twice lidar's own weight (0.01) for all depths costs 0.3."""

@@ -48,13 +48,13 @@ def test_it_ends_at_the_sky_and_does_not_begin_again_behind_it():
     assert np.isfinite(found[26:]).all() and not np.isfinite(found[:26]).any()
 
 
-def test_one_beam_that_met_a_wire_does_not_decide():
-    depth = wall(30, 12.0)
-    depth[28, 15] = 4.0
-    found = upwards(depth, RISE, np.zeros(RISE.shape, bool))
-    assert found[28, 15] == 4.0, "what is measured stays"
-    assert (found[20:27, 15 - BESIDE : 15 + BESIDE + 1] == 4.0).any() or np.isfinite(found[20:27]).all()
-    lone = upwards(depth_with(c15=(30, 12.0)), RISE, np.zeros(RISE.shape, bool))
+def test_one_beam_among_others_that_met_a_wire_does_not_decide():
+    nothing, depth = np.zeros(RISE.shape, bool), wall(30, 12.0)
+    depth[30, 15] = 4.0
+    found = upwards(depth, RISE, nothing)
+    assert found[30, 15] == 4.0, "what is measured stays"
+    assert (found[20:30] == 12.0).all()
+    lone = upwards(depth_with(c15=(30, 12.0)), RISE, nothing)
     assert np.isfinite(lone[29]).sum() == 2 * BESIDE + 1 and not np.isfinite(lone[29, : 15 - BESIDE]).any()
 
 
