@@ -13,9 +13,10 @@ from torch.nn import functional as F
 from enhance.clips import Clip, PairConfig, clip_label
 from enhance.damage import Damage, Sources, make
 from enhance.diffusion_renderer import Relit
-from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, refits, shots_of
+from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed_as, refits, shots_of
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
+from recon.align import as_aligned
 from recon.assets.extract import FEWEST_SPLATS, candidates
 from recon.early import SHORT as EARLY
 from recon.egomask import with_ego_masks
@@ -119,7 +120,8 @@ def prepare_sources(
     log = with_ego_masks(log, names, PairConfig.width)
     less = Less.drawn(seed)
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
-    early = stopped_early(log, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []
+    there, half_done = as_aligned(log, scene.meta), exposed_as(scene, half_done)
+    early = stopped_early(there, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []
     shots = shots_of(as_reconstructed(log, scene), scene) if "underfit" in kinds else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
     made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
@@ -127,7 +129,7 @@ def prepare_sources(
     own = {c.track: c.asset for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS}
     bank = Databank(databank) if databank is not None else None
     stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
-    anywhere = [c.asset for c in found if not c.flaw] + stored
+    anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored
     lit = None if relit is None else Relit(Path(relit))
     return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere)
 

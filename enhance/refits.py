@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from enhance.clips import scene_time
+from recon.align import as_aligned
 from recon.build import assemble, begin, choose
 from recon.fit.fit import FitConfig
 from recon.log import Log, LogCamera, Track
@@ -83,25 +84,32 @@ def refits(
         path = Path(folder) / f"{name}_scene"
         if not is_scene(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _fit(part, path, less.fit, size, device)
+            _fit(part, path, exposed_as(scene, less.fit), size, device)
         loaded = load(path)
         assert isinstance(loaded, Scene)
         made.append(Refit(References(shots_of(part, scene), loaded.to(device)), shown))
     return made
 
 
+def exposed_as(scene: Scene, config: FitConfig) -> FitConfig:
+    """A fit that gives frames exposures of their own only where the scene's have them: its cameras are what shows it."""
+    if any(camera.gains is not None for camera in scene.rig.values()):
+        return config
+    return replace(config, refine=tuple(kind for kind in config.refine if kind != "gains"))
+
+
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
     """The pictures of a recording that `as_reconstructed` brought to the poses of a `scene`, with that scene's exposures."""
     return [
-        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure), partial(camera.image, i), camera.ego_mask)
+        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure_at(int(t))), partial(camera.image, i), camera.ego_mask)
         for name, camera in log.cameras.items()
-        for i in range(len(camera))
+        for i, t in enumerate(camera.times_us)
     ]
 
 
 def as_reconstructed(log: Log, scene: Scene) -> Log:
     """The recording at the poses and by the clocks that the scene's fit corrected, with the scene's cameras only."""
-    cameras = {}
+    log, cameras = as_aligned(log, scene.meta), {}
     for name in scene.rig:
         camera = log.camera(name)
         times = [scene_time(scene, name, int(t)) for t in camera.times_us]

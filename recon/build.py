@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from recon.album import keep_album
+from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
 from recon.fit.fit import Fit, FitConfig, run
 from recon.fit.limbs import Limbs
@@ -99,10 +100,8 @@ def reconstruct(
     checkpoint = checkpoint_path(output)
     saved = load_checkpoint(checkpoint, options) if resume else None
 
-    unseen = held_out_sweeps(log, held_out)
-    seen = tuple(s for s in log.sweeps if s not in unseen)
-    log = annotated(log, replace(log, sweeps=seen).sweeps_within(span))
-    start, fit = begin(replace(log, sweeps=seen), names, span, size, config, held_out, saved[0] if saved else None, device)
+    log = readied(log, fitted(log, held_out).sweeps_within(span), config)
+    start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])
     spent_before = float(saved[1].get("seconds", 0.0)) if saved else 0.0
@@ -129,7 +128,7 @@ def reconstruct(
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(seconds(), 1), "live": live.curve}
     print(table_text(rows), file=sys.stderr)
-    within = [s for s in unseen if span[0] <= s.time_us <= span[1]]
+    within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     if within:
         scene.meta["off_path"] = off_path_table(there, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
@@ -138,6 +137,21 @@ def reconstruct(
         keep_album(there, fit.frames, start.rig, output, steps.step)
     checkpoint.unlink(missing_ok=True)
     return scene
+
+
+def fitted(log: Log, held_out: int) -> Log:
+    """The log without the sweeps against which a scene is measured."""
+    unseen = held_out_sweeps(log, held_out)
+    return replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
+
+
+def readied(log: Log, sweeps: Sequence[Sweep], config: FitConfig) -> Log:
+    """The log with its path corrected where `sweeps` do not meet by it, and the movers that they show where it has no boxes."""
+    if "path" in config.refine:
+        with Progress("sweeps") as steps:
+            log = aligned(log, sweeps, steps.step)
+    places = {s.index for s in sweeps}
+    return annotated(log, [s for s in log.sweeps if s.index in places])
 
 
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
@@ -204,7 +218,7 @@ def begin(
 ) -> tuple[Start, Fit]:
     """What a fit starts from, prepared unless it is given, and the fit on a device before its first step."""
     with Progress("images") as steps:
-        frames = load_frames(log, names, span, size, held_out, steps.step)
+        frames = load_frames(log, names, span, size, held_out, steps.step, "gains" in config.refine)
     if start is None:
         with Progress("prepare") as steps:
             coefficients = (config.sh_degree + 1) ** 2
@@ -248,7 +262,9 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     for c, name in enumerate(fit.frames.names):
         mount, times = fit.motion.mounted(c, [v.time_us for v in fit.frames.views if v.camera == c])
         r = start.rig[name]
-        rig[name] = RigCamera(r.lens, r.width, r.height, mount, fit.exposures[c].detach().cpu().clone(), times)
+        gains = [v.gain.cpu() for v in fit.frames.views if v.camera == c and v.gain is not None]
+        exposure = fit.exposures[c].detach().cpu().clone()
+        rig[name] = RigCamera(r.lens, r.width, r.height, mount, exposure, times, gains=torch.stack(gains) if gains else None)
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
@@ -262,7 +278,9 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         for t in log.tracks
         if not t.moving and t.name.startswith("veh")
     ]
-    sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, 1)))
+    # the darkest picture clips what is brighter than this
+    darkest = min([1.0, *(float(r.gains.min()) for r in rig.values() if r.gains is not None)])
+    sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, 1 / darkest)))
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
     scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy import ndimage
 
 from recon.egomask import at_size, ego_mask
-from recon.gains import picture_gains
+from recon.gains import gains_along, picture_gains
 from recon.log import Log, LogCamera
 from recon.project import project
 from recon.skies import like_sky, sky_mask
-from scenes.camera import Camera
+from scenes.camera import Camera, followed
 from scenes.poses import inverse
+from scenes.trajectory import between
 
 RIM = 6
 """Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
@@ -27,6 +29,16 @@ BLUE = 0.02
 SWEEPS = 16
 """Sweeps, spread over the span, by which is told what is no sky."""
 
+VARIES, LOOKED = 0.12, 4
+"""Spread of the logarithms of a camera's gains from which on each frame has its own, and every which frame shows whether they vary. Those
+of drive 002's right cameras spread by 0.07: that gains nothing there, and a haze makes up for the tints in which other cameras see it."""
+
+PROBED = 3000
+"""Points of a sweep by which exposures are compared, of those within reach."""
+
+REACH = 40.0
+"""Metres up to which these are taken: little comes between them and a camera a second later."""
+
 STRUCK, AROUND = 0.1, 7
 """Part of what looks like sky in so many columns from which on, where lidar strikes it, it is a wall."""
 
@@ -36,7 +48,8 @@ class View:
     """One frame: the camera's place in `Frames.names`, its index in the log, time, uint8 image `[H, W, 3]`; held out or not.
 
     sky: bool `[h, w]`, a coarse mask of what is surely sky. ego: bool `[H, W]`, where its camera always sees the recording car (one tensor
-    for all its views); None where nowhere.
+    for all its views); None where nowhere. gain: float32 `[3]`, how many times as much as its camera's views in the mean it was exposed;
+    None where all were alike.
     """
 
     camera: int
@@ -46,10 +59,18 @@ class View:
     held_out: bool
     sky: torch.Tensor
     ego: torch.Tensor | None = None
+    gain: torch.Tensor | None = None
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its picture on a device."""
-        return replace(self, image=self.image.to(device), sky=self.sky.to(device), ego=None if self.ego is None else self.ego.to(device))
+        ego, gain = (None if t is None else t.to(device) for t in (self.ego, self.gain))
+        return replace(self, image=self.image.to(device), sky=self.sky.to(device), ego=ego, gain=gain)
+
+    def evenly(self, *pixels: np.ndarray) -> np.ndarray:
+        """float32 `[H, W, 3]`, or `[N, 3]` at rows and columns: the image as its camera would have taken it, had it exposed all its views
+        alike; clipped where it is."""
+        image = self.image.numpy()[pixels] / np.float32(255)
+        return image if self.gain is None else image / self.gain.numpy()
 
     def shows_street(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Whether pixels of the image are neither surely sky nor the recording car; bool of the shape of `row` and `column`."""
@@ -88,6 +109,18 @@ class Frames:
         rows, columns = (np.arange(n) * of // n for n, of in zip(found.shape, view.sky.shape, strict=True))
         return found & ndimage.binary_dilation(view.sky.numpy(), iterations=2)[rows[:, None], columns]
 
+    def followed(self, time_us: int) -> torch.Tensor | None:
+        """The gain `[3]` at a time that the cameras have in the mean, None where none varies."""
+        return followed(self._gains, time_us)
+
+    @cached_property
+    def _gains(self) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
+        """Times and gains of each camera's views."""
+        mine = [[v for v in self.views if v.camera == c] for c in range(len(self.names))]
+        gains = [[v.gain.cpu() for v in views if v.gain is not None] for views in mine]
+        times = [torch.tensor([v.time_us for v in views]) for views in mine]
+        return [(t, torch.stack(g) if g else None) for t, g in zip(times, gains, strict=True)]
+
     def of(self, camera: int, held_out: bool = False) -> list[View]:
         return [v for v in self.views if v.camera == camera and v.held_out == held_out]
 
@@ -99,11 +132,13 @@ def load_frames(
     size: tuple[int, int],
     held_out: int,
     report: Callable[[], None] = lambda: None,
+    gains: bool = True,
 ) -> Frames:
     """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
 
-    `report` is called after each. Photos of a log without lidar are brought to one exposure (`picture_gains`). Raises ValueError
-    where a camera has no frame left to train on, or a file does not decode.
+    `report` is called after each. Photos of a log without lidar are brought to one exposure (`picture_gains`); where lidar tells that a
+    camera's exposure follows the light, its views say their `gain`, if `gains` are asked for. Raises ValueError where a camera has no
+    frame left to train on, or a file does not decode.
     """
     first = held_out // 2 if log.points is not None else 0
     views = []
@@ -120,7 +155,11 @@ def load_frames(
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
     views, overcast = _under_their_sky(log, names, views)
-    return Frames(names, *size, views if log.points is None else _balanced(log, names, views), overcast)
+    if log.points is not None:
+        views = _balanced(log, names, views)
+    elif gains:
+        views = _exposed(log, names, views)
+    return Frames(names, *size, views, overcast)
 
 
 def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], bool]:
@@ -174,6 +213,44 @@ def _balanced(log: Log, names: list[str], views: list[View]) -> list[View]:
         shown.append(points[inside])
     gains = picture_gains(colours, shown, len(log.points.xyz))
     return [replace(v, image=divided(v.image, torch.from_numpy(g).float())) for v, g in zip(views, gains, strict=True)]
+
+
+def _exposed(log: Log, names: list[str], views: list[View]) -> list[View]:
+    """The views with their gains, where a camera's vary, which it says; those of held-out views are what their neighbours' make likely."""
+    sweeps = log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views)))
+    if not sweeps:
+        return views
+    known: dict[int, np.ndarray] = {}
+
+    def points(view: View, camera: Camera) -> np.ndarray:
+        nearest = min(sweeps, key=lambda s: abs(s.time_us - view.time_us))
+        if nearest.index not in known:
+            xyz = nearest.read().xyz
+            near = xyz[np.linalg.norm(xyz - camera.world_from_cam[:3, 3].numpy(), axis=1) < REACH]
+            known[nearest.index] = near[:: max(1, len(near) // PROBED)]
+        return known[nearest.index]
+
+    def gains(mine: list[View], name: str) -> np.ndarray:
+        cameras = [log.camera(name).camera(v.index) for v in mine]
+        return gains_along([v.image for v in mine], cameras, [points(v, c) for v, c in zip(mine, cameras, strict=True)])
+
+    out = []
+    for c, name in enumerate(names):
+        mine = [v for v in views if v.camera == c]
+        shown = [v for v in mine if not v.held_out]
+        few = np.log(gains(shown[:: min(LOOKED, 1 + len(shown) // 16)], name))  # NaN where frames so far apart show nothing together
+        varies = np.isnan(few).any() or few.std(0).max() >= VARIES
+        logs = torch.from_numpy(np.log(gains(shown, name))).float() if varies else torch.zeros(0, 3)
+        told = logs.isfinite().all(1)
+        if told.sum() < 2 or logs[told].std(0).max() < VARIES:
+            out += mine
+            continue
+        shown, logs = [v for v, t in zip(shown, told.tolist(), strict=True) if t], logs[told]
+        least, most = logs.mean(1).exp().aminmax()
+        print(f"{name}: its exposure varies, {float(most / least):.1f}-fold; each frame is given its own", file=sys.stderr)
+        times = torch.tensor([v.time_us for v in shown])
+        out += [replace(v, gain=between(times, logs, v.time_us).exp()) for v in mine]
+    return out
 
 
 def divided(image: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:

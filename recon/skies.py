@@ -59,11 +59,11 @@ class SkyPicture:
         self.sum = np.zeros((height, 2 * height, 3))
         self.count = np.zeros((height, 2 * height))
 
-    def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray) -> None:
-        """Count the masked pixels of a uint8 image, divided by its camera's gain."""
+    def add(self, image: np.ndarray, mask: np.ndarray, camera: Camera, gain: np.ndarray, weight: float = 1.0) -> None:
+        """Count the masked pixels of an image `[H, W, 3]` in 0..1, divided by its camera's gain."""
         row, column = (places[mask] for places in _cells(camera, len(self.sum)))
-        np.add.at(self.sum, (row, column), image[mask] / 255 / gain)
-        np.add.at(self.count, (row, column), 1)
+        np.add.at(self.sum, (row, column), weight * image[mask] / gain)
+        np.add.at(self.count, (row, column), weight)
 
     def picture(self) -> torch.Tensor:
         """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too
@@ -128,7 +128,7 @@ def seen_sky(scene: Scene) -> Sky:
     picture = SkyPicture(len(own))
     picture.count = np.where(free > FREE * looks, free, 0)
     picture.sum = own * picture.count[..., None]
-    return Sky(linear_from_srgb(picture.picture().clamp(0, 1)))
+    return Sky(linear_from_srgb(picture.picture().clamp_min(0)))
 
 
 @torch.no_grad()

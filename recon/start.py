@@ -207,7 +207,9 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
             alpha, depth = (t.numpy() for t in draw(placed, camera, "alpha", "depth"))
             covered = (alpha > 0.3) | hidden
             sky = frames.sky_of(view) & ~covered
-            picture.add(view.image.numpy(), sky, camera, gains[c])
+            # of frames that were exposed one by one the darkest show it best: in others it is clipped
+            weight = 1.0 if view.gain is None else float(view.gain.mean()) ** -4
+            picture.add(view.evenly(), sky, camera, gains[c], weight)
             sky = like_sky(view.image.numpy(), sky) & ~covered
             floor = float(ground.height(camera.world_from_cam[:2, 3]))
             depth = np.where(hidden & (alpha < 0.5), np.inf, depth)

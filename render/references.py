@@ -85,8 +85,8 @@ class Shot:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A view from which detail is moved: its camera, the detail `[H, W, 4]`, depth `[H, W]`, inf at the sky, instances `[H, W]` by the
-    frames' ids, and what was placed there by those ids."""
+    """A view from which detail is moved: its camera, the detail `[H, W, 4]` before any exposure, depth `[H, W]`, inf at the sky, instances
+    `[H, W]` by the frames' ids, and what was placed there by those ids."""
 
     camera: Camera
     detail: torch.Tensor
@@ -140,7 +140,8 @@ class References:
             if last is not None:
                 _run_over(carry_over, frame, placed, clear, last, [CARRIED, (detail, wp.vec4)])
             last = _Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
-            difference, trust = detail[..., :3], detail[..., 3].clamp(0, 1)  # where it was carried, a cubic may overshoot
+            trust = detail[..., 3].clamp(0, 1)  # where it was carried, a cubic may overshoot
+            difference = detail[..., :3] * _gain(self.shown, frame)
             reference = torch.addcdiv(frame.rgb, difference, trust.clamp_min(1e-9)[..., None])
             yield replace(frame, reference=reference.clamp_(0, 1), trust=trust)
 
@@ -217,7 +218,8 @@ class References:
             if shot.ego is not None:
                 ego = torch.from_numpy(shot.ego).to(device)[None, None].float()
                 instance = torch.where(F.interpolate(ego, instance.shape)[0, 0] > 0, GONE, instance)
-            self.kept[key] = _Seen.of(frame, F.pad(photo - frame.rgb.clamp(0, 1), (0, 1)), instance, placed)
+            differs = (photo - frame.rgb.clamp(0, 1)) / _gain(self.recorded, frame)
+            self.kept[key] = _Seen.of(frame, F.pad(differs, (0, 1)), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:
             self.kept.popitem(last=False)
@@ -235,6 +237,17 @@ def _run_over(kernel: wp.Kernel, frame: Frame, placed: list[Placed], clear: torc
         here.pixels, here.depths = wp.from_torch(found.pixels, wp.vec2d), wp.from_torch(found.depth)
         here.instance, here.clear = wp.from_torch(instance), wp.from_torch(clear, wp.bool)
         run(kernel, clear.numel(), [other, here, HIDES, *(view(*t) if isinstance(t, tuple) else t for t in told)], clear.device)
+
+
+def _gain(scene: Scene, frame: Frame) -> torch.Tensor:
+    """How many times as bright as a scene's splats are they are shown, `[H, W, 3]` or `[3]`: what a photo adds is shown alike."""
+    assert frame.rgb is not None and frame.instance is not None
+    exposure, followed = frame.camera.exposure, scene.followed(frame.camera.time_us)
+    gain = torch.ones(3) if exposure is None else exposure[:, :3].diagonal().clamp_min(0.05)
+    if followed is None:
+        return gain.to(frame.rgb)
+    lit = torch.stack([gain, *(gain / followed if actor.recorded else gain for actor in scene.actors)])
+    return lit.to(frame.rgb)[frame.instance.long().clamp_min(0)]
 
 
 def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:

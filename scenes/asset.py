@@ -40,6 +40,11 @@ class Actor:
     deformation: Deformation | None = None
 
     @property
+    def recorded(self) -> bool:
+        """Whether its splats were seen on this drive: those of a databank have an id there."""
+        return not self.asset.meta.get("inserted") and "id" not in self.asset.meta
+
+    @property
     def anew(self) -> bool:
         """Whether it was put in or edited, so that no photo shows it as it stands, in its light and with its shadow."""
         return bool(self.asset.meta.get("inserted") or self.asset.meta.get("edited"))

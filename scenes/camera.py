@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -9,7 +10,7 @@ import torch
 from scenes.checks import check_tensor
 from scenes.lenses import Lens
 from scenes.poses import as_pose
-from scenes.trajectory import Trajectory
+from scenes.trajectory import Trajectory, between
 
 SHUTTERS = ("global", "rows", "columns")
 
@@ -70,10 +71,21 @@ class Camera:
         return torch.stack([x, y], -1) + 0.5
 
 
+def followed(frames: Iterable[tuple[torch.Tensor, torch.Tensor | None]], time_us: int) -> torch.Tensor | None:
+    """The gain `[3]` at a time that cameras have in the mean, of their frames' times `[F]` and gains `[F, 3]`; None where none varies.
+
+    Exposure follows the light, and so does what drives along: from the shade into the sun it looks in pictures as it did.
+    """
+    known = [None if gains is None else between(times, gains.log(), time_us) for times, gains in frames]
+    varied = [log for log in known if log is not None]
+    return (sum(varied[1:], varied[0]) / len(known)).exp() if varied else None
+
+
 @dataclass(frozen=True)
 class RigCamera:
     """A camera fixed to the body: `body_from_cam` float64 `[4, 4]`, affine exposure `[3, 4]`, and when it took its frames.
 
+    gains float32 `[F, 3]`, of frames that were exposed one by one: how many times as much as `exposure` each was; None where all alike.
     shutter "rows" or "columns": an image is read out over `readout_us` from its time on, top (left) edge first; negative: that one last, at
     its time.
     """
@@ -86,6 +98,7 @@ class RigCamera:
     times_us: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     shutter: str = "global"
     readout_us: int = 0
+    gains: torch.Tensor | None = None
 
     def __post_init__(self):
         check_size(self.width, self.height)
@@ -94,11 +107,19 @@ class RigCamera:
         check_tensor("body_from_cam", self.body_from_cam, (4, 4), torch.float64)
         check_tensor("exposure", self.exposure, (3, 4))
         check_tensor("times_us", self.times_us, ("F",), torch.int64)
+        if self.gains is not None:
+            check_tensor("gains", self.gains, (max(1, len(self.times_us)), 3), torch.float32)
+
+    def exposure_at(self, time_us: int) -> torch.Tensor:
+        """The affine exposure `[3, 4]` at a time: between frames the logarithms of their gains are linear, beyond they stay."""
+        if self.gains is None:
+            return self.exposure
+        return between(self.times_us, self.gains.log(), time_us).exp()[:, None] * self.exposure
 
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
         """The camera of a body that stands at a pose while the image is read out."""
         world_from_cam = world_from_body @ self.body_from_cam
-        return Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure)
+        return Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure_at(time_us))
 
     def along(self, ego: Trajectory, time_us: int) -> Camera:
         """The camera of a body on its way, from `time_us` on. ValueError for a time off the path."""

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from scenes.checks import check_tensor
+from scenes.trajectory import between
 
 RETURNS = 8
 """Steps towards where a point stood before a lattice moved it: each leaves what the displacement changes over its own length."""
@@ -102,16 +103,6 @@ class Deformation:
     def to(self, device) -> Deformation:
         """With its lattices on a device; corners and times stay where they are."""
         return replace(self, modes=self.modes.to(device), weights=self.weights.to(device))
-
-
-def between(times_us: torch.Tensor, values: torch.Tensor, time_us: int) -> torch.Tensor:
-    """Values `[T, ...]` at a time: linear between `times_us` `[T]`, held beyond."""
-    if len(times_us) == 1:
-        return values[0]
-    later = int(torch.searchsorted(times_us, int(time_us)).clamp(1, len(times_us) - 1))
-    first, last = times_us[later - 1 : later + 1].tolist()
-    share = min(max((int(time_us) - first) / (last - first), 0.0), 1.0)
-    return values[later - 1] * (1 - share) + values[later] * share
 
 
 def _check_corners(corners: torch.Tensor) -> None:

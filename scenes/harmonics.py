@@ -21,6 +21,11 @@ def rgb_from_sh(dc):
     return dc * C0 + 0.5
 
 
+def brighter(sh: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
+    """Coefficients `[N, K, 3]` of colours so many `times` `[3]` as bright."""
+    return torch.cat([sh[:, :1] * times + sh_from_rgb(0.5 * times), sh[:, 1:] * times], 1)
+
+
 def basis(directions: torch.Tensor, count: int) -> torch.Tensor:
     """The first `count` (1, 4, 9, 16) basis functions `[..., count]` at unit directions `[..., 3]`."""
     x, y, z = directions.unbind(-1)

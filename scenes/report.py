@@ -210,6 +210,8 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
             yield f"{where}: camera {name} took {len(early)} frames when the body's pose is unknown, the first at {early[0]} us"
         if not torch.isfinite(camera.exposure).all():
             yield f"{where}: the exposure of camera {name} is not finite"
+        if camera.gains is not None and not (camera.gains.isfinite() & (camera.gains > 0)).all():
+            yield f"{where}: camera {name} has a frame whose gain is not a positive number"
     if scene.ground is not None and not torch.isfinite(scene.ground.heights).all():
         yield f"{where}: the ground has heights that are not finite"
     for edit in scene.meta.get("edits", []):

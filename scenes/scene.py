@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from scenes.asset import Actor
-from scenes.camera import Camera, RigCamera
+from scenes.camera import Camera, RigCamera, followed
 from scenes.deformation import Lattice
-from scenes.gaussians import Placed, SplatModel
+from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
+from scenes.harmonics import brighter
 from scenes.names import unknown
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory, all_at
@@ -63,21 +64,33 @@ class Scene:
         times = self.rig_camera(name).times_us
         return times if len(times) else self.ego.times_us
 
+    def followed(self, time_us: int) -> torch.Tensor | None:
+        """How much more the cameras were exposed at a time than in the mean, `[3]`; None where that does not vary."""
+        return followed([(c.times_us, c.gains) for c in self.rig.values()], time_us)
+
     def anew(self) -> list[int]:
         """Instance ids of the actors that were put in or edited."""
         return [i + 1 for i, actor in enumerate(self.actors) if actor.anew]
 
     def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:
         """Background and the actors that exist at a time, each at its pose and under its instance id; with the pose to which it
-        moves while an image is read out, where that takes `readout_us`. What deforms stands as in the middle of it."""
+        moves while an image is read out, where that takes `readout_us`. What deforms stands as in the middle of it; recorded actors are
+        as bright as the cameras' exposures say that their light is (`followed`)."""
         here = [(i, a) for i, a in enumerate(self.actors) if a.trajectory.covers(time_us)]
         poses = all_at([a.trajectory for _, a in here], time_us)
+        gain = self.followed(time_us)
         actors = [
-            Placed(a.asset.gaussians, pose, _end(a, time_us, readout_us), instance=i + 1) for (i, a), pose in zip(here, poses, strict=True)
+            Placed(dimmed(a.asset.gaussians, gain) if a.recorded else a.asset.gaussians, pose, _end(a, time_us, readout_us), instance=i + 1)
+            for (i, a), pose in zip(here, poses, strict=True)
         ]
         middle = time_us + readout_us // 2
         bent = [p if a.deformation is None else bend(p, a.deformation.at(middle)) for (_, a), p in zip(here, actors, strict=True)]
         return [self.background, *bent]
+
+
+def dimmed(splats: Gaussians, gain: torch.Tensor | None) -> Gaussians:
+    """Splats so much less bright as cameras were exposed more, by a gain `[3]`; as they are where that is None."""
+    return splats if gain is None else replace(splats, sh=brighter(splats.sh, 1 / gain.to(splats.sh)))
 
 
 def bend(placed: Placed, lattice: Lattice) -> Placed:

@@ -94,3 +94,13 @@ def all_at(trajectories: Sequence[Trajectory], time_us: int) -> list[torch.Tenso
         ):
             poses[i] = pose
     return poses
+
+
+def between(times_us: torch.Tensor, values: torch.Tensor, time_us: int) -> torch.Tensor:
+    """Values `[T, ...]` at a time: linear between `times_us` `[T]`, held beyond."""
+    if len(times_us) == 1:
+        return values[0]
+    later = int(torch.searchsorted(times_us, int(time_us)).clamp(1, len(times_us) - 1))
+    first, last = times_us[later - 1 : later + 1].tolist()
+    share = min(max((int(time_us) - first) / max(last - first, 1), 0.0), 1.0)
+    return values[later - 1] * (1 - share) + values[later] * share

@@ -222,7 +222,8 @@ def _load_camera(stage: Usd.Stage, entry: dict, name: str) -> RigCamera:
     exposure = torch.tensor(entry["exposure"], dtype=torch.float32)
     times = torch.tensor(entry["times_us"], dtype=torch.int64)
     shutter = entry.get("shutter", "global"), entry.get("readout_us", 0)  # absent from scenes of before
-    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], local_pose(prim) @ _FLIP, exposure, times, *shutter)
+    gains = None if entry.get("gains") is None else torch.tensor(entry["gains"], dtype=torch.float32)
+    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], local_pose(prim) @ _FLIP, exposure, times, *shutter, gains)
 
 
 def _metadata(scene: Scene, cameras: dict[str, str], origin: int) -> str:
@@ -236,6 +237,7 @@ def _metadata(scene: Scene, cameras: dict[str, str], origin: int) -> str:
             "times_us": c.times_us.tolist(),
             "shutter": c.shutter,
             "readout_us": c.readout_us,
+            "gains": None if c.gains is None else c.gains.detach().cpu().tolist(),
         }
         for name, c in scene.rig.items()
     }

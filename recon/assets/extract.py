@@ -23,7 +23,7 @@ from scenes.harmonics import rgb_from_sh, turned
 from scenes.lenses import Pinhole
 from scenes.match import ground_linear
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
-from scenes.scene import Scene
+from scenes.scene import Scene, dimmed
 from scenes.seen import SECTORS, sector, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
@@ -49,11 +49,19 @@ CORNERS = {3: 145, 1: 35, 5: 215, 7: 325}
 
 @dataclass(frozen=True)
 class Candidate:
-    """A cut object before it is judged: its asset, its track, and why it is not good enough, or ''."""
+    """A cut object before it is judged: its asset as its scene holds it, its track, and why it is not good enough, or ''.
+
+    gain `[3]`: of a mover, how much more the cameras were exposed half way than in the mean; None where that does not vary.
+    """
 
     asset: Asset
     track: str
     flaw: str
+    gain: torch.Tensor | None = None
+
+    def evenly_lit(self) -> Asset:
+        """The asset as bright as what stands: a scene's own movers are as bright as exposures say that their light is."""
+        return replace(self.asset, gaussians=dimmed(self.asset.gaussians, self.gain))
 
 
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
@@ -73,7 +81,8 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
         if candidate.flaw:
             print(f"left out {candidate.track} ({candidate.asset.label}): {candidate.flaw}", file=sys.stderr)
         else:
-            ids.append(bank.add(candidate.asset, thumbnail(candidate.asset)))
+            asset = candidate.evenly_lit()
+            ids.append(bank.add(asset, thumbnail(asset)))
     if not ids:
         raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")
     return ids
@@ -86,10 +95,11 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     for actor in scene.actors:
         if actor.asset.meta.get("inserted"):
             continue  # it came from a databank
-        cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
         sight = seen(scene, actor.trajectory, actor.asset.size)
-        middle = actor.trajectory.world_from_body[len(actor.trajectory) // 2]
-        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True} | _ground(scene, middle), sight)
+        half = len(actor.trajectory) // 2
+        middle, gain = actor.trajectory.world_from_body[half], scene.followed(int(actor.trajectory.times_us[half]))
+        cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
+        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True} | _ground(scene, middle), sight, gain)
     for entry in scene.meta.get("parked", []):
         world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
         size = torch.tensor(entry["size"], dtype=torch.float64)
@@ -163,7 +173,7 @@ def shown_colours(splats: Gaussians) -> dict[str, list[float]]:
     return {name: [round(v, 4) for v in row.tolist()] for name, row in rows.items()}
 
 
-def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate:
+def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight, gain: torch.Tensor | None = None) -> Candidate:
     flaw = ""
     if sight.views < FEWEST_VIEWS:
         flaw = f"{sight.views} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
@@ -174,8 +184,8 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight) -> Candidate
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
     meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
-    meta["exposure"] = shown_colours(whole)
-    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw)
+    meta["exposure"] = shown_colours(dimmed(whole, gain))
+    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, gain)
 
 
 def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:

@@ -19,6 +19,9 @@ from recon.fit.model import FIELDS, Splats
 from recon.kernels.descent import BETA1, BETA2, Rates, catch_up, descend
 from render.launch import run, stage, view
 
+COLOURS = 11
+"""The first of a splat's numbers, in the order of the fields, that is a colour's."""
+
 _TYPES = (wp.vec3, wp.vec4, wp.vec3, float, wp.vec3)
 
 
@@ -42,6 +45,10 @@ class Descent:
         with stage(which.device):
             args = [view(which, wp.int64), rates, sh_count, *_fields(splats), view(self.moments, float), view(self.last, float)]
             run(catch_up, len(which), args, which.device)
+
+    def still_colours(self, which: torch.Tensor) -> None:
+        """Take their momentum from the colours of splats `which`, bool `[N]`."""
+        self.moments[which, :, COLOURS:] = 0
 
     def follow(self, splats: Splats, which: torch.Tensor, shown: Splats, rates: Rates, growth: Growth) -> None:
         """Move splats `which` `[M]`, which have caught up, along the gradients of `shown`, copies of theirs, and tell `growth`."""

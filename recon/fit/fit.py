@@ -19,6 +19,7 @@ from recon.fit.losses import PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
 from recon.fit.motion import REFINED, Moment, Motion
 from recon.fit.sight import Eye, in_sight
+from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames, View
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -30,6 +31,7 @@ from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
+from scenes.scene import dimmed
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,10 @@ class FitConfig:
     """Steps between densifications."""
     grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
-    refine: tuple[str, ...] = (*REFINED, "exposures", "limbs")
-    """What is corrected besides the splats and the sky: poses and clocks by kind, the cameras' exposures against the first's, and how the
-    limbs of people and animals stand."""
+    refine: tuple[str, ...] = ("path", "gains", *REFINED, "exposures", "limbs")
+    """What is corrected besides the splats and the sky: before the fit the body's path by lidar (`recon/align.py`) and how frames were
+    exposed, by what several show (`recon/gains.py`); in it poses and clocks by kind, the cameras' exposures against the first's, and how
+    the limbs of people and animals stand."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
     dissimilarity: float = 0.2
@@ -86,8 +89,14 @@ looked at, and its weight."""
 SKY_LOOKS = 40
 """Pictures of a camera by which it is known where the sky is never seen."""
 
+GUESSED_FROM = 0.8
+"""Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
+
 HORIZON = -0.01
 """Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
+
+CLIPPED = 0.99
+"""Colours of pictures from which on they may be clipped."""
 
 FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
@@ -128,6 +137,9 @@ class Fit:
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
         self._hidden = self._never_sky()
+        gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
+        self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
+        self.guessed: torch.Tensor | None = None
         self._optimise()
 
     def _chances(self) -> torch.Tensor:
@@ -160,6 +172,8 @@ class Fit:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
             self._grow()
+        if self.guessed is None and self.progress >= GUESSED_FROM:
+            self._guess()
         view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
         camera = self.motion.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
@@ -175,6 +189,8 @@ class Fit:
         rgb, alpha, depth = self._render(by_lot, view, camera, ends, shift, bool(known))
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
+        if view.gain is not None:
+            rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
@@ -187,6 +203,9 @@ class Fit:
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
         torch.autograd.backward([cost for cost in (whole, self.motion.unrest()) if cost.requires_grad])
+        colours = shown.fields["sh"].grad
+        if self.guessed is not None and colours is not None:
+            colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self._follow()
@@ -227,7 +246,12 @@ class Fit:
         shift: of the sky's samples (`developed`)."""
         placed = self._placed(shown, view, camera)
         rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
-        return developed(rgb, alpha, self.sky, self.exposures[view.camera], camera, shift), alpha, depth[0] if depth else None
+        return developed(rgb, alpha, self.sky, self._exposure(view), camera, shift), alpha, depth[0] if depth else None
+
+    def _exposure(self, view: View) -> torch.Tensor:
+        """The affine exposure `[3, 4]` of a view: its camera's, as many times as it was exposed."""
+        exposure = self.exposures[view.camera]
+        return exposure if view.gain is None else view.gain[:, None] * exposure
 
     def _drawn_by_lot(self, shown: Splats) -> Splats:
         """Without `drop` of them, which rises over the first four fifths of the fit; the mean of all draws is as dense as all are."""
@@ -242,6 +266,8 @@ class Fit:
     def _placed(self, shown: Splats, view: View, camera: Camera) -> list[Placed]:
         """The splats in sight where they are at a view's moment."""
         placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
+        gain = self._followed[view.time_us]
+        placed = [placed[0], *(replace(p, gaussians=dimmed(p.gaussians, gain)) for p in placed[1:])]
         return self.limbs.bent(placed, view.time_us)
 
     def _never_sky(self) -> torch.Tensor:
@@ -271,6 +297,18 @@ class Fit:
         (alpha,) = draw(placed, camera, "alpha")
         directions = world_directions(camera, self.device)
         return ((1 - alpha) * ((directions[..., 2] < HORIZON) | self._hidden[cells(directions, len(self._hidden))])).mean()
+
+    @torch.no_grad()
+    def _guess(self) -> None:
+        """Give what pictures hardly show its neighbours' colours, to keep."""
+        part = torch.zeros_like(self.splats.reach)
+        for view in self.training:
+            camera = self.motion.camera(view).resized(*self._size(4))
+            which = self._in_sight(view, camera, [], None)
+            shown = torch.cat(shown_parts(self._placed(self.splats.select(which, 1), view, camera), camera))
+            part[which] = torch.maximum(part[which], shown)
+        self.guessed = as_neighbours(self.splats, part)
+        self.descent.still_colours(self.guessed)
 
     def _size(self, shrink: int) -> tuple[int, int]:
         return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
@@ -325,7 +363,7 @@ class Fit:
         """Split where the gradient pulls, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
-        self.growth, self.descent = Growth.none(len(self.splats), self.device), Descent(**carried)
+        self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None
 
     # ---- checkpoints
 
@@ -337,6 +375,7 @@ class Fit:
             "reach": self.splats.reach,
             "growth": self.growth.tensors(),
             "descent": self.descent.tensors(),
+            "guessed": self.guessed,
             "sky": self.sky.detach(),
             "first_sky": self.first_sky,
             "exposures": self.exposures.detach(),
@@ -352,6 +391,7 @@ class Fit:
         """Go on from `tensors()` of another run, on whichever device: the same steps follow as would have followed there."""
         self.splats = Splats(state["fields"], state["sizes"], state["reach"]).to(self.device)
         self.growth, self.descent = Growth(**self._here(state["growth"])), Descent(**self._here(state["descent"]))
+        self.guessed = None if state["guessed"] is None else state["guessed"].to(self.device)
         self.sky, self.first_sky, self.exposures = self._here({k: state[k] for k in ("sky", "first_sky", "exposures")}).values()
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])

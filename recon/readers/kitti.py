@@ -56,7 +56,10 @@ def read_kitti_raw(path: Path) -> Log:
     poses[:, :3, 3] -= origin
     ego = lengthened(times, poses)
     cameras = {}
-    for folder in sorted(path.glob("image_0[0-3]")):
+    recorded = [folder for folder in sorted(path.glob("image_0[0-3]")) if any((folder / "data").glob("*.png"))]
+    if not recorded:
+        raise FileNotFoundError(f"{path} has no pictures in image_00/data to image_03/data; fetch one camera's at least")
+    for folder in recorded:  # some fetch no more than image_02, of the others there are time stamps alone
         projection = _named(cams, f"P_rect_{folder.name[-2:]}", 12, above / "calib_cam_to_cam.txt")
         body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
         stamps = _stamps(folder / "timestamps.txt")

@@ -46,7 +46,7 @@ def unexplained(
     down = np.minimum(rays @ pose[2, :3], -1e-3)
     z = np.minimum(z, np.maximum(0.5, (floor - pose[2, 3]) / down))
     local = rays * z[:, None]
-    colour = ndimage.uniform_filter(view.image.numpy().astype(np.float32) / 255, (STEP, STEP, 1))[rows[want], columns[want]] / gain
+    colour = ndimage.uniform_filter(view.evenly(), (STEP, STEP, 1))[rows[want], columns[want]] / gain
     return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / camera.lens.focal()[0]
 
 

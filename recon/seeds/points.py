@@ -67,7 +67,8 @@ def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, mov
                 seen &= z <= nearest_box(cam, movers)[row, column]
             # a point whose pixel is sky stands on an edge that the pixel misses
             seen &= view.shows_street(row, column)
-            out[c, mine[seen]] = view.image.numpy()[row[seen], column[seen]] / np.float32(255)
+            gain = frames.followed(view.time_us) if local_pose is not None else None
+            out[c, mine[seen]] = view.evenly(row[seen], column[seen]) * (1 if gain is None else gain.numpy())
     return out
 
 

@@ -28,7 +28,8 @@ RISES, FURTHER = 0.05, 0.15
 
 BESIDE = 2
 """Columns to either side whose median, of what a row knows, tells how far a thing is: one beam among others that met a wire shall not
-decide, though one alone above all others does."""
+decide, though one alone above all others does. Where beams of drive 002's three front cameras are held back, 1.8 % of the pixels are then
+more than a tenth off; 5.0 % if what stands below had a say, too."""
 
 STANDING = 0.002
 """What mistakes weigh. It costs drive 002's held-out pictures some 0.05 dB; twice lidar's own weight (0.01) for all depths costs 0.3."""

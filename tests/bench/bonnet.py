@@ -71,7 +71,7 @@ def main() -> None:
     }
     print(f"{'':<30} {'above the bonnet':>17} {'behind it':>10} {'mask':>7}   (dB; part of the picture)")
     for row, drive in drives.items():
-        scene, frames, rig, _ = fitted(drive, config, [name], size)
+        scene, frames, rig, *_ = fitted(drive, config, [name], size)
         times = scene.frame_times(name).tolist()
         figures = []
         for view in frames.of(0, held_out=True):

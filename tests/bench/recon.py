@@ -25,7 +25,8 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.build import HELD_OUT, annotated, assemble, begin, choose, fit_config
+from recon.align import as_aligned
+from recon.build import HELD_OUT, annotated, assemble, begin, choose, fit_config, readied
 from recon.fit.fit import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Sweep, Track
@@ -164,15 +165,16 @@ def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: dict[st
     return {r["camera"]: r["psnr"] for r in rows} | {of: masked_psnr(scene, frames, rig, m) for of, m in masks.items()}
 
 
-def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float]:
-    """The fitted scene, the frames, the log's cameras, and CPU seconds of the fit."""
+def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float, Log]:
+    """The fitted scene, the frames, the log's cameras, CPU seconds of the fit, and the log by its corrected path."""
     _, span = choose(log, names)
+    log = readied(log, log.sweeps_within(span), config)
     start, fit = begin(log, names, span, size, config)
     began = time.process_time()
     while fit.step_count < config.steps:
         fit.step()
     spent = time.process_time() - began
-    return assemble(fit, start, log), fit.frames, start.rig, spent
+    return assemble(fit, start, log), fit.frames, start.rig, spent, log
 
 
 def depth_errors(scene: Scene, log: Log, sweeps: list[Sweep]) -> str:
@@ -204,7 +206,7 @@ def main() -> None:
     names, span = choose(log, asked.cameras)
     unseen = held_out_sweeps(log, HELD_OUT)
     log, whole_log = replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen)), log
-    asked_about = [s for s in unseen if span[0] <= s.time_us <= span[1]]
+    asked_about = {s.index for s in unseen if span[0] <= s.time_us <= span[1]}
     config = replace(fit_config(log, names), steps=asked.steps, budget=asked.splats, seed=asked.seed)
     size = (192, 108) if str(asked.drive) == "walk" else (asked.size[0], asked.size[1])
     moving = [t for t in log.tracks if t.moving]
@@ -215,13 +217,14 @@ def main() -> None:
     masks: dict[str, Masks] = {}
     for what in ("", *asked.only):
         setting: Setting = PARTS[what](log, config) if what else (log, config)
-        scene, frames, rig, spent = fitted(*setting, names, size)
+        scene, frames, rig, spent, used = fitted(*setting, names, size)
         with torch.no_grad():
             masks = masks or {of: shown(scene, tracks, frames) for of, tracks in counted.items()}
         found = told(scene, frames, rig, masks)
         whole = whole or found
         cells = ["-" if math.isnan(found[n]) else f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in columns]
-        depth = depth_errors(scene, whole_log, asked_about)
+        there = as_aligned(whole_log, used.meta)
+        depth = depth_errors(scene, there, [s for s in there.sweeps if s.index in asked_about])
         print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in cells) + f"{depth:>14}{spent:>8.0f}", flush=True)
 
 

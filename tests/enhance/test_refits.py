@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from made_drive import write_drive
 
-from enhance.refits import SHORT, Less, as_reconstructed, by_turns, refits, rendered_aside, thinned
+from enhance.refits import SHORT, Less, as_reconstructed, by_turns, exposed_as, refits, rendered_aside, thinned
 from recon import open_log
+from recon.align import MOVED
 from recon.fit.fit import Fit
 from render import render_frame
 from render.compare import psnr
@@ -38,6 +40,22 @@ def test_a_recording_gets_the_scenes_poses(log, street):
     for name, camera in corrected.cameras.items():
         for pose, t in zip(camera.world_from_cam, camera.times_us.tolist(), strict=True):
             assert torch.allclose(pose, street.camera(name, t).world_from_cam)
+
+
+def test_a_recording_is_moved_as_its_scene_was(log, street):
+    up = torch.eye(4, dtype=torch.float64)
+    up[2, 3] = 0.5
+    meta = {**street.meta, MOVED: {"times_us": [0], "poses": [up.flatten().tolist()]}}
+    moved = as_reconstructed(log, replace(street, meta=meta))
+    for before, after in zip(log.sweeps, moved.sweeps, strict=True):
+        np.testing.assert_allclose(after.read().xyz - before.read().xyz, np.tile([0, 0, 0.5], (len(before.read().xyz), 1)), atol=1e-9)
+    assert torch.equal(moved.ego.world_from_body, street.ego.world_from_body), "of cameras and body the scene itself knows better"
+
+
+def test_a_refit_gives_frames_exposures_of_their_own_where_its_scene_does(street):
+    rig = {name: replace(c, gains=torch.ones(len(c.times_us), 3)) for name, c in street.rig.items()}
+    assert "gains" in SHORT.refine and "gains" not in exposed_as(street, SHORT).refine
+    assert exposed_as(replace(street, rig=rig), SHORT) is SHORT
 
 
 def test_the_cycles_pictures_are_taken_from_beside_the_path(log, street, tmp_path):

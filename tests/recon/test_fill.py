@@ -58,7 +58,7 @@ def test_gaps_that_look_like_the_sky_beside_them_are_sky():
 def test_the_sky_picture_shows_what_was_seen_and_spreads_it():
     sky = SkyPicture(32)
     image = house_under_sky()
-    sky.add(image, sky_mask(image), camera(), np.array([0.5, 1.0, 1.0]))
+    sky.add(image / 255, sky_mask(image), camera(), np.array([0.5, 1.0, 1.0]))
     picture = sky.picture()
     assert picture.shape == (32, 64, 3) and torch.isfinite(picture).all()
     np.testing.assert_allclose(picture[0, 0], [140 / 255 / 0.5, 160 / 255, 200 / 255], atol=1e-3)

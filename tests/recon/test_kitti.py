@@ -110,6 +110,14 @@ def test_a_drive_without_tracklets_or_lidar_is_a_drive(own):
     assert log.tracks == () and log.sweeps == ()
 
 
+def test_cameras_of_which_nothing_was_fetched_are_left_out(own):
+    shutil.rmtree(own / "image_02" / "data")
+    assert list(open_log(own).cameras) == ["image_03"]
+    shutil.rmtree(own / "image_03" / "data")
+    with pytest.raises(FileNotFoundError, match="no pictures in image_00/data to image_03/data; fetch"):
+        open_log(own)
+
+
 def test_an_unsynced_drive_is_refused_with_the_fix(own):
     extract = own.rename(own.with_name("2011_09_26_drive_0001_extract"))
     with pytest.raises(ValueError, match="fetch its _sync folder"):

@@ -88,6 +88,21 @@ def test_of_the_recording_car_in_a_photo_nothing_is_carried_over(street, unclear
     assert (untold.reference[low] - found.rgb[low]).max() > 0.3
 
 
+def test_what_a_photo_adds_is_exposed_as_the_frame_is(street, unclear):
+    """A camera that follows the light: photos exposed by a half less add as much to a frame as if all had been taken alike."""
+    rig, times = unclear.rig_camera(CAMERA), unclear.frame_times(CAMERA)
+    gains = torch.ones(len(rig.times_us), 3)
+    gains[:3] = 0.5
+    following = [replace(s, rig={**s.rig, CAMERA: replace(rig, gains=gains)}) for s in (street, unclear)]
+    (alike,) = References(shots(street, (0, 1, 2)), unclear).along(views(unclear, times[3:4]))
+    (found,) = References(shots(following[0], (0, 1, 2)), following[1]).along(views(following[1], times[3:4]))
+    assert torch.equal(found.rgb, alike.rgb) and (found.trust - alike.trust).abs().max() < 0.05
+    added, wanted = ((f.reference - f.rgb) * f.trust[..., None] for f in (found, alike))
+    for shown in (found.instance == 0, found.instance == 1):  # the street, and who drives along, who is lit as the exposure follows
+        assert wanted[shown].square().sum() > 1e-3
+        assert float((added * wanted)[shown].sum() / wanted[shown].square().sum()) == pytest.approx(1, abs=0.1)
+
+
 def test_without_photos_nothing_is_trusted(street):
     (frame,) = References([], street).along(views(street, street.frame_times(CAMERA)[:1]))
     assert not frame.trust.any() and torch.equal(frame.reference, frame.rgb.clamp(0, 1))

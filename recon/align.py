@@ -1,0 +1,242 @@
+"""A drive whose lidar sweeps do not meet where its recorded poses put them: the path is bent until they do.
+
+Heights by GPS drift by decimetres within seconds (KITTI), or are not recorded at all (nuScenes), and splats made from such sweeps lie in
+layers. Every sweep is laid on others that saw the same surfaces, point to plane (Chen and Medioni 1992), and all poses are found
+together, as a pose graph whose steps recorded poses hold: what sweeps do not tell, as the way along a bare road, stays as it was.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from recon.fit.model import small_poses
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from scenes.trajectory import Trajectory
+
+APART = (1, 3, 9, 27)
+"""Sweeps apart that are laid on one another."""
+
+CELL, FARTHEST = 0.25, 60.0
+"""Metres: a sweep keeps one point of each such cell, and none from farther off."""
+
+KEPT = 8000
+"""Of these, spread over all, about as many are asked for the surface there."""
+
+NEIGHBOURS, FLAT = 12, 0.1
+"""Points that span a surface, and its thickness at most, in parts of its smaller extent; so much of the larger that has to be, too, or the
+points lie on one of the lidar's rings and may span anything."""
+
+TOGETHER_US = 25_000
+"""Sweeps that begin within so much time are one: a car's lidars turn together."""
+
+MOVED = "path_correction"
+"""In the meta of a log and of scenes fitted to it: by which poses, at which times, the recorded world was moved."""
+
+SAMPLES = 1500
+"""Points of a sweep that are laid on another one."""
+
+REACH = (1.0, 0.7, 0.5, 0.3, 0.3)
+"""Metres up to which a surface is looked for, round by round."""
+
+ALIKE = 20.0
+"""Neighbouring points err alike: so many count as one."""
+
+STEP = (3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)
+"""Radians and metres by which the correction of one sweep is likely to differ from the next one's."""
+
+WHOLE = (0.05, 0.05, 0.05, 2.0, 2.0, 2.0)
+"""The same of a correction itself."""
+
+PROBE = 4
+"""Every which sweep is looked at to see whether anything is to be done."""
+
+WORTH = 0.03
+"""Metres by which corrections must differ over the sweeps that are laid on one another for them to be made."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Points `[N, 3]` of a sweep where a surface is flat, its normals there, and where the body stood, in the world as recorded."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    centre: np.ndarray
+    tree: cKDTree
+
+    @staticmethod
+    def of(xyz: np.ndarray, centre: np.ndarray) -> Surfaces:
+        near = xyz[np.linalg.norm(xyz - centre, axis=1) < FARTHEST]
+        cells = np.floor((near - centre) / CELL).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
+        thin = near[np.unique(cells, return_index=True)[1]]
+        if len(thin) < NEIGHBOURS:
+            return Surfaces(thin[:0], thin[:0], centre, cKDTree(np.zeros((1, 3))))
+        some = thin[:: max(1, len(thin) // KEPT)]
+        around = thin[cKDTree(thin).query(some, NEIGHBOURS)[1]]
+        around -= around.mean(1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+        extent = np.sqrt(values.clip(0))
+        flat = (extent[:, 0] < FLAT * extent[:, 1]) & (extent[:, 1] > FLAT * extent[:, 2])
+        kept = some[flat]
+        return Surfaces(kept, vectors[flat, :, 0], centre, cKDTree(kept if len(kept) else np.zeros((1, 3))))
+
+
+def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
+    """The log with its body's path, cameras, sweeps and boxes moved to where `sweeps` meet one another; as it is where they do already.
+
+    `report` is called for each sweep. Corrections are interpolated between sweeps and go on beyond the first and the last.
+    """
+    kept: dict[int, Surfaces] = {}
+
+    def surfaces(some: Sequence[list[Sweep]]) -> list[Surfaces]:
+        for turn in some:
+            if turn[0].index not in kept:
+                xyz = np.concatenate([sweep.read().xyz for sweep in turn])
+                kept[turn[0].index] = Surfaces.of(xyz, log.ego.near(turn[0].time_us)[:3, 3].numpy())
+                report()
+        return [kept[turn[0].index] for turn in some]
+
+    turns = _turns(sweeps)
+    if len(turns) < 2 * PROBE or _unlike(_corrections(surfaces(turns[::PROBE]), PROBE), PROBE) < WORTH:
+        return log
+    found = _corrections(surfaces(turns))
+    print(f"{log.path}: its sweeps lie up to {_unlike(found):.2f} m apart by its recorded poses, which are corrected", file=sys.stderr)
+    poses = about(np.stack([cloud.centre for cloud in surfaces(turns)]), found)
+    path = {"times_us": [turn[0].time_us for turn in turns], "poses": poses.flatten(1).tolist()}
+    return as_aligned(replace(log, meta={**log.meta, MOVED: path}))
+
+
+def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
+    """Poses `[K, 4, 4]` of small motions `[K, 6]` about points `[K, 3]`."""
+    poses, centre = small_poses(torch.from_numpy(deltas)), torch.from_numpy(centres)
+    poses[:, :3, 3] += centre - (poses[:, :3, :3] @ centre[:, :, None])[..., 0]
+    return poses
+
+
+def as_aligned(log: Log, meta: dict | None = None) -> Log:
+    """A log as recorded, moved as its `meta` says, or that of a log or scene which was `aligned`; as it is where nothing was."""
+    path = (log.meta if meta is None else meta).get(MOVED)
+    if path is None:
+        return log
+    poses = torch.tensor(path["poses"], dtype=torch.float64).view(-1, 4, 4)
+    return moved(log, Trajectory(torch.tensor(path["times_us"]), poses))
+
+
+def _turns(sweeps: Sequence[Sweep]) -> list[list[Sweep]]:
+    """The sweeps by time, those of several lidars that turn together in one."""
+    turns: list[list[Sweep]] = []
+    for sweep in sorted(sweeps, key=lambda s: s.time_us):
+        if turns and sweep.time_us - turns[-1][0].time_us < TOGETHER_US:
+            turns[-1].append(sweep)
+        else:
+            turns.append([sweep])
+    return turns
+
+
+def moved(log: Log, correction: Trajectory) -> Log:
+    """The log with all that it knows of the world moved by a correction that depends on the time."""
+
+    def at(times_us: torch.Tensor) -> torch.Tensor:
+        first, last = correction.span_us()
+        return correction.at_each(times_us.clamp(first, last))
+
+    def camera(c: LogCamera) -> LogCamera:
+        return replace(c, world_from_cam=at(c.times_us) @ c.world_from_cam)
+
+    def sweep(s: Sweep) -> Sweep:
+        def read() -> LidarPoints:
+            points, pose = s.read(), correction.near(s.time_us).numpy()
+            return replace(points, xyz=points.xyz @ pose[:3, :3].T + pose[:3, 3])
+
+        return replace(s, read=read)
+
+    def track(t: Track) -> Track:
+        return replace(t, world_from_box=at(torch.from_numpy(t.times_us)) @ t.world_from_box)
+
+    ego = replace(log.ego, world_from_body=at(log.ego.times_us) @ log.ego.world_from_body)
+    cameras = {name: camera(c) for name, c in log.cameras.items()}
+    return replace(log, ego=ego, cameras=cameras, sweeps=tuple(map(sweep, log.sweeps)), tracks=tuple(map(track, log.tracks)))
+
+
+def _apart(count: int, step: int) -> list[int]:
+    """`APART` of `count` sweeps, of which only every `step`th is at hand."""
+    return [k for k in sorted({max(1, round(k / step)) for k in APART}) if k < count]
+
+
+def _unlike(deltas: np.ndarray, step: int = 1) -> float:
+    """Metres by which the corrections of sweeps that are laid on one another differ at most."""
+    return max(float(np.linalg.norm(deltas[k:, 3:] - deltas[:-k, 3:], axis=1).max()) for k in _apart(len(deltas), step))
+
+
+def _corrections(clouds: list[Surfaces], step: int = 1) -> np.ndarray:
+    """Small motions `[K, 6]` in the world, each about its own centre, with which the clouds meet; of every `step`th sweep."""
+    count = len(clouds)
+    deltas = np.zeros((count, 6))
+    pairs = [(i, i + k) for k in _apart(count, step) for i in range(count - k)]
+    pairs += [(j, i) for i, j in pairs]
+    centres = np.stack([c.centre for c in clouds])
+    for reach in REACH:
+        poses = about(centres, deltas).numpy()
+        blocks = [_pair(clouds[i], clouds[j], poses[i], poses[j], reach) for i, j in pairs]
+        deltas = _solved(deltas, pairs, blocks, step)
+    turn, away = deltas[:, :3].mean(0), centres - centres.mean(0)  # sweeps do not tell how they lie as a whole: as they did in the mean
+    deltas[:, 3:] -= np.cross(turn, away)
+    return deltas - deltas.mean(0)
+
+
+def _pair(one: Surfaces, other: Surfaces, pose: np.ndarray, other_pose: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations `[12, 12]`, `[12]` of laying points of one cloud on the surfaces of another, for further small motions of both."""
+    points = one.points[:: max(1, len(one.points) // SAMPLES)]
+    here = points @ pose[:3, :3].T + pose[:3, 3]
+    there = (here - other_pose[:3, 3]) @ other_pose[:3, :3]
+    away, nearest = other.tree.query(there, distance_upper_bound=reach)
+    met = np.isfinite(away) & (nearest < len(other.points))
+    if met.sum() < 50:
+        return np.zeros((12, 12)), np.zeros(12)
+    here, nearest = here[met], nearest[met]
+    surface = other.points[nearest] @ other_pose[:3, :3].T + other_pose[:3, 3]
+    normal = other.normals[nearest] @ other_pose[:3, :3].T
+    off = ((here - surface) * normal).sum(1)
+    jacobian = np.concatenate([np.cross(here - one.centre, normal), normal, -np.cross(surface - other.centre, normal), -normal], 1)
+    spread = max(0.02, 1.5 * float(np.median(np.abs(off))))
+    weight = 1 / (1 + (off / spread) ** 2) / (ALIKE * spread**2)
+    return (jacobian * weight[:, None]).T @ jacobian, -(jacobian * weight[:, None]).T @ off
+
+
+def _solved(deltas: np.ndarray, pairs: list[tuple[int, int]], blocks: list[tuple[np.ndarray, np.ndarray]], step: int) -> np.ndarray:
+    """The corrections after one step of Gauss and Newton."""
+    count = len(deltas)
+    own, steady = 1 / np.array(WHOLE) ** 2, 1 / (step * np.array(STEP) ** 2)
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    right = -own * deltas
+    change = steady * np.diff(deltas, axis=0)
+    right[:-1] += change
+    right[1:] -= change
+
+    def add(i: int, j: int, block: np.ndarray) -> None:
+        row, column = np.meshgrid(6 * i + np.arange(6), 6 * j + np.arange(6), indexing="ij")
+        for numbers, more in ((rows, row), (columns, column), (values, block)):
+            numbers.append(more.ravel())
+
+    for i in range(count):
+        add(i, i, np.diag(own))
+    for i in range(count - 1):
+        for a, b, sign in ((i, i, 1), (i + 1, i + 1, 1), (i, i + 1, -1), (i + 1, i, -1)):
+            add(a, b, sign * np.diag(steady))
+    for (i, j), (normal, wanted) in zip(pairs, blocks, strict=True):
+        for a, x in ((i, 0), (j, 6)):
+            right[a] += wanted[x : x + 6]
+            for b, y in ((i, 0), (j, 6)):
+                add(a, b, normal[x : x + 6, y : y + 6])
+    shape = (6 * count, 6 * count)
+    matrix = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsc()
+    return deltas + spsolve(matrix, right.ravel()).reshape(count, 6)

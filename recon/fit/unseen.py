@@ -1,0 +1,76 @@
+"""Colours of what the pictures hardly show: a wall behind a tree, the far side of a car.
+
+Such a splat is seen by a few pixels between leaves, and Adam's steps, which do not know how little they say, drive its colour to whatever
+puts those right, orange or violet. From aside it stands there whole. So it is given the colour of what stands beside it and is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from scipy.spatial import cKDTree
+
+from recon.fit.model import Splats, draw
+from scenes.camera import Camera
+from scenes.gaussians import Placed
+from scenes.harmonics import C0
+from scenes.poses import inverse, matrix_from_quat
+
+SEEN = 0.05
+"""Part of a splat that the picture showing most of it must show for its colour to be known."""
+
+NEIGHBOURS = 16
+"""Splats of known colour beside one of unknown, whose mean it is given."""
+
+
+def shown_parts(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
+    """Of each group's splats `[N]`, the part of its weight that a picture shows, what stands before it taken off; 0 where its middle is
+    out of the picture. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture (`footprint`)."""
+    groups = [p.gaussians.detach() for p in placed]
+    blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
+    drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
+    with torch.enable_grad():
+        (rgb,) = draw(drawn, camera, "rgb")
+        weights = torch.autograd.grad(rgb[..., 0].sum() / C0, blank)
+    wholes = [footprint(p, camera) for p in placed]
+    return [torch.where(whole > 0, w[:, 0, 0] / whole, 0.0) for w, whole in zip(weights, wholes, strict=True)]
+
+
+def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
+    """Sum of the opacities `[N]` that each splat alone has over a picture's pixels, were it in the middle of it: at the border a pinhole
+    draws it larger. 0 where its middle is out of the picture."""
+    g = placed.gaussians
+    cam_from_local = (inverse(camera.world_from_cam) @ placed.world_from_local).to(g.means)
+    middle = g.means @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
+    pixels, size = camera.lens.project(middle), torch.tensor([camera.width, camera.height]).to(middle)
+    inside = ((pixels >= 0) & (pixels < size)).all(1) & camera.lens.valid(middle)
+    # seen along d, an ellipsoid of axes s is sqrt((s2 s3 d1)^2 + (s1 s3 d2)^2 + (s1 s2 d3)^2) wide
+    axes = cam_from_local[:3, :3] @ matrix_from_quat(g.quats)
+    along = (axes * middle[:, :, None]).sum(1)
+    scales = g.log_scales.exp()
+    across = (along / scales).norm(dim=1) * scales.prod(1) / middle.norm(dim=1).pow(3).clamp_min(1e-9)
+    fx, fy = camera.lens.focal()
+    return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * inside
+
+
+def as_neighbours(splats: Splats, part: torch.Tensor) -> torch.Tensor:
+    """Give splats of which less than `SEEN` was shown, by the largest `part` `[N]` of each in any picture, the colours of their group's
+    nearest others, in place. Returns which these are, bool `[N]`; of groups without any other none, and none that no picture looks at."""
+    unknown, begin = torch.zeros_like(part, dtype=torch.bool), 0
+    for size in splats.sizes:
+        mine = slice(begin, begin + size)
+        begin += size
+        hidden = (part[mine] > 0) & (part[mine] < SEEN)
+        known = (part[mine] >= SEEN).nonzero()[:, 0]
+        if len(known) < NEIGHBOURS or not hidden.any():
+            continue
+        means, sh = splats.fields["means"][mine], splats.fields["sh"][mine]
+        away, nearest = cKDTree(means[known].cpu().numpy()).query(means[hidden].cpu().numpy(), NEIGHBOURS)
+        wide = splats.fields["log_scales"][mine][hidden].exp().mean(1)
+        share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
+        found = sh[known[torch.from_numpy(nearest).to(known)]]
+        sh[hidden] = (found * (share / share.sum(1, keepdim=True))[:, :, None, None]).sum(1)
+        unknown[mine] = hidden
+    return unknown

@@ -1,0 +1,119 @@
+"""Sweeps that recorded poses put apart are laid on one another, and with them all that the log knows of the world."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from recon.align import about, aligned, as_aligned, moved
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from scenes.lenses import Pinhole
+from scenes.poses import inverse
+from scenes.trajectory import Trajectory
+
+COUNT, STEP_US = 36, 100_000
+
+
+def street(centre: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """World points of a road, houses whose fronts step back and forth, and poles, within 40 m of a place on the road; 1 cm of noise."""
+    along = centre[0] + generator.uniform(-40, 40, 6000)
+    road = np.stack([along, generator.uniform(-8, 8, 6000), np.zeros(6000)], 1)
+    side = np.where(generator.random(6000) < 0.5, -1.0, 1.0)
+    fronts = np.stack([along, side * (9 + 2 * (np.floor(along / 7) % 2)), generator.uniform(0, 6, 6000)], 1)
+    corners = np.stack([7 * np.round(along / 7), side * generator.uniform(9, 11, 6000), generator.uniform(0, 6, 6000)], 1)
+    return np.concatenate([road, fronts, corners]) + generator.normal(0, 0.01, (18_000, 3))
+
+
+def drifting(height: float, metres: float = 0.0, radians: float = 0.0) -> tuple[Log, torch.Tensor]:
+    """A log along the street whose recorded poses drift away, and by which poses `[T, 4, 4]` its world must be moved back at its stamps."""
+    generator = np.random.default_rng(5)
+    times = torch.arange(COUNT) * STEP_US
+    truth = torch.eye(4, dtype=torch.float64).repeat(COUNT, 1, 1)
+    truth[:, 0, 3] = 0.8 * torch.arange(COUNT)
+    truth[:, 2, 3] = 1.7
+    slow = torch.sin(torch.linspace(0, 3, COUNT, dtype=torch.float64))
+    deltas = torch.zeros(COUNT, 6, dtype=torch.float64)
+    deltas[:, 2], deltas[:, 4], deltas[:, 5] = radians * slow, metres * slow.flip(0), height * slow
+    drift = about(truth[:, :3, 3].numpy(), deltas.numpy())
+    sweeps = []
+    for i in range(COUNT):
+        xyz = street(truth[i, :3, 3].numpy(), generator) @ drift[i, :3, :3].numpy().T + drift[i, :3, 3].numpy()
+        points = LidarPoints(xyz, np.full(len(xyz), int(times[i])), np.zeros(len(xyz), np.int64))
+        sweeps.append(Sweep(i, int(times[i]), lambda points=points: points))
+    recorded = drift @ truth
+    camera = LogCamera("front", Pinhole(50.0, 50.0, 32.0, 24.0), 64, 48, tuple(Path(str(i)) for i in range(COUNT)), times, recorded)
+    box = drift @ torch.tensor([[1.0, 0, 0, 12], [0, 1, 0, 3], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    track = Track("veh_1", "car", False, np.array([4.0, 2, 1.5]), times.numpy(), box, np.zeros(COUNT, np.int64), ("a",))
+    return Log("made", Path("made"), {"front": camera}, tuple(sweeps), (track,), Trajectory(times, recorded), {}), inverse(drift)
+
+
+def apart(poses: torch.Tensor) -> float:
+    """Metres by which poses that should be one differ, at the origin of each."""
+    return float((poses[:, :3, 3] - poses[:, :3, 3].mean(0)).norm(dim=1).max())
+
+
+def test_a_path_that_drifts_is_bent_back(capsys):
+    log, _ = drifting(height=0.4, metres=0.2, radians=0.01)
+    assert apart(log.tracks[0].world_from_box) > 0.2
+    better = aligned(log, log.sweeps)
+    assert "lie up to 0." in capsys.readouterr().err
+    assert apart(better.tracks[0].world_from_box) < 0.03, "the annotated box, which stands, stands"
+    heights = [float(np.median(s.read().xyz[:6000, 2])) for s in better.sweeps]
+    assert np.ptp(heights) < 0.015, "one road"
+    body, seen = better.ego.world_from_body, better.camera("front").world_from_cam
+    torch.testing.assert_close(body, seen, atol=1e-9, rtol=0)
+    for k in (1, 30):
+        way = (inverse(body[:-k]) @ body[k:])[:, :3, 3]
+        assert float((way - torch.tensor([0.8 * k, 0, 0], dtype=torch.float64)).abs().max()) < 0.03
+
+
+def test_a_drive_whose_sweeps_meet_is_left_alone(capsys):
+    log, _ = drifting(height=0.01)
+    assert aligned(log, log.sweeps) is log and not capsys.readouterr().err
+    for few in (3, 9, 27, 28, 29):
+        assert aligned(log, log.sweeps[:few]) is log, "too few to tell, or nothing to do"
+    bare = replace(log, sweeps=tuple(replace(s, read=lambda: LidarPoints(np.zeros((0, 3)), np.zeros(0), np.zeros(0))) for s in log.sweeps))
+    assert aligned(bare, bare.sweeps) is bare
+
+
+def test_sweeps_that_are_left_out_go_along(drift=0.4):
+    """Those against which a scene is measured take no part, and are moved as their neighbours are."""
+    log, back = drifting(height=drift)
+    better = aligned(log, [s for s in log.sweeps if s.index % 8 != 4])
+    left = [float(np.median(better.sweeps[i].read().xyz[:6000, 2])) for i in range(4, COUNT, 8)]
+    assert np.ptp(left) < 0.02
+
+
+def test_a_correction_takes_everything_with_it():
+    log, back = drifting(height=0.4, radians=0.01)
+    nothing = replace(log.tracks[0], times_us=np.zeros(0, np.int64), world_from_box=torch.zeros(0, 4, 4, dtype=torch.float64))
+    better = moved(replace(log, tracks=(*log.tracks, nothing)), Trajectory(log.ego.times_us, back))
+    truth = back @ log.ego.world_from_body
+    torch.testing.assert_close(better.ego.world_from_body, truth)
+    torch.testing.assert_close(better.camera("front").world_from_cam, truth)
+    assert apart(better.tracks[0].world_from_box) == pytest.approx(0, abs=1e-9)
+    assert np.ptp([np.median(s.read().xyz[:6000, 2]) for s in better.sweeps]) < 0.01
+
+
+def test_a_recording_is_moved_again_as_its_scene_says():
+    log, _ = drifting(height=0.4)
+    better = aligned(log, log.sweeps)
+    again = as_aligned(log, json.loads(json.dumps(better.meta)))
+    torch.testing.assert_close(again.ego.world_from_body, better.ego.world_from_body, atol=1e-12, rtol=0)
+    np.testing.assert_allclose(again.sweeps[7].read().xyz, better.sweeps[7].read().xyz, atol=1e-9)
+    assert as_aligned(log, {}) is log and as_aligned(log) is log
+
+
+def test_lidars_that_turn_together_are_laid_on_others_together():
+    log, _ = drifting(height=0.4)
+    halves = []
+    for sweep in log.sweeps:
+        points = sweep.read()
+        for k in (0, 1):
+            half = LidarPoints(points.xyz[k::2], points.times_us[k::2], points.sensor[k::2])
+            halves.append(Sweep(2 * sweep.index + k, sweep.time_us, lambda half=half: half))
+    two = aligned(replace(log, sweeps=tuple(halves)), halves)
+    assert apart(two.tracks[0].world_from_box) < 0.03 and len(two.sweeps) == 2 * COUNT

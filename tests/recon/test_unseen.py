@@ -1,0 +1,102 @@
+"""What pictures hardly show is told from what they do, and takes its neighbours' colours."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recon import open_log
+from recon.build import begin, choose
+from recon.fit.fit import GUESSED_FROM
+from recon.fit.model import Splats
+from recon.fit.unseen import NEIGHBOURS, SEEN, as_neighbours, footprint, shown_parts
+from render import rasterize
+from scenes.camera import Camera
+from scenes.gaussians import Gaussians, Placed
+from scenes.harmonics import sh_from_rgb
+from scenes.lenses import Fisheye, Pinhole
+from tests.bench.presets import random_splats
+from tests.recon.test_fit import CONFIG, SIZE
+
+AHEAD = Camera(Pinhole(160.0, 160.0, 128.0, 96.0), 256, 192, torch.eye(4, dtype=torch.float64))
+
+
+def balls(places: list[tuple[float, float, float]], metres: list[float], opacity: list[float]) -> Gaussians:
+    """Round splats of standard deviations `metres`."""
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(len(places), 4).contiguous()
+    scales = torch.tensor(metres).log()[:, None].expand(-1, 3).contiguous()
+    return Gaussians(torch.tensor(places), quats, scales, torch.logit(torch.tensor(opacity)), torch.zeros(len(places), 1, 3))
+
+
+def test_what_stands_before_a_splat_is_taken_off():
+    splats = balls([(0.0, 0, 10), (0.0, 0, 4), (2.0, 2, 8), (60.0, 0, 8)], [0.5, 0.4, 0.4, 0.4], [0.9, 0.95, 0.7, 0.9])
+    behind, before, free, outside = shown_parts([Placed(splats, torch.eye(4, dtype=torch.float64))], AHEAD)[0].tolist()
+    assert before == pytest.approx(1, abs=0.05) and free == pytest.approx(1.2, abs=0.1) and outside == 0
+    assert behind == pytest.approx(1 - 0.95 * 0.8, abs=0.02), "two Gaussians, one twice as wide"
+    alone = shown_parts([Placed(splats.select(torch.tensor([0])), torch.eye(4, dtype=torch.float64))], AHEAD)[0]
+    assert float(alone) == pytest.approx(1, abs=0.05)
+
+
+def test_a_splats_whole_weight_is_that_of_its_ellipse():
+    """However it is turned, stretched and seen, where nothing else is drawn: what is measured is what a picture sums up to."""
+    generator = torch.Generator().manual_seed(3)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+    for lens in (AHEAD.lens, Fisheye(160.0, 160.0, 128.0, 96.0)):
+        camera = replace(AHEAD, lens=lens)
+        for _ in range(6):
+            turn = torch.randn(1, 4, generator=generator)
+            scales = 0.2 + 0.4 * torch.rand(1, 3, generator=generator)
+            one = replace(balls([(0.5, 0.4, 7.0)], [1.0], [0.8]), quats=turn, log_scales=scales.log())
+            drawn = rasterize([Placed(one, pose)], camera, ("alpha",)).alpha.sum()
+            assert float(footprint(Placed(one, pose), camera)) == pytest.approx(float(drawn), rel=0.12)
+
+
+def splats_of(groups: list[list[float]], colour) -> tuple[Splats, torch.Tensor]:
+    """Groups of random splats in a unit cube with these parts shown, coloured `colour(part)`."""
+    made = []
+    for i, parts in enumerate(groups):
+        cloud = random_splats(len(parts), i, sh_count=4)
+        rgb = torch.tensor([colour(part) for part in parts])
+        made.append(replace(cloud, sh=torch.cat([sh_from_rgb(rgb)[:, None], torch.full((len(parts), 3, 3), 0.1)], 1)))
+    return Splats.of(made, [torch.ones(len(g)) for g in groups]), torch.tensor([p for g in groups for p in g])
+
+
+def test_hidden_splats_take_the_colours_of_known_ones_beside_them():
+    grey, orange = [0.4, 0.4, 0.4], [1.0, 0.5, 0.0]
+    groups = [[0.5] * 40 + [0.01] * 10 + [0.0] * 5, [0.9] * (NEIGHBOURS - 1) + [0.01] * 4]
+    splats, part = splats_of(groups, lambda p: grey if p >= SEEN else orange)
+    before = splats.fields["sh"].clone()
+    guessed = as_neighbours(splats, part)
+    assert guessed.nonzero()[:, 0].tolist() == list(range(40, 50)), "not what no picture looks at, nor an actor of which nothing is known"
+    after = splats.fields["sh"]
+    assert torch.equal(after[~guessed], before[~guessed])
+    torch.testing.assert_close(after[40:50], before[:1].expand(10, -1, -1))
+
+
+def test_the_nearest_count_most():
+    splats, part = splats_of([[1.0] * 60 + [0.01]], lambda p: [0.2, 0.2, 0.2])
+    means, sh = splats.fields["means"], splats.fields["sh"]
+    means[:20], means[20:60], means[60] = torch.rand(20, 3) * 0.1, 3 + torch.rand(40, 3), torch.zeros(3)
+    sh[20:60] += 1.0
+    splats.fields["log_scales"][60] = math.log(0.05)
+    as_neighbours(splats, part)
+    torch.testing.assert_close(sh[60], sh[0])
+
+
+def test_a_fit_keeps_them_to_its_end(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    while fit.guessed is None:
+        fit.step()
+    assert fit.progress == pytest.approx(GUESSED_FROM, abs=1.5 / CONFIG.steps)
+    some = fit.guessed
+    assert 0 < some.float().mean() < 0.5
+    before = {name: field.clone() for name, field in fit.splats.fields.items()}
+    while fit.step_count < CONFIG.steps:
+        fit.step()
+    after = fit.splats.fields
+    assert torch.equal(after["sh"][some], before["sh"][some]), "their colours rest"
+    assert not torch.equal(after["sh"][~some], before["sh"][~some]) and not torch.equal(after["means"][some], before["means"][some])
