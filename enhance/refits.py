@@ -19,7 +19,7 @@ import torch
 from enhance.clips import scene_time
 from recon.align import as_aligned
 from recon.build import assemble, begin, choose
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.log import Log, LogCamera, Track
 from render import render_frame
 from render.progress import Progress

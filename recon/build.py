@@ -14,10 +14,12 @@ import torch
 from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit.fit import Fit, FitConfig, run
+from recon.fit.config import FitConfig
+from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
 from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
+from recon.fit.run import run
 from recon.fit.strides import stride_of
 from recon.frames import Frames, load_frames
 from recon.live import Live

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.log import Track
 from recon.seeds.measured import Measured
 from recon.start import Start

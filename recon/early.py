@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from recon.build import annotated, assemble, begin, choose
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.log import Log
 from render.progress import Progress
 from scenes.files import save

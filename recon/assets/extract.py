@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from recon.assets.cleaning import cleaned
+from recon.assets.closing import closed
 from render import Frame, rasterize
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera
@@ -185,7 +186,8 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight, gain: torch.
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
     meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
     meta["exposure"] = shown_colours(dimmed(whole, gain))
-    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, gain)
+    made = replace(asset, gaussians=whole, meta=meta)
+    return Candidate(made if flaw else closed(made), meta["track"], flaw, gain)
 
 
 def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:

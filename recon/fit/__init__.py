@@ -1,5 +1,5 @@
 """The fit: splats, sky, poses, clocks, exposures and limbs, by gradient descent on the photos."""
 
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 
 __all__ = ["FitConfig"]

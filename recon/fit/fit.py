@@ -2,98 +2,45 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 
+from recon.fit.config import FitConfig
 from recon.fit.densify import Growth, grow
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.limbs import Limbs
 from recon.fit.losses import PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
-from recon.fit.motion import REFINED, Moment, Motion
+from recon.fit.motion import Moment, Motion
+from recon.fit.openings import Openings
 from recon.fit.sight import Eye, in_sight
 from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames, View
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.measured import Measured, mistake
-from recon.seeds.points import spread
-from recon.skies import always_hidden, cells
 from render.launch import upload
-from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
 from scenes.scene import dimmed
 
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How long and how finely to fit."""
-
-    steps: int = 4000
-    """Pictures rendered and compared."""
-    budget: int = 220_000
-    """Splats at most, all groups together."""
-    sh_degree: int = 1
-    """Harmonics of the splats' colours; they rise from 0 a quarter of the way in."""
-    stages: tuple[tuple[float, int], ...] = ((0.0, 4), (0.15, 2), (0.4, 1))
-    """From which part of the fit on pictures are shrunk by which factor: coarse to fine."""
-    grow_every: int = 100
-    """Steps between densifications."""
-    grow_span: tuple[float, float] = (0.06, 0.6)
-    """Part of the fit within which splats are added."""
-    refine: tuple[str, ...] = ("path", "gains", *REFINED, "exposures", "limbs")
-    """What is corrected besides the splats and the sky: before the fit the body's path by lidar (`recon/align.py`) and how frames were
-    exposed, by what several show (`recon/gains.py`); in it poses and clocks by kind, the cameras' exposures against the first's, and how
-    the limbs of people and animals stand."""
-    poses_from: float = 0.1
-    """Part of the fit from which poses are corrected."""
-    dissimilarity: float = 0.2
-    """Weight of 1 - SSIM against L1."""
-    still_weight: float = 0.4
-    """How often a view is drawn while the car stands, against one while it drives."""
-    drop: float = 0.0
-    """Part of the splats in sight that a step leaves out of its picture, by lot, towards the end; the others are denser for them. Where few
-    photos see a place, none may serve one photo alone (DropGaussian, Park et al. 2025)."""
-    depth_weight: float = 1.0
-    """Of depths that are not as measured, times what suits who measured them (`recon/seeds/measured.py`)."""
-    seed: int = 0
-    """Of the order of views."""
-
-
 WINDOW = (180, 320)
 """Rows and columns of the part of a picture in which similarity is taken."""
-
-SKY_WEIGHT = 0.03
-"""Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
 
 SKY_PRIOR = 3e-6
 """Of the squared distance of the sky from its first picture, in a step's gradient: a twentieth of what a picture's sky weighs, and more
 than what shines through a wall, which Adam would turn into noise that a shifted view shows between the houses."""
 
-SOLID_WEIGHT = 0.1
-"""Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
-
-ASIDE, ASIDE_EVERY, ASIDE_WEIGHT = 3.0, 2, 0.3
-"""Metres to either side of the path from which the road must be closed too, and what always hides the sky; every how many steps that is
-looked at, and its weight."""
-
-SKY_LOOKS = 40
-"""Pictures of a camera by which it is known where the sky is never seen."""
+ASIDE_EVERY = 2
+"""Every how many steps it is looked at what is open from aside of the path."""
 
 GUESSED_FROM = 0.8
 """Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
-
-HORIZON = -0.01
-"""Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
 
 CLIPPED = 0.99
 """Colours of pictures from which on they may be clipped."""
@@ -136,7 +83,7 @@ class Fit:
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
-        self._hidden = self._never_sky()
+        self.openings = Openings(frames, motion, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self.guessed: torch.Tensor | None = None
@@ -177,7 +124,9 @@ class Fit:
         view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
         camera = self.motion.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
-        aside = self._aside(view, camera) if self.step_count % ASIDE_EVERY == 0 else None
+        aside = None
+        if self.step_count % ASIDE_EVERY == 0:
+            aside = self.openings.aside(view, camera, self.generator).resized(*self._size(2 * self.shrink()))
         ends = self.motion.readout(view, camera)
         rates = self._rates()
         which = self._in_sight(view, camera, ends, aside)
@@ -186,16 +135,15 @@ class Fit:
         known = self._known(view)
         by_lot = self._drawn_by_lot(shown)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
-        rgb, alpha, depth = self._render(by_lot, view, camera, ends, shift, bool(known))
+        rgb, alpha, depth = self._render(by_lot, view, camera, ends, self.openings.backdrop(self.sky, self.generator), shift, bool(known))
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         if view.gain is not None:
             rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
-        coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
-        haze = SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * self._below(camera, view)).mean()
+        haze = self.openings.haze(alpha, view, camera)
         if aside is not None:
-            haze = haze + ASIDE_WEIGHT * self._gaps(shown, view, aside)
+            haze = haze + self.openings.gaps(draw(self._placed(shown, view, aside), aside, "alpha")[0], aside)
         if depth is not None:
             for weight, there in known:
                 haze = haze + self.config.depth_weight * weight * mistake(depth, alpha, there)
@@ -225,7 +173,7 @@ class Fit:
         camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
-        return self._render(shown, view, camera, ends, (0, 0), False)[0]
+        return self._render(shown, view, camera, ends, self.sky, (0, 0), False)[0]
 
     def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
         """Indices of the splats that a picture of a view, and one from aside, may show."""
@@ -240,13 +188,13 @@ class Fit:
         return in_sight(self.splats, eyes, [i + 1 for i in actors])
 
     def _render(
-        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], shift: Sequence[int], with_depth: bool
+        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], sky: torch.Tensor, shift: Sequence[int], with_depth: bool
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted;
         shift: of the sky's samples (`developed`)."""
         placed = self._placed(shown, view, camera)
         rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
-        return developed(rgb, alpha, self.sky, self._exposure(view), camera, shift), alpha, depth[0] if depth else None
+        return developed(rgb, alpha, sky, self._exposure(view), camera, shift), alpha, depth[0] if depth else None
 
     def _exposure(self, view: View) -> torch.Tensor:
         """The affine exposure `[3, 4]` of a view: its camera's, as many times as it was exposed."""
@@ -269,34 +217,6 @@ class Fit:
         gain = self._followed[view.time_us]
         placed = [placed[0], *(replace(p, gaussians=dimmed(p.gaussians, gain)) for p in placed[1:])]
         return self.limbs.bent(placed, view.time_us)
-
-    def _never_sky(self) -> torch.Tensor:
-        """Directions in which no picture shows the sky, though some look there."""
-        looks = []
-        for c in range(len(self.frames.names)):
-            for view in spread(self.frames.of(c), SKY_LOOKS):
-                h, w = view.sky.shape
-                looks.append((view.sky.numpy(), self.motion.camera(view).resized(w, h)))
-        return always_hidden(looks).to(self.device)
-
-    def _below(self, camera: Camera, view: View) -> torch.Tensor:
-        """Where a view surely looks at something: below the horizon and not at its sky; bool, of `view.sky`'s shape."""
-        small = camera.resized(view.sky.shape[1], view.sky.shape[0])
-        return (world_directions(small, self.device)[..., 2] < 0) & ~view.sky
-
-    def _aside(self, view: View, camera: Camera) -> Camera:
-        """A small picture's camera up to `ASIDE` metres to the left or right of a view."""
-        metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
-        pose = camera.world_from_cam.detach().clone()
-        pose[:3, 3] += metres * self.motion.left(view)
-        return replace(camera, world_from_cam=pose).resized(*self._size(2 * self.shrink()))
-
-    def _gaps(self, shown: Splats, view: View, camera: Camera) -> torch.Tensor:
-        """Mean of 1 - alpha below the horizon, and where the sky is never seen, as a camera sees a view's moment."""
-        placed = self._placed(shown, view, camera)
-        (alpha,) = draw(placed, camera, "alpha")
-        directions = world_directions(camera, self.device)
-        return ((1 - alpha) * ((directions[..., 2] < HORIZON) | self._hidden[cells(directions, len(self._hidden))])).mean()
 
     @torch.no_grad()
     def _guess(self) -> None:
@@ -408,33 +328,3 @@ class Fit:
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:
     return torch.optim.Adam(groups, betas=(0.9, 0.999), eps=eps, fused=True)
-
-
-def run(fit: Fit, save: Callable[[], None], report: Callable[[Fit], None], every_seconds: float = 45.0) -> None:
-    """Step to the end, calling `report` each step and `save` now and then.
-
-    Ctrl-C lets the step end, so that what is saved is whole, saves, and then raises KeyboardInterrupt; a second one does at once.
-    """
-    asked: list[bool] = []
-
-    def ask(_signal, _frame) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(True)
-
-    # only the main thread may listen to signals; elsewhere there is no Ctrl-C either
-    listening = threading.current_thread() is threading.main_thread()
-    former = signal.signal(signal.SIGINT, ask) if listening else None
-    saved = time.monotonic()
-    try:
-        while fit.step_count < fit.config.steps:
-            fit.step()
-            report(fit)
-            if asked or time.monotonic() - saved > every_seconds:
-                save()
-                saved = time.monotonic()
-            if asked:
-                raise KeyboardInterrupt
-    finally:
-        if listening:
-            signal.signal(signal.SIGINT, former)

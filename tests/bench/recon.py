@@ -27,7 +27,7 @@ from scipy.spatial import ConvexHull, QhullError
 from recon import open_log
 from recon.align import as_aligned
 from recon.build import HELD_OUT, annotated, assemble, begin, choose, fit_config, readied
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Sweep, Track
 from recon.offpath import held_out_sweeps, off_path_table

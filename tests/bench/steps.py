@@ -24,12 +24,13 @@ from recon.fit.develop import Develop
 from recon.fit.fit import Fit
 from recon.fit.losses import PictureLoss
 from recon.fit.motion import Motion
+from recon.fit.openings import Openings
 from render.bridge import Rasterize
 
 PARTS = [
     (Fit, "step"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
     (Motion, "actor_poses"), (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
-    (PictureLoss, "forward"), (Fit, "_gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
+    (PictureLoss, "forward"), (Openings, "gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
     (Develop, "backward"), (Descent, "follow"), (Fit, "_follow"),
 ]  # fmt: skip
 

@@ -9,7 +9,7 @@ from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 
 from recon import open_log, reconstruct
 from recon.build import MOST, PER_PHOTO, fit_config, fit_size
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
 from recon.ground import estimate_ground

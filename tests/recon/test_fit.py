@@ -11,8 +11,10 @@ from PIL import Image
 from recon import open_log, reconstruct, stopped_early
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path
-from recon.fit.fit import HORIZON, Fit, FitConfig
+from recon.fit.config import FitConfig
+from recon.fit.fit import Fit
 from recon.fit.model import Knots, Splats, small_poses
+from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.seeds.measured import Measured, mistake
 from render import render_frame
 from render.album import references_of
@@ -159,7 +161,7 @@ def _mistakes(fit):
     for view in fit.training:
         camera = fit.motion.camera(view).resized(*SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-        _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), (0, 0), True)
+        _, alpha, depth = fit._render(shown, view, camera, fit.motion.readout(view, camera), fit.sky, (0, 0), True)
         found.append(float(mistake(depth, alpha, fit.measured[0].views[view.camera, view.index])))
     return np.mean(found)
 
@@ -184,13 +186,28 @@ def test_from_aside_nothing_may_be_open_where_the_sky_is_never_seen(drive):
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
     view = fit.training[0]
-    camera = fit._aside(view, fit.motion.camera(view))
-    nothing = fit.splats.select(torch.zeros(0, dtype=torch.long), 1)
+    camera = fit.openings.aside(view, fit.motion.camera(view), fit.generator)
+    nothing = torch.zeros(camera.height, camera.width)
     below = float((world_directions(camera)[..., 2] < HORIZON).float().mean())
-    open_ = float(fit._gaps(nothing, view, camera).detach())
+    open_ = float(fit.openings.gaps(nothing, camera)) / ASIDE_WEIGHT
     assert below + 0.1 < open_ < 0.9, "houses above the horizon count, and the sky does not"
-    fit._hidden[:] = False
-    assert float(fit._gaps(nothing, view, camera).detach()) == pytest.approx(below)
+    fit.openings.hidden[:] = False
+    assert float(fit.openings.gaps(nothing, camera)) / ASIDE_WEIGHT == pytest.approx(below)
+    assert float(fit.openings.gaps(1 - nothing, camera)) == 0
+
+
+def test_behind_what_always_hides_the_sky_is_no_light_to_rely_on(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    row, column = (torch.arange(n) * m // n for n, m in zip(fit.sky.shape[:2], fit.openings.hidden.shape, strict=True))
+    blind = fit.openings.hidden[row[:, None], column]
+    assert 0.01 < float(blind.float().mean()) < 0.99
+    first, second = (fit.openings.backdrop(fit.sky, fit.generator) for _ in range(2))
+    assert torch.equal(first[~blind], fit.sky[~blind]) and torch.equal(second[~blind], fit.sky[~blind])
+    assert (first[blind] == first[blind][0]).all() and (first[blind][0] - second[blind][0]).abs().max() > 0.01
+    first.sum().backward()
+    assert fit.sky.grad is not None and torch.equal(fit.sky.grad[..., 0] == 0, blind)
 
 
 def test_a_drive_without_lidar_whose_pictures_show_no_features_is_refused(own_drive, tmp_path):

@@ -12,7 +12,8 @@ import walker
 from recon import open_log, reconstruct
 from recon.build import assemble, begin, choose
 from recon.checkpoint import load_checkpoint, save_checkpoint
-from recon.fit.fit import Fit, FitConfig
+from recon.fit.config import FitConfig
+from recon.fit.fit import Fit
 from recon.report import held_out_table
 
 ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")

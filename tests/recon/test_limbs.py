@@ -10,7 +10,8 @@ import walker
 
 from recon.assets.extract import at_rest
 from recon.build import assemble, begin, choose
-from recon.fit.fit import Fit, FitConfig
+from recon.fit.config import FitConfig
+from recon.fit.fit import Fit
 from recon.tracks import LIMBED
 from render import render_frame
 from scenes import Scene

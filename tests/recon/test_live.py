@@ -6,7 +6,7 @@ import torch
 
 from recon import open_log, reconstruct
 from recon.build import begin, choose
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from recon.live import EVERY, Live
 
 CONFIG = FitConfig(steps=4 * EVERY, budget=9000, stages=((0.0, 2), (0.5, 1)), grow_every=10)

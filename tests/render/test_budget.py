@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from recon import open_log, reconstruct
-from recon.fit.fit import FitConfig
+from recon.fit.config import FitConfig
 from render import RenderConfig, rasterize
 from render.budget import split
 from render.canonical import canonical_frames

@@ -1,0 +1,73 @@
+"""Where light from the sky may come from, and where a scene must be closed: the road, and whatever always stands before the sky."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+
+from recon.fit.motion import Motion
+from recon.frames import Frames, View
+from recon.seeds.points import spread
+from recon.skies import always_hidden, cells
+from render.launch import upload
+from render.rays import world_directions
+from scenes.camera import Camera
+
+SKY_WEIGHT = 0.03
+"""Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
+
+SOLID_WEIGHT = 0.1
+"""Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
+
+ASIDE, ASIDE_WEIGHT = 3.0, 0.3
+"""Metres to either side of the path from which the road must be closed too, and what always hides the sky, and the weight of that."""
+
+LOOKS = 40
+"""Pictures of a camera by which it is known where the sky is never seen."""
+
+HORIZON = -0.01
+"""Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
+
+
+class Openings:
+    """What a fit's pictures say of the sky.
+
+    hidden  bool `[HIDDEN, 2 HIDDEN]`: directions in which none of them shows it, though some look there (`recon/skies.py`)
+    """
+
+    def __init__(self, frames: Frames, motion: Motion, device: torch.device):
+        self.motion, self.device = motion, device
+        looks = []
+        for c in range(len(frames.names)):
+            for view in spread(frames.of(c), LOOKS):
+                h, w = view.sky.shape
+                looks.append((view.sky.numpy(), motion.camera(view).resized(w, h)))
+        self.hidden = always_hidden(looks).to(device)
+
+    def backdrop(self, sky: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """The sky `[H, 2H, 3]`, and where no picture shows it any one grey, another one each time: a bright sky below the road would be the
+        cheapest light at the edges of shade, and leave holes there."""
+        blind = F.interpolate(self.hidden[None, None].float(), sky.shape[:2])[0, 0, :, :, None] > 0
+        return torch.where(blind, upload(torch.rand(1, generator=generator), self.device), sky)
+
+    def haze(self, alpha: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
+        """What it costs that alpha `[H, W]`, as a view's camera sees it, is above 0 before the sky and below 1 under the horizon."""
+        coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
+        small = camera.resized(view.sky.shape[1], view.sky.shape[0])
+        solid = (world_directions(small, self.device)[..., 2] < 0) & ~view.sky
+        return SKY_WEIGHT * (coarse * view.sky).mean() + SOLID_WEIGHT * ((1 - coarse) * solid).mean()
+
+    def aside(self, view: View, camera: Camera, generator: torch.Generator) -> Camera:
+        """A view's camera, up to `ASIDE` metres farther left or right."""
+        metres = ASIDE * (2 * float(torch.rand((), generator=generator)) - 1)
+        pose = camera.world_from_cam.detach().clone()
+        pose[:3, 3] += metres * self.motion.left(view)
+        return replace(camera, world_from_cam=pose)
+
+    def gaps(self, alpha: torch.Tensor, camera: Camera) -> torch.Tensor:
+        """What it costs that alpha `[H, W]`, as a camera from aside sees it, is below 1 under the horizon or where the sky is hidden."""
+        directions = world_directions(camera, self.device)
+        closed = (directions[..., 2] < HORIZON) | self.hidden[cells(directions, len(self.hidden))]
+        return ASIDE_WEIGHT * ((1 - alpha) * closed).mean()
