@@ -286,7 +286,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     meta = {**log.meta, "parked": parked, **(extra or {})}
     scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
-    return replace(scene, sky=seen_sky(scene.to(fit.device)))
+    return replace(scene, sky=seen_sky(scene.to(fit.device), fit.openings.hidden))
 
 
 def middle_pose(track: Track) -> torch.Tensor:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 
 from render import render_frame
@@ -112,8 +113,14 @@ def always_hidden(looks: Iterable[tuple[np.ndarray, Camera]]) -> torch.Tensor:
     return torch.from_numpy((looked & ~ndimage.binary_dilation(open_, np.ones((3, 3))))[:, 2:-2])
 
 
-def seen_sky(scene: Scene) -> Sky:
-    """The scene's sky as its cameras saw it, spread into directions in which something always stood before it.
+def finer(hidden: torch.Tensor, height: int) -> torch.Tensor:
+    """`always_hidden` directions on an equirectangular grid of `height` rows: bool `[height, 2 height]`."""
+    return F.interpolate(hidden[None, None].float(), (height, 2 * height))[0, 0] > 0
+
+
+def seen_sky(scene: Scene, hidden: torch.Tensor) -> Sky:
+    """The scene's sky as its cameras saw it, spread into directions in which something always stood before it, as photos say (`hidden`,
+    of `always_hidden`) or the splats do.
 
     What shines through a wall of alpha 0.99 is enough for Adam to turn the texels behind into noise, which a shifted view then shows
     between the houses.
@@ -126,7 +133,7 @@ def seen_sky(scene: Scene) -> Sky:
         np.add.at(looks, place, 1)
         np.add.at(free, place, sky)
     picture = SkyPicture(len(own))
-    picture.count = np.where(free > FREE * looks, free, 0)
+    picture.count = np.where((free > FREE * looks) & ~finer(hidden, len(own)).cpu().numpy(), free, 0)
     picture.sum = own * picture.count[..., None]
     return Sky(linear_from_srgb(picture.picture().clamp_min(0)))
 

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from recon.fit.motion import Motion
 from recon.frames import Frames, View
 from recon.seeds.points import spread
-from recon.skies import always_hidden, cells
+from recon.skies import always_hidden, cells, finer
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
@@ -49,8 +49,7 @@ class Openings:
     def backdrop(self, sky: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """The sky `[H, 2H, 3]`, and where no picture shows it any one grey, another one each time: a bright sky below the road would be the
         cheapest light at the edges of shade, and leave holes there."""
-        blind = F.interpolate(self.hidden[None, None].float(), sky.shape[:2])[0, 0, :, :, None] > 0
-        return torch.where(blind, upload(torch.rand(1, generator=generator), self.device), sky)
+        return torch.where(finer(self.hidden, len(sky))[..., None], upload(torch.rand(1, generator=generator), self.device), sky)
 
     def haze(self, alpha: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
         """What it costs that alpha `[H, W]`, as a view's camera sees it, is above 0 before the sky and below 1 under the horizon."""

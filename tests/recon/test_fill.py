@@ -6,7 +6,7 @@ import torch
 from recon.frames import View
 from recon.seeds.fill import FAR, unexplained
 from recon.seeds.sweep import companions, swept_depth
-from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, like_sky, seen_sky, sky_mask
+from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sky, seen_sky, sky_mask
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
 
@@ -120,11 +120,15 @@ def test_a_sky_that_something_always_hid_is_spread_from_where_it_was_seen():
     looked = torch.zeros(64, 128, dtype=torch.bool)
     looked[26:38, 52:64] = True  # 34 degrees to the left of +x and as much up and down as the wall covers
     sky = Sky(torch.where(looked[..., None], noise, blue))
-    seen = seen_sky(Scene(Placed(wall, still), (), sky, ego, rig)).linear
+    nowhere = torch.zeros(HIDDEN, 2 * HIDDEN, dtype=torch.bool)
+    seen = seen_sky(Scene(Placed(wall, still), (), sky, ego, rig), nowhere).linear
     assert (seen[looked] - blue).abs().max() < 1e-3
     assert (seen[26:38, 66:72] - blue).abs().max() < 1e-5
-    untouched = seen_sky(Scene(Placed(wall.select(torch.zeros(0, dtype=torch.long)), still), (), sky, ego, rig)).linear
-    assert (untouched[looked] - noise[looked]).abs().max() < 1e-5, "with no wall all of it was seen"
+    open_ = Scene(Placed(wall.select(torch.zeros(0, dtype=torch.long)), still), (), sky, ego, rig)
+    assert (seen_sky(open_, nowhere).linear[looked] - noise[looked]).abs().max() < 1e-5, "with no wall all of it was seen"
+    there = torch.nn.functional.max_pool2d(looked[None, None].float(), 3, 1, 1)[0, 0] > 0
+    told = seen_sky(open_, finer(there, HIDDEN)).linear
+    assert (told[looked] - blue).abs().max() < 1e-3, "with no splats before it, but of which photos say that it never shows"
 
 
 def test_directions_in_which_no_look_shows_the_sky_are_known():

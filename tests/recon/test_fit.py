@@ -16,6 +16,7 @@ from recon.fit.fit import Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.seeds.measured import Measured, mistake
+from recon.skies import finer
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
@@ -200,8 +201,7 @@ def test_behind_what_always_hides_the_sky_is_no_light_to_rely_on(drive):
     log = open_log(drive)
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
-    row, column = (torch.arange(n) * m // n for n, m in zip(fit.sky.shape[:2], fit.openings.hidden.shape, strict=True))
-    blind = fit.openings.hidden[row[:, None], column]
+    blind = finer(fit.openings.hidden, len(fit.sky))
     assert 0.01 < float(blind.float().mean()) < 0.99
     first, second = (fit.openings.backdrop(fit.sky, fit.generator) for _ in range(2))
     assert torch.equal(first[~blind], fit.sky[~blind]) and torch.equal(second[~blind], fit.sky[~blind])
