@@ -4,7 +4,8 @@ sparse    some frames of every camera: views between are guessed
 cycle     pictures rendered from a path beside the recorded one: the recorded views are then what is off the path
 crossref  every other camera, by direction: each half of the rig is seen through the other half's reconstruction
 
-The poses are those of the finished scene and are not corrected again, so that what is rendered lies where the photos lie.
+Poses and cameras' exposures are those of the finished scene and are not corrected again, so that what is rendered lies where the photos lie
+and is as bright: half a rig by itself would take its own first camera for the measure.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def refits(
         path = Path(folder) / f"{name}_scene"
         if not is_scene(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _fit(part, path, exposed_as(scene, less.fit), size, device)
+            _fit(scene, part, path, less.fit, size, device)
         loaded = load(path)
         assert isinstance(loaded, Scene)
         made.append(Refit(References(shots_of(part, scene), loaded.to(device)), shown))
@@ -92,10 +93,10 @@ def refits(
 
 
 def exposed_as(scene: Scene, config: FitConfig) -> FitConfig:
-    """A fit that gives frames exposures of their own only where the scene's have them: its cameras are what shows it."""
-    if any(camera.gains is not None for camera in scene.rig.values()):
-        return config
-    return replace(config, refine=tuple(kind for kind in config.refine if kind != "gains"))
+    """A fit that keeps the scene's exposures of cameras, and gives frames some of their own only where the scene's have them: its cameras
+    are what shows it."""
+    kept = {"exposures"} if any(camera.gains is not None for camera in scene.rig.values()) else {"exposures", "gains"}
+    return replace(config, refine=tuple(kind for kind in config.refine if kind not in kept))
 
 
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
@@ -179,9 +180,11 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
     return replace(log, ego=ego, cameras=cameras)
 
 
-def _fit(log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
+def _fit(scene: Scene, log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
     names, span = choose(log, list(log.cameras))
+    config = exposed_as(scene, config)
     start, fit = begin(log, names, span, size, config, held_out=0, device=device)
+    fit.exposures.copy_(torch.stack([scene.rig_camera(name).exposure for name in names]))
     with Progress(f"fit {path.name}", total=config.steps) as steps:
         while fit.step_count < config.steps:
             fit.step()

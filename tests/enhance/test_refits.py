@@ -55,7 +55,7 @@ def test_a_recording_is_moved_as_its_scene_was(log, street):
 def test_a_refit_gives_frames_exposures_of_their_own_where_its_scene_does(street):
     rig = {name: replace(c, gains=torch.ones(len(c.times_us), 3)) for name, c in street.rig.items()}
     assert "gains" in SHORT.refine and "gains" not in exposed_as(street, SHORT).refine
-    assert exposed_as(replace(street, rig=rig), SHORT) is SHORT
+    assert "gains" in exposed_as(replace(street, rig=rig), SHORT).refine
 
 
 def test_the_cycles_pictures_are_taken_from_beside_the_path(log, street, tmp_path):
@@ -79,8 +79,18 @@ def test_a_refit_lies_where_the_scene_lies_and_is_kept(log, street, tmp_path, mo
     assert len(refits("sparse", street, log, tmp_path, QUICK, SIZE)) == 1
 
 
+def test_a_refit_is_exposed_as_its_scene_is(log, street, tmp_path):
+    """Half a rig by itself would take its own first camera for the measure, and the other half's views would be too bright or too dark."""
+    darker = torch.cat([torch.diag(torch.tensor([0.7, 0.8, 0.9])), torch.full((3, 1), 0.01)], 1)
+    dark = replace(street, rig=street.rig | {"left_camera": replace(street.rig["left_camera"], exposure=darker)})
+    halves = refits("crossref", dark, log, tmp_path, QUICK, SIZE)
+    kept = {name: camera.exposure for r in halves for name, camera in r.references.recorded.rig.items()}
+    assert set(kept) == {"front_camera", "left_camera"}
+    assert all(torch.equal(kept[name], camera.exposure) for name, camera in dark.rig.items())
+
+
 def test_each_half_of_the_rig_shows_the_other_halfs_views(log, street, tmp_path, monkeypatch):
-    monkeypatch.setattr("enhance.refits._fit", lambda part, path, config, size, device: _instead(street, path))
+    monkeypatch.setattr("enhance.refits._fit", lambda scene, part, path, config, size, device: _instead(scene, path))
     made = refits("crossref", street, log, tmp_path, QUICK, SIZE)
     assert {r.cameras for r in made} == {("front_camera",), ("left_camera",)}
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]})
