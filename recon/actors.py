@@ -62,7 +62,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     offsets: list[float] = []
     for sweep in sweeps:
         points = sweep.read()
-        keep = _beside_body(log, sweep, points.xyz)
+        keep = np.ones(len(points.xyz), dtype=bool)
         near = _Near(points.xyz)
         for track in tracks:
             at = stamps[track.name].get(sweep.time_us)
@@ -130,13 +130,6 @@ def _between(track: Track, time_us: int) -> bool:
     """Whether a track's boxes shortly before and after a moment tell where it is then."""
     later = int(np.searchsorted(track.times_us, time_us))
     return 0 < later < len(track.times_us) and track.times_us[later] - track.times_us[later - 1] <= APART_US
-
-
-def _beside_body(log: Log, sweep: Sweep, xyz: np.ndarray) -> np.ndarray:
-    """Mask of points that are not on the recording car itself."""
-    back = inverse(log.ego.at(sweep.time_us)).numpy()
-    local = xyz @ back[:3, :3].T + back[:3, 3]
-    return ~((np.abs(local[:, 0]) < 2.6) & (np.abs(local[:, 1]) < 1.1) & (local[:, 2] > 0.1))
 
 
 def _retimed(track: Track, scanned: np.ndarray, usual: float) -> Track:

@@ -14,6 +14,7 @@ from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
 from recon.readers.photos import is_photos, is_video, read_photos
 from recon.readers.waymo import is_waymo, read_waymo
+from recon.recorder import without_recorder
 
 
 def open_log(
@@ -34,7 +35,7 @@ def open_log(
         if given:
             raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
         _knows_its_lenses(path, angle_of_view)
-        return read(path)
+        return without_recorder(read(path))
     if is_video(path):
         return read_photos(path, camera_height, metres_per_unit, angle_of_view)
     if not path.is_dir():

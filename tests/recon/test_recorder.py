@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+import torch
+
+from recon import open_log
+from recon.log import LidarPoints, Log, Sweep
+from recon.recorder import without_recorder
+from scenes import Trajectory
+from scenes.poses import translation, yaw
+
+REAR_AXLE = [
+    [0.94, 0.0, 1.84],  # the lidar's own housing, at no distance
+    [2.7, 0.4, 1.0],  # the bonnet
+    [-0.9, -0.8, 0.9],  # the boot
+    [4.6, 0.0, 0.0],  # the road ahead
+    [0.9, 1.5, 0.5],  # a door beside
+    [-2.4, 0.0, 0.7],  # a car behind
+]
+
+
+@pytest.mark.parametrize("lidars", [{0: np.array([0.94, 0.0, 1.84])}, {1: np.array([-1.1, 0, 1]), 2: np.array([3.0, 0.5, 1])}])
+def test_points_on_the_recording_car_are_no_street(lidars):
+    pose = translation(30.0, -4.0, 0.5) @ yaw(2.1)
+    ego = Trajectory(torch.tensor([0, 100_000]), torch.stack([pose @ translation(-1.0, 0, 0), pose]))
+    xyz = np.array(REAR_AXLE) @ pose[:3, :3].numpy().T + pose[:3, 3].numpy()
+    points = LidarPoints(xyz, np.arange(6), np.arange(6) % 2)
+    log = Log("street", "street", {}, (Sweep(3, 100_000, lambda: points),), (), ego, {}, lidars=lidars)
+    (sweep,) = without_recorder(log).sweeps
+    left = sweep.read()
+    assert (sweep.index, sweep.time_us) == (3, 100_000)
+    np.testing.assert_array_equal(left.xyz, xyz[3:])
+    assert left.times_us.tolist() == [3, 4, 5] and left.sensor.tolist() == [1, 0, 1]
+
+
+def test_a_log_opens_without_them(drive):
+    log = open_log(drive)
+    for sweep in log.sweeps:
+        local = sweep.read().xyz - log.ego.at(sweep.time_us)[:3, 3].numpy()
+        assert len(local) and np.linalg.norm(local[:, :2], axis=1).min() > 1
