@@ -131,11 +131,9 @@ def _seen_from(asset: Asset) -> dict[str, str]:
 
     seen = ", ".join(f"{name} {count}" for name, count in asset.meta.get("sectors", {}).items() if count)
     mirrored = " (the other side is its mirror image)" if asset.meta.get("mirrored") else ""
-    closed = asset.meta.get("closed")
-    told = {
-        "seen from": seen + mirrored,
-        "a guess from": ", ".join(unseen_sides(asset)) + (f" ({' and '.join(closed)} closed by the outline of the sides)" if closed else ""),
-    }
+    closed = " and ".join(asset.meta.get("closed", ()))
+    guess = ", ".join(unseen_sides(asset)) + (f" ({closed} closed by the outline of the sides)" if closed else "")
+    told = {"seen from": seen + mirrored, "a guess from": guess}
     return {key: value for key, value in told.items() if value}
 
 

@@ -24,7 +24,10 @@ RIM = 6
 """Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
 
 BLUE = 0.02
-"""Part of a drive's pictures from which on their sky is blue, and nothing else is taken for it."""
+"""Part of a drive's pictures from which on their sky is blue, and no other colour is taken for it, but for clipped white beside it."""
+
+DAZZLED = 1.2
+"""How many times as much sky there must be with what is clipped for that to be taken for it."""
 
 SWEEPS = 16
 """Sweeps, spread over the span, by which is told what is no sky."""
@@ -84,14 +87,14 @@ class Frames:
     """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
 
     From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
-    shows at its edges, no other one does. `overcast` where their sky has no colour.
+    shows at its edges, no other one does. `under` is one of `SKIES`.
     """
 
     names: list[str]
     width: int
     height: int
     views: list[View]
-    overcast: bool = False
+    under: str = "blue"
 
     def training(self) -> list[View]:
         return [v for v in self.views if not v.held_out]
@@ -101,10 +104,10 @@ class Frames:
 
     def sky_of(self, view: View) -> np.ndarray:
         """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
-        found = sky_mask(view.image.numpy(), self.overcast)
+        found = sky_mask(view.image.numpy(), self.under)
         if view.ego is not None:
             found &= ~view.ego.numpy()
-        if not self.overcast:
+        if self.under == "blue":
             return found
         rows, columns = (np.arange(n) * of // n for n, of in zip(found.shape, view.sky.shape, strict=True))
         return found & ndimage.binary_dilation(view.sky.numpy(), iterations=2)[rows[:, None], columns]
@@ -154,36 +157,38 @@ def load_frames(
             views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, _sky(image, ego), ego))
         if not any(v.camera == c and not v.held_out for v in views):
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
-    views, overcast = _under_their_sky(log, names, views)
+    views, under = _under_their_sky(log, names, views)
     if log.points is not None:
         views = _balanced(log, names, views)
     elif gains:
         views = _exposed(log, names, views)
-    return Frames(names, *size, views, overcast)
+    return Frames(names, *size, views, under)
 
 
-def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], bool]:
-    """The views, and whether their sky is overcast: then each is told its sky as such a one is known.
+def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], str]:
+    """The views, and which of `SKIES` theirs is: then each is told its sky as such a one is known.
 
-    That takes colour, and what lidar strikes is left out: a white wall fits the description as well.
+    One that is not blue takes colour, and what lidar strikes is left out: a white wall fits the description as well. Beside blue, white is
+    sky only where there is lidar to tell.
     """
     blue = float(np.mean([v.sky.float().mean() for v in views]))
-    if blue >= BLUE or all(_colourless(v.image) for v in views[:: max(1, len(views) // 8)]):
-        return views, False
     within = log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views)))
+    if (blue >= BLUE and not within) or all(_colourless(v.image) for v in views[:: max(1, len(views) // 8)]):
+        return views, "blue"
     chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
     points = [s.read().xyz for s in chosen]
-    grey = []
+    kind, more = ("blinding", DAZZLED) if blue >= BLUE else ("overcast", 2)
+    told = []
     for view in views:
-        sky = _sky(view.image, view.ego, overcast=True).numpy()
+        sky = _sky(view.image, view.ego, kind).numpy()
         if chosen:
             nearest = min(range(len(chosen)), key=lambda i: abs(chosen[i].time_us - view.time_us))
             camera = log.camera(names[view.camera]).camera(view.index, sky.shape[1], sky.shape[0])
             sky = _unstruck(sky, points[nearest], camera)
-        grey.append(replace(view, sky=torch.from_numpy(sky)))
-    if float(np.mean([v.sky.float().mean() for v in grey])) <= 2 * blue:
-        return views, False
-    return grey, True
+        told.append(replace(view, sky=torch.from_numpy(sky) | view.sky if kind == "blinding" else torch.from_numpy(sky)))
+    if float(np.mean([v.sky.float().mean() for v in told])) <= more * blue:
+        return views, "blue"
+    return told, kind
 
 
 def _colourless(image: torch.Tensor) -> bool:
@@ -268,10 +273,10 @@ def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, in
     return at_size(small, size[1], size[0])
 
 
-def _sky(image: torch.Tensor, ego: torch.Tensor | None, overcast: bool = False) -> torch.Tensor:
+def _sky(image: torch.Tensor, ego: torch.Tensor | None, kind: str = "blue") -> torch.Tensor:
     """The sky of an image on a grid about 240 cells wide: without its rim, but for what of that looks like it, where splats of its colour
     would stand before walls as soon as it is seen from elsewhere. Nothing of it is in the recording car."""
     step = max(1, image.shape[1] // 240)
     coarse = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step].numpy())
-    found = torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse, overcast), border_value=1), RIM))
+    found = torch.from_numpy(like_sky(coarse, ndimage.binary_erosion(sky_mask(coarse, kind), border_value=1), RIM))
     return found if ego is None else found & ~ego[step // 2 :: step, step // 2 :: step]

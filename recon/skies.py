@@ -23,19 +23,29 @@ FREE = 0.05
 HIDDEN = 128
 """Rows of the grid of directions in which the sky is never seen: 1.4 degrees each."""
 
+SKIES = ("blue", "overcast", "blinding")
+"""How skies look: what is no blue sky is known by less, and may as well be a white wall."""
+
+WHITE = 250
+"""Of all channels, from which on a blinding sky is clipped."""
+
 TINT, BRIGHTEST = 32, 0.8
 """Of an overcast sky: levels between its channels at most, and part of the light of the picture's brightest fiftieth that it has."""
 
 
-def sky_mask(image: np.ndarray, overcast: bool = False) -> np.ndarray:
-    """Pixels `[H, W]` of a uint8 image that are surely sky: smooth, bright enough, joined to the image's top row, and bluish, or under an
-    overcast sky (or one that blinds the camera) without colour and the brightest there is."""
+def sky_mask(image: np.ndarray, kind: str = "blue") -> np.ndarray:
+    """Pixels `[H, W]` of a uint8 image that are surely sky, as one of `SKIES` looks: smooth, bright enough, joined to the image's top row,
+    and bluish; under an overcast sky without colour and the brightest there is; under a blinding one bluish or clipped."""
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     grey = rgb.mean(-1)
     edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
-    grey_sky = (np.ptp(rgb, axis=-1) < TINT) & (grey > BRIGHTEST * np.percentile(grey, 98))
-    blue_sky = rgb[..., 2] > rgb[..., 0] + 2
-    smooth = (edge < 3.0) & (grey_sky if overcast else blue_sky) & (grey > 90)
+    if kind == "overcast":
+        coloured = (np.ptp(rgb, axis=-1) < TINT) & (grey > BRIGHTEST * np.percentile(grey, 98))
+    else:
+        coloured = rgb[..., 2] > rgb[..., 0] + 2
+    if kind == "blinding":
+        coloured |= rgb.min(-1) >= WHITE
+    smooth = (edge < 3.0) & coloured & (grey > 90)
     label, _ = ndimage.label(smooth)
     large = np.bincount(label.ravel()) > 1e-3 * grey.size
     top = np.array([k for k in np.unique(label[:3][smooth[:3]]) if large[k]], dtype=label.dtype)

@@ -34,7 +34,7 @@ def test_an_overcast_sky_is_known_by_its_light_and_only_where_it_is_asked_for():
     image = generator.integers(40, 160, (48, 64, 3)).astype(np.uint8)
     image[:20] = 238, 236, 233
     image[:20, 40:] = 150, 150, 150  # a concrete wall, as smooth as the sky
-    found = sky_mask(image, overcast=True)
+    found = sky_mask(image, "overcast")
     assert found[2:17, 2:37].all() and not found[:, 42:].any() and not found[23:].any()
     assert not sky_mask(image).any()
 

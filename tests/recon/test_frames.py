@@ -1,3 +1,4 @@
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -16,12 +17,15 @@ ALL = (0, 2**62)
 SIZE = (240, 120)
 
 
-def _log(sky: tuple[int, int, int], strikes: bool) -> Log:
-    """Three pictures of a street: sky to the left, to the right a wall as white as an overcast one, and lidar on it, or on the road."""
+def _log(sky: tuple[int, int, int], strikes: bool, wall: tuple[int, int, int] = (231, 229, 226), glare: bool = False) -> Log:
+    """Three pictures of a street: sky to the left, half of it clipped where there is glare, to the right a wall as white as an overcast
+    one, and lidar on it, or on the road."""
     generator = np.random.default_rng(0)
     image = generator.integers(20, 120, (120, 240, 3)).astype(np.uint8)
     image[:50] = sky
-    image[:70, 130:] = 231, 229, 226
+    image[:70, 130:] = wall
+    if glare:
+        image[:50, 60:120] = 255
     buffer = BytesIO()
     Image.fromarray(image).save(buffer, "png")
     times = torch.arange(3) * 100_000
@@ -37,12 +41,12 @@ def _log(sky: tuple[int, int, int], strikes: bool) -> Log:
 
 def _skies(log: Log) -> tuple[bool, np.ndarray, np.ndarray]:
     frames = load_frames(log, ["front"], ALL, SIZE, 0)
-    return frames.overcast, frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
+    return frames.under, frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
 
 
 def test_a_white_wall_under_an_overcast_sky_is_told_from_it_by_lidar():
-    overcast, coarse, fine = _skies(_log((236, 238, 240)[::-1], strikes=True))
-    assert overcast
+    under, coarse, fine = _skies(_log((236, 238, 240)[::-1], strikes=True))
+    assert under == "overcast"
     for mask in (coarse, fine):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
     _, unguarded, _ = _skies(_log((236, 238, 240)[::-1], strikes=False))
@@ -50,24 +54,37 @@ def test_a_white_wall_under_an_overcast_sky_is_told_from_it_by_lidar():
 
 
 def test_under_a_blue_sky_nothing_white_is_taken_for_it():
-    overcast, coarse, fine = _skies(_log((150, 180, 225), strikes=False))
-    assert not overcast
+    under, coarse, fine = _skies(_log((150, 180, 225), strikes=False))
+    assert under == "blue"
     for mask in (coarse, fine):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
 
 
+def test_beside_blue_what_is_clipped_is_sky_where_lidar_does_not_strike_it():
+    """A low sun behind houses blinds the camera: what shines there is no wall, and what shines and is struck is one."""
+    dazzled = _log((150, 180, 225), strikes=True, wall=(255, 255, 255), glare=True)
+    under, coarse, fine = _skies(dazzled)
+    assert under == "blinding"
+    for mask in (coarse, fine):
+        assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
+    under, coarse, fine = _skies(replace(dazzled, sweeps=()))
+    assert under == "blue"  # nothing tells
+    for mask in (coarse, fine):
+        assert mask[3:40, 5:55].mean() > 0.95 and mask[:, 70:].mean() < 0.02
+
+
 def test_pictures_without_colour_tell_no_sky():
-    overcast, coarse, _ = _skies(_log((255, 255, 255), strikes=True))
-    assert overcast and coarse.any()  # white among colours
+    under, coarse, _ = _skies(_log((255, 255, 255), strikes=True))
+    assert under == "overcast" and coarse.any()  # white among colours
     grey = _log((255, 255, 255), strikes=True)
     plain = BytesIO()
     Image.open(BytesIO(grey.cameras["front"].files[0].read())).convert("L").save(plain, "png")
     camera = grey.cameras["front"]
     object.__setattr__(camera, "files", (Packed("grey", plain.getvalue),) * 3)
-    overcast, coarse, _ = _skies(grey)
-    assert not overcast and not coarse.any()
+    under, coarse, _ = _skies(grey)
+    assert under == "blue" and not coarse.any()
 
 
 def test_the_made_up_streets_sky_is_blue(drive):
     log = open_log(drive)
-    assert not load_frames(log, list(log.cameras), ALL, (96, 54), 8).overcast
+    assert load_frames(log, list(log.cameras), ALL, (96, 54), 8).under == "blue"
