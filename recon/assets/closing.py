@@ -40,7 +40,7 @@ THERE = 0.15
 SOLID = 0.3
 """Opacity from which on a splat is a part of the outline."""
 
-ROUND = 0.3
+ROUND = 0.75
 """Metres over which an end curves into the sides."""
 
 FEWEST = 20

@@ -38,7 +38,7 @@ def test_a_front_that_nobody_saw_is_closed_where_the_sides_end():
     x, y, z = added.means.unbind(1)
     assert x.min() > 0.3 and x.max() < 2.25 and z.max() < 1.5 and y.abs().max() < 0.95
     # a grille at the nose, a bonnet behind it, a windscreen behind that
-    for part in ((x > 2.0) & (z < 0.8), (x > 0.9) & (x < 1.8) & (z > 0.75) & (z < 1.0), (x < 0.85) & (z > 1.0)):
+    for part in ((x > 1.9) & (z < 0.8), (x > 0.9) & (x < 1.8) & (z > 0.75) & (z < 1.0), (x < 0.85) & (z > 1.0)):
         cells = np.unique((y[part] / 0.1).floor().numpy())
         assert len(cells) >= 12, "closed from side to side"
     rgb = rgb_from_sh(added.sh[:, 0])
