@@ -134,7 +134,8 @@ def _seen_from(asset: Asset) -> dict[str, str]:
     closed = asset.meta.get("closed")
     told = {
         "seen from": seen + mirrored,
-        "a guess from": ", ".join(unseen_sides(asset)) + (f" ({' and '.join(closed)} closed by the outline of the sides)" if closed else ""),
+        "a guess from": ", ".join(unseen_sides(asset))
+        + (f" ({' and '.join(closed)} closed by the outline of the sides)" if closed else ""),
     }
     return {key: value for key, value in told.items() if value}
 
