@@ -168,8 +168,7 @@ class Log:
     def offsets(self, name: str) -> torch.Tensor:
         """`body_from_cam` `[F, 4, 4]` of every frame: the recorded camera pose as seen from the body at that moment."""
         cam = self.camera(name)
-        bodies = torch.stack([self.ego.at(int(t)) for t in cam.times_us])
-        return inverse(bodies) @ cam.world_from_cam
+        return inverse(self.ego.at_each(cam.times_us)) @ cam.world_from_cam
 
 
 def image_size(file: Path) -> tuple[int, int]:

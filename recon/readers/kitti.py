@@ -20,7 +20,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
 from recon.readers.spin import untwisted
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, translation, yaw
 from scenes.trajectory import Trajectory
@@ -64,7 +64,7 @@ def read_kitti_raw(path: Path) -> Log:
         body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
         stamps = _stamps(folder / "timestamps.txt")
         files = _files(folder / "data", ".png", len(stamps), 10)
-        world = torch.stack([ego.near(int(t)) @ body_from_cam for t in stamps])
+        world = ego.near_each(torch.from_numpy(stamps)) @ body_from_cam
         cameras[folder.name] = _camera(folder.name, projection, files, stamps, world)
     sweeps, lidar_times = _spinning(path / "velodyne_points", inverse(lidar_from_imu), ego)
     first = _oxts(path / "oxts" / "data" / f"{0:010d}.txt")
@@ -278,9 +278,9 @@ def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego
             rows = [[float(p.findtext(k, "")) for k in ("tx", "ty", "tz", "rz")] for p in item.findall("./poses/item")]
             count = min(len(rows), len(times) - first)
             stamps = times[first : first + count]
-            placed = [translation(*row[:3]) @ yaw(row[3]) for row in rows[:count]]
             if count > 0:
-                poses = torch.stack([ego.near(int(t)) @ body_from_lidar @ p for t, p in zip(stamps, placed, strict=True)])
+                placed = np.array(rows[:count])
+                poses = ego.near_each(torch.from_numpy(stamps)) @ body_from_lidar @ upright(placed[:, :3], placed[:, 3])
                 label = slug(item.findtext("objectType", ""), LABELS)
                 found.append(Boxes(str(number), label, stamps, poses, np.tile(size, (count, 1))))
     except (ElementTree.ParseError, ValueError) as problem:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.names import unknown
 from scenes.poses import pose_from, translation
@@ -171,8 +171,8 @@ def _tracks(tables: Tables, samples: dict, sweeps: list[dict], home: torch.Tenso
     for instance, rows in seen.items():
         times = np.array([at[row["sample_token"]] for row in rows], dtype=np.int64)
         sizes = np.array([[row["size"][1], row["size"][0], row["size"][2]] for row in rows])
-        base = torch.stack([home @ _pose(row) @ translation(0.0, 0.0, -row["size"][2] / 2) for row in rows])
-        found.append(Boxes(instance, label_of(kinds[instance]), times, base, sizes))
+        poses = home @ from_middles(torch.stack([_pose(row) for row in rows]), sizes[:, 2])
+        found.append(Boxes(instance, label_of(kinds[instance]), times, poses, sizes))
     return tracks_of(found, ego, str(tables.folder / "sample_annotation.json"))
 
 

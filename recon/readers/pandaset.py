@@ -17,7 +17,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
 from recon.readers.unpickle import read_frame
-from recon.tracks import named, slug
+from recon.tracks import named, slug, upright
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory
@@ -120,9 +120,8 @@ def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
 
 def _middles(times_us: np.ndarray, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Times and poses of the images' middle rows, of those at the stamps."""
-    path = lengthened(times_us, poses)
-    middle = times_us + MIDDLE_US
-    return torch.from_numpy(middle), torch.stack([path.at(t) for t in middle.tolist()])
+    middles = torch.from_numpy(times_us + MIDDLE_US)
+    return middles, lengthened(times_us, poses).at_each(middles)
 
 
 def _pickle(folder: Path, index: int) -> Path | None:
@@ -186,8 +185,7 @@ def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, ego: Trajector
         if not (np.isfinite(size).all() and (size > 0).all()):
             raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} must have positive dimensions, got {size.tolist()}")
         base = np.array([[e["position.x"], e["position.y"], e["position.z"] - e["dimensions.z"] / 2] for e in entries]) - origin
-        half = (np.array([e["yaw"] for e in entries], dtype=np.float64) + np.pi / 2) / 2
-        poses = pose_from(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), base)
+        poses = upright(base, np.array([e["yaw"] for e in entries], dtype=np.float64) + np.pi / 2)
         if not torch.isfinite(poses).all():
             raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} stands at a place that is not finite")
         label = slug(str(lead[0]["label"]), LABELS)

@@ -16,10 +16,10 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
 from recon.readers.arrow import read_cell, read_table
-from recon.tracks import Boxes, tracks_of
+from recon.tracks import Boxes, from_middles, tracks_of, upright
 from scenes.lenses import OpenCV
 from scenes.names import unknown
-from scenes.poses import inverse, translation, yaw
+from scenes.poses import inverse, translation
 from scenes.trajectory import Trajectory
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
@@ -112,8 +112,8 @@ def _cameras(component, home: torch.Tensor, ego: Trajectory) -> dict[str, LogCam
         lens = OpenCV(*(float(table[k][row]) for k in LENS))
         body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
         bodies = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine])
-        moved = [inverse(ego.near(t)) @ ego.near(m) for t, m in zip(stamps.tolist(), middles.tolist(), strict=True)]
-        poses = bodies @ torch.stack(moved) @ body_from_cam
+        moved = inverse(ego.near_each(torch.from_numpy(stamps))) @ ego.near_each(torch.from_numpy(middles))
+        poses = bodies @ moved @ body_from_cam
         files = tuple(Packed(f"{images}, {name} at {taken[WHEN][i]}", partial(read_cell, images, IMAGE, int(i))) for i in mine)
         size = int(table[width][row]), int(table[height][row])
         cameras[name] = LogCamera(name, lens, *size, files, torch.from_numpy(middles), poses, shutter, readout)
@@ -211,11 +211,6 @@ def _rotations(angles: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(r, -1) for r in rows], -2)
 
 
-def _base(row: np.ndarray) -> torch.Tensor:
-    """The place of a box's base centre, of its middle and size."""
-    return translation(float(row[0]), float(row[1]), float(row[2] - row[5] / 2))
-
-
 def _tracks(path: Path, ego: Trajectory) -> tuple:
     """Tracks of the boxes, which stand in the vehicle frame by their middles; signs are no objects that move."""
     if not path.is_file():
@@ -224,9 +219,9 @@ def _tracks(path: Path, ego: Trajectory) -> tuple:
     table = read_table(path, ("key.laser_object_id", WHEN, kind, *BOX))
     times = table[WHEN].astype(np.int64)
     rows = np.stack([table[k] for k in BOX], 1).astype(np.float64)
+    poses = ego.near_each(torch.from_numpy(times)) @ from_middles(upright(rows[:, :3], rows[:, 6]), rows[:, 5])
     found = []
     for name in dict.fromkeys(table["key.laser_object_id"].tolist()):
         mine = np.flatnonzero(table["key.laser_object_id"] == name)
-        poses = [ego.near(int(times[i])) @ _base(rows[i]) @ yaw(rows[i, 6]) for i in mine]
-        found.append(Boxes(str(name), LABELS.get(int(table[kind][mine[0]]), "object"), times[mine], torch.stack(poses), rows[mine, 3:6]))
+        found.append(Boxes(str(name), LABELS.get(int(table[kind][mine[0]]), "object"), times[mine], poses[mine], rows[mine, 3:6]))
     return tracks_of(found, ego, str(path))

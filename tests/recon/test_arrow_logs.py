@@ -18,7 +18,9 @@ from made_waymo import READOUT_US, SEGMENT, near_points, write_waymo  # noqa: E4
 
 from recon import open_log  # noqa: E402
 from recon.readers.waymo import _from_range, _rotations  # noqa: E402
+from recon.tracks import nearness  # noqa: E402
 from scenes.lenses import OpenCV, Pinhole  # noqa: E402
+from scenes.poses import inverse, pose_from, translation, yaw  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +70,52 @@ def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
     assert shutters == {"front": ("rows", READOUT_US), "front_right": ("columns", -READOUT_US)}  # the right one from right to left
     assert log.rig(96, 54)["front_right"].times_us[0] == log.camera("front_right").times_us[0] + READOUT_US // 2
     assert open_log(waymo).name == log.name  # the only segment needs no name
+
+
+def test_argoverse_boxes_stand_where_each_alone_is_placed(own_argoverse):
+    """One that the path does not cover is left out."""
+    import pandas as pd
+
+    path = own_argoverse / "annotations.feather"
+    table = pd.read_feather(path)
+    late = table.iloc[:1].assign(timestamp_ns=table["timestamp_ns"].max() + 10**9)
+    pd.concat([table, late], ignore_index=True).to_feather(path)
+    log = open_log(own_argoverse)
+    for track in log.tracks:
+        rows = table[table["track_uuid"] == track.sources[0]].to_dict("records")
+        assert track.times_us.tolist() == [row["timestamp_ns"] // 1000 for row in rows]
+        for row, pose in zip(rows, track.world_from_box, strict=True):
+            local = pose_from([row[f"q{k}"] for k in "wxyz"], [row[f"t{k}_m"] for k in "xyz"])
+            alone = log.ego.at(row["timestamp_ns"] // 1000) @ local @ translation(0.0, 0.0, -row["height_m"] / 2)
+            torch.testing.assert_close(pose, alone, atol=1e-9, rtol=0)
+
+
+def test_waymo_boxes_stand_where_each_alone_is_placed(waymo):
+    import pandas as pd
+
+    log = open_log(waymo / SEGMENT)
+    table = pd.read_parquet(waymo / f"lidar_box/{SEGMENT}.parquet")
+    for track in log.tracks:
+        rows = table[table["key.laser_object_id"] == track.sources[0]]
+        keys = [f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.z", "heading")]
+        values = zip(rows["key.frame_timestamp_micros"], rows[keys].to_numpy(), track.world_from_box, strict=True)
+        for t, (x, y, z, height, heading), pose in values:
+            alone = log.ego.at(t) @ translation(x, y, z - height / 2) @ yaw(heading)
+            torch.testing.assert_close(pose, alone, atol=1e-9, rtol=0)
+
+
+def test_the_way_to_a_box_and_to_a_camera_is_that_of_each_moment_alone(argoverse):
+    log = open_log(argoverse)
+    for track in log.tracks:
+        ways = [inverse(log.ego.at(t)) @ pose for t, pose in zip(track.times_us.tolist(), track.world_from_box, strict=True)]
+        assert nearness(track, log.ego) == pytest.approx(min(float(way[:3, 3].norm()) for way in ways), abs=1e-9)
+        assert nearness(replace(track, times_us=track.times_us + 10**9), log.ego) == float("inf")
+        late = replace(track, times_us=track.times_us + int(log.ego.span_us()[1] - track.times_us[0]))  # the first alone is covered
+        first = inverse(log.ego.at(int(late.times_us[0]))) @ track.world_from_box[0]
+        assert nearness(late, log.ego) == pytest.approx(float(first[:3, 3].norm()), abs=1e-9)
+    for name, camera in log.cameras.items():
+        alone = [inverse(log.ego.at(int(t))) @ pose for t, pose in zip(camera.times_us, camera.world_from_cam, strict=True)]
+        torch.testing.assert_close(log.offsets(name), torch.stack(alone), atol=1e-9, rtol=0)
 
 
 def test_a_range_images_middle_column_looks_ahead_and_its_first_row_up():
