@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
 from recon.readers.spin import untwisted
 from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.lenses import Pinhole
@@ -110,7 +110,7 @@ def read_kitti_odometry(path: Path) -> Log:
         "name": f"kitti-odometry-{number}", "source": f"KITTI odometry sequence {number}", **SHARE,
         "body": "lidar, x forward, y left, z up",
     }  # fmt: skip
-    return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3))
+    return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3, dtype=torch.float64))
 
 
 def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory, lidar: torch.Tensor) -> Log:
@@ -122,11 +122,12 @@ def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, eg
 
 
 def _camera(name: str, projection: torch.Tensor, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:
+    """times `[F]`, world: `world_from_cam` `[F, 4, 4]`, of all frames, of which `files` are the first."""
     p = projection.reshape(3, 4)
     lens = Pinhole(float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
     # the devkit counts pixel centres from 0, we from 0.5
     lens = Pinhole(lens.fx, lens.fy, lens.cx + 0.5, lens.cy + 0.5)
-    return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times), world)
+    return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times[: len(files)]), world[: len(files)])
 
 
 def _beside(projection: torch.Tensor) -> torch.Tensor:
@@ -202,11 +203,7 @@ def _stamps(path: Path) -> np.ndarray:
 
 
 def _files(folder: Path, end: str, count: int, digits: int) -> tuple[Path, ...]:
-    files = tuple(folder / f"{i:0{digits}d}{end}" for i in range(count))
-    lost = next((f for f in files if not f.is_file()), None)
-    if lost is not None:
-        raise FileNotFoundError(f"{lost} is missing; the time stamps name {count} frames")
-    return files
+    return leading([folder / f"{i:0{digits}d}{end}" for i in range(count)])
 
 
 def _oxts(path: Path) -> list[float]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
 from recon.readers.unpickle import read_frame
 from recon.tracks import named, slug, upright
 from scenes.lenses import Pinhole
@@ -105,17 +105,15 @@ def _stamped(folder: Path) -> tuple[np.ndarray, torch.Tensor]:
 
 def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
     times_us, poses = _stamped(folder)
-    files = tuple(folder / f"{i:02d}.jpg" for i in range(len(times_us)))
-    for file in files:
-        if not file.is_file():
-            raise FileNotFoundError(f"{file} is missing; {folder / 'timestamps.json'} names {len(files)} frames")
+    files = leading([folder / f"{i:02d}.jpg" for i in range(len(times_us))])
     width, height = image_size(files[0])
     lens = _json(folder / "intrinsics.json")
     try:
         pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
     except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
-    return LogCamera(folder.name, pinhole, width, height, files, *_middles(times_us, home @ poses), "rows", READOUT_US)
+    middles, world_from_cam = (values[: len(files)] for values in _middles(times_us, home @ poses))
+    return LogCamera(folder.name, pinhole, width, height, files, middles, world_from_cam, "rows", READOUT_US)
 
 
 def _middles(times_us: np.ndarray, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
