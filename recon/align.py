@@ -144,8 +144,7 @@ def moved(log: Log, correction: Trajectory) -> Log:
     """The log with all that it knows of the world moved by a correction that depends on the time."""
 
     def at(times_us: torch.Tensor) -> torch.Tensor:
-        first, last = correction.span_us()
-        return correction.at_each(times_us.clamp(first, last))
+        return correction.near_each(times_us)
 
     def camera(c: LogCamera) -> LogCamera:
         return replace(c, world_from_cam=at(c.times_us) @ c.world_from_cam)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -168,8 +169,7 @@ class Log:
     def offsets(self, name: str) -> torch.Tensor:
         """`body_from_cam` `[F, 4, 4]` of every frame: the recorded camera pose as seen from the body at that moment."""
         cam = self.camera(name)
-        bodies = torch.stack([self.ego.at(int(t)) for t in cam.times_us])
-        return inverse(bodies) @ cam.world_from_cam
+        return inverse(self.ego.at_each(cam.times_us)) @ cam.world_from_cam
 
 
 def image_size(file: Path) -> tuple[int, int]:
@@ -183,6 +183,20 @@ def image_size(file: Path) -> tuple[int, int]:
         raise
     except (OSError, UnidentifiedImageError) as problem:
         raise ValueError(f"{file} does not decode as an image ({problem}); fetch the file again") from None
+
+
+def leading(files: Sequence[Path]) -> tuple[Path, ...]:
+    """The pictures that are there of those that a camera's time stamps name, where no more than the last are missing.
+
+    A piece of a drive, as others share it, has its first pictures and all of its time stamps; stderr says how many. FileNotFoundError
+    naming a picture that is missing before others, which a download broke off, or the first where there is none.
+    """
+    count = next((i for i, file in enumerate(files) if not file.is_file()), len(files))
+    if count < len(files):
+        if not count or any(file.is_file() for file in files[count:]):
+            raise FileNotFoundError(f"{files[count]} is missing; the time stamps name {len(files)} frames")
+        print(f"{files[0].parent} holds the first {count} of {len(files)} pictures, which are read", file=sys.stderr)
+    return tuple(files[:count])
 
 
 def lengthened(times_us: np.ndarray, poses: torch.Tensor) -> Trajectory:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from recon.log import Track
-from scenes.poses import inverse
+from scenes.poses import inverse, pose_from
 from scenes.trajectory import Trajectory
 
 KINDS = {"pedestrian": "ped", "bicycle": "cyc", "motorcycle": "cyc", "scooter": "cyc", "cyclist": "cyc"}
@@ -39,6 +39,19 @@ class Boxes:
 def slug(label: str, known: dict[str, str]) -> str:
     """A class as a slug, by the log's own table first; unknown ones in lower case with dashes."""
     return known.get(label) or re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "object"
+
+
+def upright(places: np.ndarray, headings: np.ndarray) -> torch.Tensor:
+    """Poses `[T, 4, 4]` at places `[T, 3]`, turned by headings `[T]` radians about z."""
+    half = np.asarray(headings, dtype=np.float64) / 2
+    return pose_from(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), places)
+
+
+def from_middles(poses: torch.Tensor, heights: np.ndarray) -> torch.Tensor:
+    """Boxes' poses `[T, 4, 4]` at their base centres, of such at their middles and heights `[T]`."""
+    down = torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1)
+    down[:, 2, 3] = -torch.from_numpy(np.asarray(heights, dtype=np.float64)) / 2
+    return poses @ down
 
 
 def tracks_of(found: list[Boxes], ego: Trajectory, where: str) -> tuple[Track, ...]:
@@ -71,5 +84,7 @@ def named(tracks: list[Track], ego: Trajectory) -> tuple[Track, ...]:
 
 def nearness(track: Track, ego: Trajectory) -> float:
     """Metres between the body and the box where they were nearest; inf where they share no time."""
-    pairs = zip(track.times_us.tolist(), track.world_from_box, strict=True)
-    return min((float((inverse(ego.at(t)) @ pose)[:3, 3].norm()) for t, pose in pairs if ego.covers(t)), default=float("inf"))
+    times = torch.from_numpy(track.times_us)
+    shared = ego.covers_each(times)
+    away = (inverse(ego.at_each(times[shared])) @ track.world_from_box[shared])[:, :3, 3].norm(dim=1)
+    return float(away.min()) if len(away) else float("inf")

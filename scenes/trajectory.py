@@ -47,6 +47,11 @@ class Trajectory:
         first, last = self.span_us()
         return first <= int(time_us) <= last
 
+    def covers_each(self, times_us: torch.Tensor) -> torch.Tensor:
+        """Which of times int64 `[n]` are covered, bool `[n]`."""
+        first, last = self.span_us()
+        return (first <= times_us) & (times_us <= last)
+
     def at(self, time_us: int) -> torch.Tensor:
         """`world_from_body` `[4, 4]` at a time: slerp and lerp between neighbours. ValueError where not covered."""
         if not self.covers(time_us):
@@ -77,6 +82,10 @@ class Trajectory:
         """`world_from_body` `[4, 4]` at a time, or at the nearest that is covered: where a readout ends after the path does."""
         first, last = self.span_us()
         return self.at(min(max(int(time_us), first), last))
+
+    def near_each(self, times_us: torch.Tensor) -> torch.Tensor:
+        """`world_from_body` `[n, 4, 4]` at times int64 `[n]`, or at the nearest that are covered, as `near` gives them one by one."""
+        return self.at_each(times_us.clamp(*self.span_us()))
 
     def shifted(self, lateral: float = 0.0, vertical: float = 0.0, forward: float = 0.0) -> Trajectory:
         """Every pose moved by metres along its own body axes: forward x, left y, up z."""

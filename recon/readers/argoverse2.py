@@ -16,7 +16,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, lengthened
 from recon.readers.arrow import read_table
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory
@@ -61,7 +61,7 @@ def read_argoverse2(path: Path) -> Log:
             raise ValueError(f"{path / 'calibration/egovehicle_SE3_sensor.feather'} does not say where {name} stands")
         lens = Pinhole(*(float(lenses[k][row]) for k in ("fx_px", "fy_px", "cx_px", "cy_px")))
         stamps = torch.tensor([t for t, _ in files])
-        poses = torch.stack([ego.at(t) for t, _ in files]) @ mount_of[name]
+        poses = ego.at_each(stamps) @ mount_of[name]
         size = int(lenses["width_px"][row]), int(lenses["height_px"][row])
         cameras[str(name)] = LogCamera(str(name), lens, *size, tuple(f for _, f in files), stamps, poses)
     if not cameras:
@@ -108,12 +108,14 @@ def _tracks(path: Path, ego: Trajectory) -> tuple:
     if not path.is_file():  # the test split has none
         return ()
     table = read_table(path, ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *POSE))
-    times, local = _us(table["timestamp_ns"]), _poses(table)
+    stamps = torch.from_numpy(_us(table["timestamp_ns"]))
     sizes = np.stack([table[k] for k in ("length_m", "width_m", "height_m")], 1).astype(np.float64)
+    covered = ego.covers_each(stamps)
+    poses = ego.near_each(stamps) @ from_middles(_poses(table), sizes[:, 2])
     found = []
     for uuid in dict.fromkeys(table["track_uuid"].tolist()):
-        mine = np.array([i for i in np.flatnonzero(table["track_uuid"] == uuid) if ego.covers(int(times[i]))], dtype=np.int64)
+        mine = np.flatnonzero((table["track_uuid"] == uuid) & covered.numpy())
         if len(mine):
-            poses = torch.stack([ego.at(int(times[i])) @ local[i] @ translation(0.0, 0.0, -sizes[i, 2] / 2) for i in mine])
-            found.append(Boxes(str(uuid), slug(str(table["category"][mine[0]]), LABELS), times[mine], poses, sizes[mine]))
+            label = slug(str(table["category"][mine[0]]), LABELS)
+            found.append(Boxes(str(uuid), label, stamps.numpy()[mine], poses[mine], sizes[mine]))
     return tracks_of(found, ego, str(path))

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
 from recon.readers.spin import untwisted
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, translation, yaw
 from scenes.trajectory import Trajectory
@@ -64,7 +64,7 @@ def read_kitti_raw(path: Path) -> Log:
         body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
         stamps = _stamps(folder / "timestamps.txt")
         files = _files(folder / "data", ".png", len(stamps), 10)
-        world = torch.stack([ego.near(int(t)) @ body_from_cam for t in stamps])
+        world = ego.near_each(torch.from_numpy(stamps)) @ body_from_cam
         cameras[folder.name] = _camera(folder.name, projection, files, stamps, world)
     sweeps, lidar_times = _spinning(path / "velodyne_points", inverse(lidar_from_imu), ego)
     first = _oxts(path / "oxts" / "data" / f"{0:010d}.txt")
@@ -110,7 +110,7 @@ def read_kitti_odometry(path: Path) -> Log:
         "name": f"kitti-odometry-{number}", "source": f"KITTI odometry sequence {number}", **SHARE,
         "body": "lidar, x forward, y left, z up",
     }  # fmt: skip
-    return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3))
+    return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3, dtype=torch.float64))
 
 
 def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory, lidar: torch.Tensor) -> Log:
@@ -122,11 +122,12 @@ def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, eg
 
 
 def _camera(name: str, projection: torch.Tensor, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:
+    """times `[F]`, world: `world_from_cam` `[F, 4, 4]`, of all frames, of which `files` are the first."""
     p = projection.reshape(3, 4)
     lens = Pinhole(float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
     # the devkit counts pixel centres from 0, we from 0.5
     lens = Pinhole(lens.fx, lens.fy, lens.cx + 0.5, lens.cy + 0.5)
-    return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times), world)
+    return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times[: len(files)]), world[: len(files)])
 
 
 def _beside(projection: torch.Tensor) -> torch.Tensor:
@@ -202,11 +203,7 @@ def _stamps(path: Path) -> np.ndarray:
 
 
 def _files(folder: Path, end: str, count: int, digits: int) -> tuple[Path, ...]:
-    files = tuple(folder / f"{i:0{digits}d}{end}" for i in range(count))
-    lost = next((f for f in files if not f.is_file()), None)
-    if lost is not None:
-        raise FileNotFoundError(f"{lost} is missing; the time stamps name {count} frames")
-    return files
+    return leading([folder / f"{i:0{digits}d}{end}" for i in range(count)])
 
 
 def _oxts(path: Path) -> list[float]:
@@ -278,9 +275,9 @@ def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego
             rows = [[float(p.findtext(k, "")) for k in ("tx", "ty", "tz", "rz")] for p in item.findall("./poses/item")]
             count = min(len(rows), len(times) - first)
             stamps = times[first : first + count]
-            placed = [translation(*row[:3]) @ yaw(row[3]) for row in rows[:count]]
             if count > 0:
-                poses = torch.stack([ego.near(int(t)) @ body_from_lidar @ p for t, p in zip(stamps, placed, strict=True)])
+                placed = np.array(rows[:count])
+                poses = ego.near_each(torch.from_numpy(stamps)) @ body_from_lidar @ upright(placed[:, :3], placed[:, 3])
                 label = slug(item.findtext("objectType", ""), LABELS)
                 found.append(Boxes(str(number), label, stamps, poses, np.tile(size, (count, 1))))
     except (ElementTree.ParseError, ValueError) as problem:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track, lengthened
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Fisheye, FTheta, Lens, OpenCV, Pinhole
 from scenes.poses import inverse, translation
 from scenes.trajectory import Trajectory
@@ -187,7 +187,6 @@ def _tracks(loader, home: torch.Tensor, ego: Trajectory, file: Path) -> tuple[Tr
         local[:, :3, :3] = Rotation.from_euler("xyz", [o.bbox3.rot for o in observations]).as_matrix()
         local[:, :3, 3] = [o.bbox3.centroid for o in observations]
         sizes = np.array([o.bbox3.dim for o in observations], dtype=np.float64)
-        local[:, :3, 3] -= local[:, :3, 2] * sizes[:, 2:] / 2
         label = slug(str(observations[0].class_id), LABELS)
-        found.append(Boxes(track, label, times, home @ frames @ torch.from_numpy(local), sizes))
+        found.append(Boxes(track, label, times, home @ frames @ from_middles(torch.from_numpy(local), sizes[:, 2]), sizes))
     return tracks_of(found, ego, str(file))

@@ -8,14 +8,17 @@ and sizes as width, length, height. Sweeps are published free of the car's own m
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
-from recon.tracks import Boxes, slug, tracks_of
+from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.names import unknown
 from scenes.poses import pose_from, translation
@@ -86,24 +89,49 @@ def read_nuscenes(path: Path) -> Log:
 
 
 class Tables:
-    """The tables of one version, read as they are asked for."""
+    """The tables of one version, of which the whole data set's have millions of rows: they are read one by one, none is kept."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
-    def rows(self, name: str) -> list[dict]:
-        """The rows of a table. FileNotFoundError, ValueError naming the file."""
+    def rows(self, name: str) -> Iterator[dict]:
+        """The rows of a table, as they are read. FileNotFoundError, ValueError naming the file."""
         path = self.folder / f"{name}.json"
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing; nuScenes' metadata comes as a download of its own: unpack it there")
-        try:
-            rows = json.loads(path.read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as problem:
-            raise ValueError(f"{path} is not json ({problem}); fetch it again") from None
-        lost = [key for key in KEYS[name] if not isinstance(rows, list) or any(key not in row for row in rows)]
-        if lost:
-            raise ValueError(f'{path} has rows without "{lost[0]}"; it is not as nuScenes writes it')
-        return rows
+        keys = frozenset(KEYS[name])
+        with open(path, encoding="utf-8") as file:
+            for row in _entries(file, path):
+                if not isinstance(row, dict) or not keys <= row.keys():
+                    lost = next(key for key in KEYS[name] if not isinstance(row, dict) or key not in row)
+                    raise ValueError(f'{path} has rows without "{lost}"; it is not as nuScenes writes it')
+                yield row
+
+
+CHUNK = 1 << 20
+"""Characters of a table that are read at once: a row has some hundreds."""
+BEGIN, NEXT = re.compile(r"\s*\[\s*(\])?\s*"), re.compile(r"\s*(?:,|(\]))\s*")
+"""What stands before a list's first entry and after each; with a group where that ends the list."""
+
+
+def _entries(file: TextIO, path: Path) -> Iterator:
+    """The entries of a json list, one at a time. ValueError naming the file where it is none, or is cut off."""
+    decode, count = json.JSONDecoder().raw_decode, 0
+    try:
+        text = file.read(CHUNK)
+        mark = BEGIN.match(text)
+        while mark and not mark[1]:
+            entry, at = decode(text, mark.end())
+            yield entry
+            count += 1
+            if len(text) - at < CHUNK and (more := file.read(CHUNK)):  # else the next entry may be cut
+                text, at = text[at:] + more, 0
+            mark = NEXT.match(text, at)
+        if not mark or mark.end() < len(text):
+            raise ValueError("it is not one whole list")
+    except ValueError as problem:
+        why = problem.msg if isinstance(problem, json.JSONDecodeError) else problem
+        raise ValueError(f"{path} is not json ({why}, after {count} rows); fetch it again") from None
 
 
 KEYS = {
@@ -171,8 +199,8 @@ def _tracks(tables: Tables, samples: dict, sweeps: list[dict], home: torch.Tenso
     for instance, rows in seen.items():
         times = np.array([at[row["sample_token"]] for row in rows], dtype=np.int64)
         sizes = np.array([[row["size"][1], row["size"][0], row["size"][2]] for row in rows])
-        base = torch.stack([home @ _pose(row) @ translation(0.0, 0.0, -row["size"][2] / 2) for row in rows])
-        found.append(Boxes(instance, label_of(kinds[instance]), times, base, sizes))
+        poses = home @ from_middles(torch.stack([_pose(row) for row in rows]), sizes[:, 2])
+        found.append(Boxes(instance, label_of(kinds[instance]), times, poses, sizes))
     return tracks_of(found, ego, str(tables.folder / "sample_annotation.json"))
 
 

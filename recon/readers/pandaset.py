@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lengthened
+from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
 from recon.readers.unpickle import read_frame
-from recon.tracks import named, slug
+from recon.tracks import named, slug, upright
 from scenes.lenses import Pinhole
 from scenes.poses import pose_from, translation
 from scenes.trajectory import Trajectory
@@ -105,24 +105,21 @@ def _stamped(folder: Path) -> tuple[np.ndarray, torch.Tensor]:
 
 def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
     times_us, poses = _stamped(folder)
-    files = tuple(folder / f"{i:02d}.jpg" for i in range(len(times_us)))
-    for file in files:
-        if not file.is_file():
-            raise FileNotFoundError(f"{file} is missing; {folder / 'timestamps.json'} names {len(files)} frames")
+    files = leading([folder / f"{i:02d}.jpg" for i in range(len(times_us))])
     width, height = image_size(files[0])
     lens = _json(folder / "intrinsics.json")
     try:
         pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
     except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
-    return LogCamera(folder.name, pinhole, width, height, files, *_middles(times_us, home @ poses), "rows", READOUT_US)
+    middles, world_from_cam = (values[: len(files)] for values in _middles(times_us, home @ poses))
+    return LogCamera(folder.name, pinhole, width, height, files, middles, world_from_cam, "rows", READOUT_US)
 
 
 def _middles(times_us: np.ndarray, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Times and poses of the images' middle rows, of those at the stamps."""
-    path = lengthened(times_us, poses)
-    middle = times_us + MIDDLE_US
-    return torch.from_numpy(middle), torch.stack([path.at(t) for t in middle.tolist()])
+    middles = torch.from_numpy(times_us + MIDDLE_US)
+    return middles, lengthened(times_us, poses).at_each(middles)
 
 
 def _pickle(folder: Path, index: int) -> Path | None:
@@ -186,8 +183,7 @@ def _tracks(path: Path, times_us: np.ndarray, origin: np.ndarray, ego: Trajector
         if not (np.isfinite(size).all() and (size > 0).all()):
             raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} must have positive dimensions, got {size.tolist()}")
         base = np.array([[e["position.x"], e["position.y"], e["position.z"] - e["dimensions.z"] / 2] for e in entries]) - origin
-        half = (np.array([e["yaw"] for e in entries], dtype=np.float64) + np.pi / 2) / 2
-        poses = pose_from(np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1), base)
+        poses = upright(base, np.array([e["yaw"] for e in entries], dtype=np.float64) + np.pi / 2)
         if not torch.isfinite(poses).all():
             raise ValueError(f"{lead[0]['file']}: cuboid {sources[0]} stands at a place that is not finite")
         label = slug(str(lead[0]["label"]), LABELS)

@@ -16,7 +16,7 @@ def untwisted(xyz: np.ndarray, times_us: np.ndarray, body_from_lidar: torch.Tens
     if not len(xyz):
         return np.zeros((0, 3))
     knots = np.unique(np.linspace(times_us.min(), times_us.max(), STEPS + 1).round().astype(np.int64))
-    poses = torch.stack([ego.near(int(t)) @ body_from_lidar for t in knots]).numpy()
+    poses = (ego.near_each(torch.from_numpy(knots)) @ body_from_lidar).numpy()
     left = (np.searchsorted(knots, times_us, side="right") - 1).clip(0, max(len(knots) - 2, 0))
     right = np.minimum(left + 1, len(knots) - 1)
     share = ((times_us - knots[left]) / np.maximum(knots[right] - knots[left], 1))[:, None]

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
-from recon.readers.arrow import read_cell, read_table
-from recon.tracks import Boxes, tracks_of
+from recon.readers.arrow import Rows, read_cell, read_table
+from recon.tracks import Boxes, from_middles, tracks_of, upright
 from scenes.lenses import OpenCV
 from scenes.names import unknown
-from scenes.poses import inverse, translation, yaw
+from scenes.poses import inverse, translation
 from scenes.trajectory import Trajectory
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
@@ -29,6 +29,14 @@ FRONT = ("front", "front_left", "front_right")
 OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 IMAGE = "[CameraImageComponent].image"
 WHEN = "key.frame_timestamp_micros"
+BODY = "[VehiclePoseComponent].world_from_vehicle.transform"
+RANGES, PIXELS = "[LiDARComponent].range_image_return1", "[LiDARPoseComponent].range_image_return1"
+SWEPT = {
+    "lidar": ("key.laser_name", f"{RANGES}.values", f"{RANGES}.shape"),
+    "lidar_pose": ("key.laser_name", f"{PIXELS}.values", f"{PIXELS}.shape"),
+    "vehicle_pose": (BODY,),
+}
+"""What a sweep is made of: columns by component."""
 SHUTTERS = {1: ("rows", 1), 2: ("columns", 1), 3: ("rows", -1), 4: ("columns", -1)}
 """How an image is read out and which way, by the data set's number of the direction; others take all at once."""
 LENS = tuple(f"[CameraCalibrationComponent].intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
@@ -48,11 +56,10 @@ def read_waymo(path: Path) -> Log:
     def component(kind: str) -> Path:
         return root / kind / f"{segment}.parquet"
 
-    pose_column = "[VehiclePoseComponent].world_from_vehicle.transform"
-    table = read_table(component("vehicle_pose"), (WHEN, pose_column))
+    table = read_table(component("vehicle_pose"), (WHEN, BODY))
     order = np.argsort(table[WHEN])
     times = table[WHEN][order].astype(np.int64)
-    bodies = torch.stack([_matrix(table[pose_column][i], component("vehicle_pose")) for i in order])
+    bodies = torch.stack([_matrix(table[BODY][i], component("vehicle_pose")) for i in order])
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())
     ego = lengthened(times, home @ bodies)
@@ -61,7 +68,8 @@ def read_waymo(path: Path) -> Log:
         "name": f"waymo-{segment}", "source": f"Waymo Open Dataset segment {segment}", "licence": "Waymo Dataset License Agreement",
         "attribution": "Waymo Open Dataset by Waymo", "body": "vehicle frame, x forward, y left, z up", "world_origin": origin.tolist(),
     }  # fmt: skip
-    sweeps = tuple(Sweep(i, t, partial(_points, component, t, home)) for i, t in enumerate(_swept(component)))
+    parts = {kind: Rows(component(kind), WHEN, columns) for kind, columns in SWEPT.items()}
+    sweeps = tuple(Sweep(i, t, partial(_points, component, parts, t, home)) for i, t in enumerate(_swept(component)))
     tracks = _tracks(component("lidar_box"), ego)
     front = tuple(n for n in FRONT if n in cameras)
     return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars=_mounts(component) if sweeps else {})
@@ -112,8 +120,8 @@ def _cameras(component, home: torch.Tensor, ego: Trajectory) -> dict[str, LogCam
         lens = OpenCV(*(float(table[k][row]) for k in LENS))
         body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
         bodies = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine])
-        moved = [inverse(ego.near(t)) @ ego.near(m) for t, m in zip(stamps.tolist(), middles.tolist(), strict=True)]
-        poses = bodies @ torch.stack(moved) @ body_from_cam
+        moved = inverse(ego.near_each(torch.from_numpy(stamps))) @ ego.near_each(torch.from_numpy(middles))
+        poses = bodies @ moved @ body_from_cam
         files = tuple(Packed(f"{images}, {name} at {taken[WHEN][i]}", partial(read_cell, images, IMAGE, int(i))) for i in mine)
         size = int(table[width][row]), int(table[height][row])
         cameras[name] = LogCamera(name, lens, *size, files, torch.from_numpy(middles), poses, shutter, readout)
@@ -140,25 +148,19 @@ def _mounts(component) -> dict[int, np.ndarray]:
     return {int(laser): _matrix(m, component("lidar_calibration"))[:3, 3].numpy() for laser, m in pairs}
 
 
-def _points(component, stamp: int, home: torch.Tensor) -> LidarPoints:
+def _points(component, parts: dict[str, Rows], stamp: int, home: torch.Tensor) -> LidarPoints:
     """First returns of all lidars at a stamp, in the world."""
-    values, shape = (f"[LiDARComponent].range_image_return1.{k}" for k in ("values", "shape"))
-    table = read_table(component("lidar"), ("key.laser_name", WHEN, values, shape), others=False, rows=(WHEN, stamp))
-    of_pixel = "[LiDARPoseComponent].range_image_return1."
-    keys = ("key.laser_name", WHEN, f"{of_pixel}values", f"{of_pixel}shape")
-    turning = read_table(component("lidar_pose"), keys, others=False, rows=(WHEN, stamp))
+    table, turning, vehicle = (parts[kind].read(stamp) for kind in SWEPT)
+    body = _matrix(vehicle[BODY][0], component("vehicle_pose"))
     prefix = "[LiDARCalibrationComponent]."
     calibration = read_table(
         component("lidar_calibration"),
         ("key.laser_name", f"{prefix}extrinsic.transform", *(f"{prefix}beam_inclination.{k}" for k in ("min", "max"))),
     )
-    poses = "[VehiclePoseComponent].world_from_vehicle.transform"
-    vehicle = read_table(component("vehicle_pose"), (WHEN, poses), others=False, rows=(WHEN, stamp))
-    body = _matrix(vehicle[poses][0], component("vehicle_pose"))
     xyz, sensor = [], []
     for row, laser in enumerate(table["key.laser_name"].tolist()):
         at = int(np.flatnonzero(calibration["key.laser_name"] == laser)[0])
-        image = _image(table[values][row], table[shape][row], component("lidar"))
+        image = _image(table[f"{RANGES}.values"][row], table[f"{RANGES}.shape"][row], component("lidar"))
         mount = _matrix(calibration[f"{prefix}extrinsic.transform"][at], component("lidar_calibration"))
         beams = calibration.get(f"{prefix}beam_inclination.values")
         limits = [float(calibration[f"{prefix}beam_inclination.{k}"][at]) for k in ("min", "max")]
@@ -166,7 +168,8 @@ def _points(component, stamp: int, home: torch.Tensor) -> LidarPoints:
         placed = local @ mount[:3, :3].numpy().T + mount[:3, 3].numpy()
         own = np.flatnonzero(turning["key.laser_name"] == laser)
         if len(own):
-            pixel = _image(turning[keys[2]][own[0]], turning[keys[3]][own[0]], component("lidar_pose"))[hit].astype(np.float64)
+            pixels = _image(turning[f"{PIXELS}.values"][own[0]], turning[f"{PIXELS}.shape"][own[0]], component("lidar_pose"))
+            pixel = pixels[hit].astype(np.float64)
             placed = np.einsum("nij,nj->ni", _rotations(pixel[:, :3]), placed) + pixel[:, 3:]
         else:
             placed = placed @ body[:3, :3].numpy().T + body[:3, 3].numpy()
@@ -211,11 +214,6 @@ def _rotations(angles: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(r, -1) for r in rows], -2)
 
 
-def _base(row: np.ndarray) -> torch.Tensor:
-    """The place of a box's base centre, of its middle and size."""
-    return translation(float(row[0]), float(row[1]), float(row[2] - row[5] / 2))
-
-
 def _tracks(path: Path, ego: Trajectory) -> tuple:
     """Tracks of the boxes, which stand in the vehicle frame by their middles; signs are no objects that move."""
     if not path.is_file():
@@ -224,9 +222,9 @@ def _tracks(path: Path, ego: Trajectory) -> tuple:
     table = read_table(path, ("key.laser_object_id", WHEN, kind, *BOX))
     times = table[WHEN].astype(np.int64)
     rows = np.stack([table[k] for k in BOX], 1).astype(np.float64)
+    poses = ego.near_each(torch.from_numpy(times)) @ from_middles(upright(rows[:, :3], rows[:, 6]), rows[:, 5])
     found = []
     for name in dict.fromkeys(table["key.laser_object_id"].tolist()):
         mine = np.flatnonzero(table["key.laser_object_id"] == name)
-        poses = [ego.near(int(times[i])) @ _base(rows[i]) @ yaw(rows[i, 6]) for i in mine]
-        found.append(Boxes(str(name), LABELS.get(int(table[kind][mine[0]]), "object"), times[mine], torch.stack(poses), rows[mine, 3:6]))
+        found.append(Boxes(str(name), LABELS.get(int(table[kind][mine[0]]), "object"), times[mine], poses[mine], rows[mine, 3:6]))
     return tracks_of(found, ego, str(path))

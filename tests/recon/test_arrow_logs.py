@@ -17,8 +17,11 @@ from made_waymo import NAMES as FIVE  # noqa: E402
 from made_waymo import READOUT_US, SEGMENT, near_points, write_waymo  # noqa: E402
 
 from recon import open_log  # noqa: E402
+from recon.readers.arrow import Rows  # noqa: E402
 from recon.readers.waymo import _from_range, _rotations  # noqa: E402
+from recon.tracks import nearness  # noqa: E402
 from scenes.lenses import OpenCV, Pinhole  # noqa: E402
+from scenes.poses import inverse, pose_from, translation, yaw  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +71,115 @@ def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
     assert shutters == {"front": ("rows", READOUT_US), "front_right": ("columns", -READOUT_US)}  # the right one from right to left
     assert log.rig(96, 54)["front_right"].times_us[0] == log.camera("front_right").times_us[0] + READOUT_US // 2
     assert open_log(waymo).name == log.name  # the only segment needs no name
+
+
+def test_argoverse_boxes_stand_where_each_alone_is_placed(own_argoverse):
+    """One that the path does not cover is left out."""
+    import pandas as pd
+
+    path = own_argoverse / "annotations.feather"
+    table = pd.read_feather(path)
+    late = table.iloc[:1].assign(timestamp_ns=table["timestamp_ns"].max() + 10**9)
+    pd.concat([table, late], ignore_index=True).to_feather(path)
+    log = open_log(own_argoverse)
+    for track in log.tracks:
+        rows = table[table["track_uuid"] == track.sources[0]].to_dict("records")
+        assert track.times_us.tolist() == [row["timestamp_ns"] // 1000 for row in rows]
+        for row, pose in zip(rows, track.world_from_box, strict=True):
+            local = pose_from([row[f"q{k}"] for k in "wxyz"], [row[f"t{k}_m"] for k in "xyz"])
+            alone = log.ego.at(row["timestamp_ns"] // 1000) @ local @ translation(0.0, 0.0, -row["height_m"] / 2)
+            torch.testing.assert_close(pose, alone, atol=1e-9, rtol=0)
+
+
+def test_waymo_boxes_stand_where_each_alone_is_placed(waymo):
+    import pandas as pd
+
+    log = open_log(waymo / SEGMENT)
+    table = pd.read_parquet(waymo / f"lidar_box/{SEGMENT}.parquet")
+    for track in log.tracks:
+        rows = table[table["key.laser_object_id"] == track.sources[0]]
+        keys = [f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.z", "heading")]
+        values = zip(rows["key.frame_timestamp_micros"], rows[keys].to_numpy(), track.world_from_box, strict=True)
+        for t, (x, y, z, height, heading), pose in values:
+            alone = log.ego.at(t) @ translation(x, y, z - height / 2) @ yaw(heading)
+            torch.testing.assert_close(pose, alone, atol=1e-9, rtol=0)
+
+
+def test_the_way_to_a_box_and_to_a_camera_is_that_of_each_moment_alone(argoverse):
+    log = open_log(argoverse)
+    for track in log.tracks:
+        ways = [inverse(log.ego.at(t)) @ pose for t, pose in zip(track.times_us.tolist(), track.world_from_box, strict=True)]
+        assert nearness(track, log.ego) == pytest.approx(min(float(way[:3, 3].norm()) for way in ways), abs=1e-9)
+        assert nearness(replace(track, times_us=track.times_us + 10**9), log.ego) == float("inf")
+        late = replace(track, times_us=track.times_us + int(log.ego.span_us()[1] - track.times_us[0]))  # the first alone is covered
+        first = inverse(log.ego.at(int(late.times_us[0]))) @ track.world_from_box[0]
+        assert nearness(late, log.ego) == pytest.approx(float(first[:3, 3].norm()), abs=1e-9)
+    for name, camera in log.cameras.items():
+        alone = [inverse(log.ego.at(int(t))) @ pose for t, pose in zip(camera.times_us, camera.world_from_cam, strict=True)]
+        torch.testing.assert_close(log.offsets(name), torch.stack(alone), atol=1e-9, rtol=0)
+
+
+def unpacked(monkeypatch) -> list:
+    """What row groups are unpacked from now on, as columns and the group's number."""
+    from pyarrow import parquet
+
+    seen, read = [], parquet.ParquetFile.iter_batches
+
+    def noted(self, size, row_groups, columns):
+        seen.append((*columns, *row_groups))
+        return read(self, size, row_groups, columns)
+
+    monkeypatch.setattr(parquet.ParquetFile, "iter_batches", noted)
+    return seen
+
+
+def test_sweeps_read_in_order_unpack_each_row_group_once(waymo, monkeypatch):
+    seen = unpacked(monkeypatch)
+    for sweep in open_log(waymo / SEGMENT).sweeps:
+        sweep.read()
+    assert len(seen) == len(set(seen)) == 6  # two groups each of the lidar, of its pixels' poses and of the vehicle's
+
+
+@pytest.fixture
+def rows_file(tmp_path):
+    """Three rows each of ten stamps in groups of four, which part them; `image` has more numbers each row."""
+    import pandas as pd
+
+    stamps = np.repeat(np.arange(10) * 100, 3)
+    table = pd.DataFrame({"image": [np.full(i + 1, i, np.float32) for i in range(30)], "key.stamp": stamps, "key.laser": np.arange(30) % 3})
+    table.to_parquet(tmp_path / "rows.parquet", row_group_size=4)
+    return tmp_path / "rows.parquet"
+
+
+def test_rows_of_a_value_come_from_all_groups_that_have_some(rows_file, monkeypatch):
+    seen = unpacked(monkeypatch)
+    rows = Rows(rows_file, "key.stamp", ("key.laser", "image"))
+    for stamp in range(10):
+        found = rows.read(stamp * 100)
+        assert list(found) == ["key.laser", "image"] and found["key.laser"].tolist() == [0, 1, 2]
+        assert [image.tolist() for image in found["image"]] == [[i] * (i + 1) for i in range(3 * stamp, 3 * stamp + 3)]
+    assert [group for *_, group in seen] == list(range(8))
+    assert all(len(column) == 0 for column in rows.read(50).values()) and len(seen) == 8
+    rows.read(0)
+    assert seen[-1][-1] == 0 and len(seen) == 9  # no more than the last one is kept
+
+
+def test_rows_are_those_that_the_file_has_now(rows_file):
+    import pandas as pd
+
+    rows = Rows(rows_file, "key.stamp", ("image",))
+    rows.read(0)
+    table = pd.read_parquet(rows_file)
+    table.assign(image=[image + 1 for image in table["image"]]).iloc[:8].to_parquet(rows_file, row_group_size=4)
+    assert rows.read(0)["image"][2].tolist() == [3, 3, 3]
+    with pytest.raises(ValueError, match='rows.parquet has no column "range"; it has image, key.stamp, key.laser'):
+        Rows(rows_file, "key.stamp", ("range",)).read(0)
+    rows_file.write_bytes(rows_file.read_bytes()[:-20])
+    with pytest.raises(ValueError, match="rows.parquet is cut off or corrupt"):
+        rows.read(0)
+    rows_file.unlink()
+    with pytest.raises(FileNotFoundError, match="rows.parquet is missing"):
+        rows.read(0)
 
 
 def test_a_range_images_middle_column_looks_ahead_and_its_first_row_up():

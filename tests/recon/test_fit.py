@@ -112,6 +112,21 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
     assert resumed.meta["held_out"] == whole[1].meta["held_out"] and out.is_dir()
 
 
+def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive, tmp_path):
+    """Its poses and boxes go on."""
+    for i in (5, 6, 7):
+        (own_drive / f"camera/front_camera/{i:02d}.jpg").unlink()
+        (own_drive / f"lidar/{i:02d}.pkl.gz").unlink()
+    config = FitConfig(steps=6, budget=3000, stages=((0.0, 2),), grow_every=3, sh_degree=0)
+    log = open_log(own_drive)
+    made = reconstruct(log, tmp_path / "scene", size=(48, 27), held_out=4, config=config)
+    times = log.camera("front_camera").times_us
+    assert len(times) == 5 and made.frame_times("front_camera").tolist() == times.tolist()
+    assert [row["frames"] for row in made.meta["held_out"] if row["which"] == "all"] == [[0, 4]]
+    assert made.ego.covers(int(times[-1])) and made.ego.times_us[-1] < log.ego.times_us[-1] and len(made.actors) == 1
+    assert isinstance(load(tmp_path / "scene"), Scene)
+
+
 def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, monkeypatch):
     log, out = open_log(drive), tmp_path / "scene"
     with pytest.raises(FileNotFoundError, match="without --resume"):

@@ -50,6 +50,7 @@ def test_a_sequence_reads_as_it_was_recorded(odometry, recorded):
     early = replace(actor, trajectory=replace(actor.trajectory, times_us=actor.trajectory.times_us - int(STAMPS[0])))
     late = replace(late, street=replace(recorded.street, actors=(early,), ego=late.ego))
     lead = log.camera("image_2")
+    assert log.lidars[0].dtype == float  # 64 bits, as all places are
     assert lead.times_us.tolist() == [100_000 * i for i in range(6)] and log.tracks == () and len(log.sweeps) == 5
     for name in ("image_2", "image_3"):
         assert torch.isfinite(log.camera(name).world_from_cam).all()
@@ -78,6 +79,44 @@ def test_a_spinning_lidars_points_stand_still_though_the_car_moves(raw, recorded
 def test_a_missing_file_of_a_raw_drive_is_named(own, file):
     (own / file).unlink()
     with pytest.raises(FileNotFoundError, match=f"{(own / file).name} is missing"):
+        open_log(own)
+
+
+def test_a_piece_of_a_raw_drive_is_read_as_far_as_its_pictures_go(raw, own, capsys):
+    """As others share it: all time stamps, the first pictures and sweeps."""
+    for i in (4, 5):
+        (own / f"image_02/data/{i:010d}.png").unlink()
+        (own / f"velodyne_points/data/{i:010d}.bin").unlink()
+    whole, piece = open_log(raw), open_log(own)
+    told = [line for line in capsys.readouterr().err.splitlines() if "pictures" in line]
+    assert told == [f"{own}/image_02/data holds the first 4 of 6 pictures, which are read"]
+    _first_of(whole.camera("image_02"), piece.camera("image_02"), 4)
+    assert len(piece.camera("image_03")) == 6 and [s.index for s in piece.sweeps] == [0, 1, 3]
+    assert torch.equal(piece.ego.times_us, whole.ego.times_us) and len(piece.tracks) == 2
+    assert abs(piece.sweeps[-1].read().xyz - whole.sweeps[2].read().xyz).max() == 0
+
+
+def test_a_piece_of_a_sequence_is_read_as_far_as_its_pictures_go(odometry, own_sequence, capsys):
+    for file in ("image_2/000005.png", "image_3/000005.png", "velodyne/000005.bin"):
+        (own_sequence / file).unlink()
+    whole, piece = open_log(odometry), open_log(own_sequence)
+    assert capsys.readouterr().err.count("holds the first 5 of 6 pictures") == 2
+    for name in ("image_2", "image_3"):
+        _first_of(whole.camera(name), piece.camera(name), 5)
+    assert piece.sweeps[-1].index == 4
+
+
+def _first_of(whole, piece, count):
+    assert len(piece) == len(piece.times_us) == len(piece.world_from_cam) == count
+    assert [f.name for f in piece.files] == [f.name for f in whole.files[:count]]
+    assert torch.equal(piece.times_us, whole.times_us[:count]) and torch.equal(piece.world_from_cam, whole.world_from_cam[:count])
+
+
+@pytest.mark.parametrize("lost", ["0000000000.png", "0000000002.png"])
+def test_a_picture_missing_before_others_is_a_broken_download(own, lost):
+    (own / "image_03/data" / lost).unlink()
+    (own / "image_03/data/0000000005.png").unlink()
+    with pytest.raises(FileNotFoundError, match=f"image_03/data/{lost} is missing; the time stamps name 6 frames"):
         open_log(own)
 
 

@@ -1,12 +1,14 @@
 import json
 import shutil
+import tracemalloc
 
 import pytest
 from made_nuscenes import NAMES, write_nuscenes
 from made_tape import check, tape
 
 from recon import open_log
-from recon.readers.nuscenes import label_of
+from recon.readers import nuscenes
+from recon.readers.nuscenes import Tables, label_of
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,47 @@ def test_missing_and_wrong_tables_are_named(own, table):
     path.unlink()
     with pytest.raises(FileNotFoundError, match=f"{table}.json is missing"):
         open_log(own / "scene-0061")
+
+
+@pytest.mark.parametrize("indent", [None, 0, 4])
+def test_a_table_is_read_row_by_row_wherever_its_text_is_parted(tmp_path, monkeypatch, indent):
+    rows = [{"token": f"ä{i}", "channel": 'a "]}, {[' * (i % 5)} for i in range(40)]
+    (tmp_path / "sensor.json").write_text(json.dumps(rows, indent=indent, ensure_ascii=indent is None) + "\n", encoding="utf-8")
+    for chunk in range(130, 190, 7):
+        monkeypatch.setattr(nuscenes, "CHUNK", chunk)
+        assert list(Tables(tmp_path).rows("sensor")) == rows
+    (tmp_path / "sensor.json").write_text(" [ ]\n")
+    assert list(Tables(tmp_path).rows("sensor")) == []
+
+
+ROW = '{"token": "a", "channel": "b"}'
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[", f"[{ROW}", f"[{ROW},", f"[{ROW},]", f"[{ROW} {ROW}]", f"[{ROW}]]", f"[] {ROW}", ROW, f"[{ROW[:-5]}", "[\xff]"]
+)
+def test_a_table_that_is_not_one_whole_list_is_refused(tmp_path, text):
+    (tmp_path / "sensor.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match="sensor.json is not json"):
+        list(Tables(tmp_path).rows("sensor"))
+
+
+@pytest.mark.parametrize("entry", ["1", "null", '["token"]', '{"token": "a"}'])
+def test_an_entry_without_the_tables_keys_is_refused(tmp_path, entry):
+    (tmp_path / "sensor.json").write_text(f"[{ROW}, {entry}]")
+    with pytest.raises(ValueError, match='sensor.json has rows without "(token|channel)"'):
+        list(Tables(tmp_path).rows("sensor"))
+
+
+def test_a_long_table_takes_no_more_memory_than_a_short_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(nuscenes, "CHUNK", 1 << 14)
+    (tmp_path / "sensor.json").write_text(json.dumps([{"token": f"{i}", "channel": 100 * "x"} for i in range(20_000)]))
+    tracemalloc.start()
+    try:
+        assert [row["token"] for row in Tables(tmp_path).rows("sensor") if row["token"].endswith("9999")] == ["9999", "19999"]
+        assert tracemalloc.get_traced_memory()[1] < (tmp_path / "sensor.json").stat().st_size / 10
+    finally:
+        tracemalloc.stop()
 
 
 def test_the_test_part_has_no_boxes(own):

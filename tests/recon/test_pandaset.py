@@ -70,6 +70,19 @@ def test_a_missing_image_is_named(own_drive):
         open_log(own_drive)
 
 
+def test_a_piece_of_a_drive_is_read_as_far_as_its_pictures_go(drive, own_drive, capsys):
+    for i in (5, 6, 7):
+        (own_drive / f"camera/left_camera/{i:02d}.jpg").unlink()
+    whole, piece = open_log(drive).camera("left_camera"), open_log(own_drive).camera("left_camera")
+    assert capsys.readouterr().err == f"{own_drive}/camera/left_camera holds the first 5 of 8 pictures, which are read\n"
+    assert [f.name for f in piece.files] == [f.name for f in whole.files[:5]]
+    assert torch.equal(piece.times_us, whole.times_us[:5]) and torch.equal(piece.world_from_cam, whole.world_from_cam[:5])
+    for file in (own_drive / "camera/left_camera").glob("*.jpg"):
+        file.unlink()
+    with pytest.raises(FileNotFoundError, match="left_camera/00.jpg is missing"):
+        open_log(own_drive)
+
+
 def test_an_image_that_does_not_decode_is_named(own_drive):
     file = own_drive / "camera/front_camera/02.jpg"
     file.write_bytes(file.read_bytes()[:400])

@@ -208,5 +208,10 @@ def test_a_trajectory_at_many_times_is_the_trajectory_at_each():
     times = torch.tensor([-40, 0, 55, 100, 249, 260])
     assert torch.allclose(path.at_each(times), torch.stack([path.at(int(t)) for t in times]), rtol=0, atol=1e-15)
     assert path.at_each(times[:0]).shape == (0, 4, 4)
+    beyond = torch.tensor([-10_000, *times.tolist(), 10_000])
+    assert path.covers_each(beyond).tolist() == [path.covers(int(t)) for t in beyond]
+    assert torch.allclose(path.near_each(beyond), torch.stack([path.near(int(t)) for t in beyond]), rtol=0, atol=1e-15)
+    still = Trajectory(torch.tensor([5]), path.world_from_body[:1])
+    assert still.covers_each(beyond).all() and torch.equal(still.near_each(beyond)[0], still.near(-10_000))
     with pytest.raises(ValueError, match="time 900 us is outside"):
         path.at_each(torch.tensor([0, 900]))
