@@ -4,7 +4,7 @@ sparse    some frames of every camera: views between are guessed
 cycle     pictures rendered from a path beside the recorded one: the recorded views are then what is off the path
 crossref  every other camera, by direction: each half of the rig is seen through the other half's reconstruction
 
-Poses and cameras' exposures are those of the finished scene and are not corrected again, so that what is rendered lies where the photos lie
+Poses and exposures are those of the finished scene and are not corrected again, so that what is rendered lies where the photos lie
 and is as bright: half a rig by itself would take its own first camera for the measure.
 """
 
@@ -93,10 +93,10 @@ def refits(
 
 
 def exposed_as(scene: Scene, config: FitConfig) -> FitConfig:
-    """A fit that keeps the scene's exposures of cameras, and gives frames some of their own only where the scene's have them: its cameras
-    are what shows it."""
-    kept = {"exposures"} if any(camera.gains is not None for camera in scene.rig.values()) else {"exposures", "gains"}
-    return replace(config, refine=tuple(kind for kind in config.refine if kind not in kept))
+    """A fit that gives frames exposures of their own only where the scene's have them: its cameras are what shows it."""
+    if any(camera.gains is not None for camera in scene.rig.values()):
+        return config
+    return replace(config, refine=tuple(kind for kind in config.refine if kind != "gains"))
 
 
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
@@ -182,9 +182,8 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
 
 def _fit(scene: Scene, log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
     names, span = choose(log, list(log.cameras))
-    config = exposed_as(scene, config)
-    start, fit = begin(log, names, span, size, config, held_out=0, device=device)
-    fit.exposures.copy_(torch.stack([scene.rig_camera(name).exposure for name in names]))
+    config = replace(config, refine=tuple(kind for kind in config.refine if kind not in ("exposures", "gains")))
+    start, fit = begin(log, names, span, size, config, held_out=0, device=device, exposed=scene.rig)
     with Progress(f"fit {path.name}", total=config.steps) as steps:
         while fit.step_count < config.steps:
             fit.step()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -217,14 +217,21 @@ def begin(
     held_out: int = HELD_OUT,
     start: Start | None = None,
     device: str = "cpu",
+    exposed: Mapping[str, RigCamera] | None = None,
 ) -> tuple[Start, Fit]:
-    """What a fit starts from, prepared unless it is given, and the fit on a device before its first step."""
+    """What a fit starts from, prepared unless it is given, and the fit on a device before its first step.
+
+    exposed: cameras by name as a scene has them, whose exposures and frames' gains are taken; estimated where None.
+    """
     with Progress("images") as steps:
         frames = load_frames(log, names, span, size, held_out, steps.step, "gains" in config.refine)
+    if exposed is not None:
+        frames = replace(frames, views=[replace(v, gain=exposed[names[v.camera]].gain_at(v.time_us)) for v in frames.views])
     if start is None:
         with Progress("prepare") as steps:
             coefficients = (config.sh_degree + 1) ** 2
-            start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what))
+            known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
+            start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), known)
     return start, _fit(frames, start, config, device)
 
 

@@ -15,7 +15,7 @@ from recon.egomask import at_size, ego_mask
 from recon.gains import gains_along, picture_gains
 from recon.log import Log, LogCamera
 from recon.project import project
-from recon.skies import like_sky, sky_mask
+from recon.skies import WHITE, like_sky, sky_mask
 from scenes.camera import Camera, followed
 from scenes.poses import inverse
 from scenes.trajectory import between
@@ -43,7 +43,10 @@ REACH = 40.0
 """Metres up to which these are taken: little comes between them and a camera a second later."""
 
 STRUCK, AROUND = 0.1, 7
-"""Part of what looks like sky in so many columns from which on, where lidar strikes it, it is a wall."""
+"""Part of what looks like sky in so many columns, as far up as beams go, from which on, where lidar strikes it, it is a wall."""
+
+STRAY = 0.005
+"""Part of a sweep's points in a picture that may lie above where its beams go in general."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,8 @@ def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[lis
     chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
     points = [s.read().xyz for s in chosen]
     kind, more = ("blinding", DAZZLED) if blue >= BLUE else ("overcast", 2)
+    if kind == "blinding" and float(np.mean([(v.image[::4, ::4].amin(-1) >= WHITE).float().mean() for v in views])) < blue * (DAZZLED - 1):
+        return views, "blue"
     told = []
     for view in views:
         sky = _sky(view.image, view.ego, kind).numpy()
@@ -200,7 +205,9 @@ def _unstruck(sky: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray
     row, column, _, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
     struck = np.zeros(sky.shape, np.float32)
     struck[row[inside], column[inside]] = 1
-    hits, cells = (ndimage.uniform_filter1d(m.sum(0, dtype=np.float32), AROUND) for m in (struck * sky, sky))
+    # what is above all beams but some stray ones they do not tell
+    reached = np.arange(len(sky))[:, None] >= (np.quantile(row[inside], STRAY) if inside.any() else len(sky))
+    hits, cells = (ndimage.uniform_filter1d(m.sum(0, dtype=np.float32), AROUND) for m in (struck * sky * reached, sky & reached))
     return sky & (hits <= STRUCK * cells)
 
 

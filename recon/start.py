@@ -62,15 +62,24 @@ class Start:
     measured: tuple[Measured, ...]
 
 
-def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_count: int, report: Callable[[str], None]) -> Start:
+def prepare(
+    log: Log,
+    frames: Frames,
+    span_us: tuple[int, int],
+    budget: int,
+    sh_count: int,
+    report: Callable[[str], None],
+    exposures: torch.Tensor | None = None,
+) -> Start:
     """Read the sweeps of the span and make the start of a fit; where it has none, points are found in the pictures.
 
-    ValueError where a drive has no lidar point in view.
+    exposures: of the cameras, affine `[C, 3, 4]`, where they are known. ValueError where a drive has no lidar point in view.
     """
     rig = log.rig(frames.width, frames.height, frames.names)
     ego = body_path(log, frames, rig)
     sweeps = log.sweeps_within(span_us)
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
+    told = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
     report("colouring points")
@@ -78,12 +87,12 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     if sparse is not None:
         ground = estimate_ground(sparse.xyz, log.ego)
         cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers)
-        gains = np.ones((len(frames.names), 3))
+        gains = np.ones((len(frames.names), 3)) if told is None else told
         ground = estimate_ground(cloud.xyz, log.ego)
     else:
         ground = estimate_ground(split.static, log.ego)
         seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
-        gains = first_exposures(seen)
+        gains = first_exposures(seen) if told is None else told
         rgb = merged_colours(seen, gains)
         known = np.isfinite(rgb[:, 0])
         if not known.any():
@@ -115,8 +124,9 @@ def prepare(log: Log, frames: Frames, span_us: tuple[int, int], budget: int, sh_
     reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], NEAREST)).float()
     # what is seeded wider than the cameras can tell (ground that none of them saw) must not be cut down to leave gaps
     reach = torch.maximum(reach, filled.log_scales.exp().amax(1) / LARGEST)
-    exposures = torch.zeros(len(frames.names), 3, 4)
-    exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
+    if exposures is None:
+        exposures = torch.zeros(len(frames.names), 3, 4)
+        exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
     return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured))
 
 

@@ -112,9 +112,12 @@ class RigCamera:
 
     def exposure_at(self, time_us: int) -> torch.Tensor:
         """The affine exposure `[3, 4]` at a time: between frames the logarithms of their gains are linear, beyond they stay."""
-        if self.gains is None:
-            return self.exposure
-        return between(self.times_us, self.gains.log(), time_us).exp()[:, None] * self.exposure
+        gain = self.gain_at(time_us)
+        return self.exposure if gain is None else gain[:, None] * self.exposure
+
+    def gain_at(self, time_us: int) -> torch.Tensor | None:
+        """How many times as much as `exposure` it exposes at a time, `[3]`; None where all frames were exposed alike."""
+        return None if self.gains is None else between(self.times_us, self.gains.log(), time_us).exp()
 
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
         """The camera of a body that stands at a pose while the image is read out."""

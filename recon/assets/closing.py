@@ -69,6 +69,8 @@ def hull_of_end(splats: Gaussians, size: np.ndarray, end: float) -> Gaussians:
         return Gaussians.empty(splats.sh.shape[1])
     surface = _ruled(*outline)
     surface = surface[cKDTree(points).query(surface)[0] > THERE]
+    if not len(surface):
+        return Gaussians.empty(splats.sh.shape[1])
     alike = np.abs(points) * [1, 1, LEVEL]
     nearest = cKDTree(alike).query(np.abs(surface) * [1, 1, LEVEL], k=min(ALIKE, len(alike)))[1]
     colours = np.median(rgb_from_sh(solid.sh[:, 0]).numpy()[nearest.reshape(len(surface), -1)], axis=1)

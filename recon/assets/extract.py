@@ -82,7 +82,7 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
         if candidate.flaw:
             print(f"left out {candidate.track} ({candidate.asset.label}): {candidate.flaw}", file=sys.stderr)
         else:
-            asset = candidate.evenly_lit()
+            asset = closed(candidate.evenly_lit())
             ids.append(bank.add(asset, thumbnail(asset)))
     if not ids:
         raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")
@@ -186,8 +186,7 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight, gain: torch.
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
     meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
     meta["exposure"] = shown_colours(dimmed(whole, gain))
-    made = replace(asset, gaussians=whole, meta=meta)
-    return Candidate(made if flaw else closed(made), meta["track"], flaw, gain)
+    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, gain)
 
 
 def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:

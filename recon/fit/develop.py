@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import torch
@@ -12,18 +12,24 @@ from recon.kernels.develop import SKY_STEP, develop, develop_backward
 from render.launch import run, stage, upload, view
 from render.rays import on_device
 from scenes.camera import Camera
-from scenes.sky import sample_equirect
 
 
-def developed(rgb: torch.Tensor, alpha: torch.Tensor, sky: torch.Tensor, exposure: torch.Tensor, camera: Camera, shift: Sequence[int]):
-    """`[H, W, 3]`: E[:, :3] (rgb + (1 - alpha) sky) + E[:, 3]; differentiable in premultiplied rgb `[H, W, 3]`, alpha `[H, W]`, the
-    equirectangular sky `[h, w, 3]` and the exposure `[3, 4]`.
+def developed(
+    rgb: torch.Tensor,
+    alpha: torch.Tensor,
+    sky: Callable[[torch.Tensor], torch.Tensor],
+    exposure: torch.Tensor,
+    camera: Camera,
+    shift: Sequence[int],
+) -> torch.Tensor:
+    """`[H, W, 3]`: E[:, :3] (rgb + (1 - alpha) sky) + E[:, 3]; differentiable in premultiplied rgb `[H, W, 3]`, alpha `[H, W]`, what the
+    sky's colours `[h, w, 3]` by directions `[h, w, 3]` in the world are made of, and the exposure `[3, 4]`.
 
     The sky is smooth, and a lookup a pixel would cost as much as the splats: it is sampled every `SKY_STEP` pixels, at others with every
     `shift` (rows and columns, below `SKY_STEP`), or those between would never learn.
     """
     rays = on_device(_sample_rays(camera.lens.key(), camera.width, camera.height, tuple(shift)), rgb.device)
-    samples = sample_equirect(sky, rays @ upload(camera.world_from_cam[:3, :3].detach(), rgb.device).T)
+    samples = sky(rays @ upload(camera.world_from_cam[:3, :3].detach(), rgb.device).T)
     if rgb.device.type == "cuda":
         return developed_by_matrices(rgb, alpha, samples, exposure, shift)
     return Develop.apply(rgb, alpha, samples, exposure, shift)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -28,6 +29,7 @@ from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
 from scenes.scene import dimmed
+from scenes.sky import sample_equirect
 
 WINDOW = (180, 320)
 """Rows and columns of the part of a picture in which similarity is taken."""
@@ -173,7 +175,7 @@ class Fit:
         camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
-        return self._render(shown, view, camera, ends, self.sky, (0, 0), False)[0]
+        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), (0, 0), False)[0]
 
     def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
         """Indices of the splats that a picture of a view, and one from aside, may show."""
@@ -188,7 +190,14 @@ class Fit:
         return in_sight(self.splats, eyes, [i + 1 for i in actors])
 
     def _render(
-        self, shown: Splats, view: View, camera: Camera, ends: list[Moment], sky: torch.Tensor, shift: Sequence[int], with_depth: bool
+        self,
+        shown: Splats,
+        view: View,
+        camera: Camera,
+        ends: list[Moment],
+        sky: Callable[[torch.Tensor], torch.Tensor],
+        shift: Sequence[int],
+        with_depth: bool,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted;
         shift: of the sky's samples (`developed`)."""

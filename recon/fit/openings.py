@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -10,10 +11,11 @@ import torch.nn.functional as F
 from recon.fit.motion import Motion
 from recon.frames import Frames, View
 from recon.seeds.points import spread
-from recon.skies import always_hidden, cells, finer
+from recon.skies import always_hidden, cells
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
+from scenes.sky import sample_equirect
 
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""
@@ -46,10 +48,19 @@ class Openings:
                 looks.append((view.sky.numpy(), motion.camera(view).resized(w, h)))
         self.hidden = always_hidden(looks).to(device)
 
-    def backdrop(self, sky: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """The sky `[H, 2H, 3]`, and where no picture shows it any one grey, another one each time: a bright sky below the road would be the
-        cheapest light at the edges of shade, and leave holes there."""
-        return torch.where(finer(self.hidden, len(sky))[..., None], upload(torch.rand(1, generator=generator), self.device), sky)
+    def backdrop(self, sky: torch.Tensor, generator: torch.Generator) -> Callable[[torch.Tensor], torch.Tensor]:
+        """What lies behind everything, colours `[h, w, 3]` by directions `[h, w, 3]` in the world: the sky `[H, 2H, 3]`, and where no
+        picture shows it any one grey, another one each time. A bright sky below the road would be the cheapest light at the edges of shade,
+        and leave holes there."""
+        grey = upload(torch.rand(1, generator=generator), self.device)
+
+        def behind(directions: torch.Tensor) -> torch.Tensor:
+            open_ = ~self.hidden[cells(directions, len(self.hidden))]
+            # what is looked up between directions is of both: no grey beside a direction that is open
+            beside = F.max_pool2d(open_[None, None].float(), 3, 1, 1)[0, 0, :, :, None] > 0
+            return torch.where(beside, sample_equirect(sky, directions), grey)
+
+        return behind
 
     def haze(self, alpha: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
         """What it costs that alpha `[H, W]`, as a view's camera sees it, is above 0 before the sky and below 1 under the horizon."""

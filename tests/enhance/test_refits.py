@@ -87,6 +87,12 @@ def test_a_refit_is_exposed_as_its_scene_is(log, street, tmp_path):
     kept = {name: camera.exposure for r in halves for name, camera in r.references.recorded.rig.items()}
     assert set(kept) == {"front_camera", "left_camera"}
     assert all(torch.equal(kept[name], camera.exposure) for name, camera in dark.rig.items())
+    for refit in halves:
+        for name, camera in log.cameras.items():
+            if name in refit.references.recorded.rig:
+                shown = render_frame(refit.references.recorded, refit.references.recorded.camera(name, int(camera.times_us[3]))).rgb
+                photo = torch.from_numpy(camera.image(3, *SIZE).copy()).float() / 255
+                assert float(shown.mean() / photo.mean()) == pytest.approx(1, abs=0.1)
 
 
 def test_each_half_of_the_rig_shows_the_other_halfs_views(log, street, tmp_path, monkeypatch):

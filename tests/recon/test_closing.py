@@ -71,3 +71,9 @@ def test_a_rear_is_closed_as_a_front_is():
     ours, theirs = closed(turned), closed(back)
     assert ours.meta["closed"] == ["rear"]
     torch.testing.assert_close(ours.gaussians.means * turn, theirs.gaussians.means, atol=1e-5, rtol=0)
+
+
+def test_what_is_closed_already_stays_as_it_is():
+    made = closed(sedan())
+    again = closed(replace(made, gaussians=Gaussians.cat([made.gaussians, closed(made).gaussians])))
+    assert again.meta["closed"] == [] and len(again.gaussians) == len(made.gaussians) + len(closed(made).gaussians)

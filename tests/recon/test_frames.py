@@ -17,7 +17,9 @@ ALL = (0, 2**62)
 SIZE = (240, 120)
 
 
-def _log(sky: tuple[int, int, int], strikes: bool, wall: tuple[int, int, int] = (231, 229, 226), glare: bool = False) -> Log:
+def _log(
+    sky: tuple[int, int, int], strikes: bool, wall: tuple[int, int, int] = (231, 229, 226), glare: bool = False, up_to: float = 4.9
+) -> Log:
     """Three pictures of a street: sky to the left, half of it clipped where there is glare, to the right a wall as white as an overcast
     one, and lidar on it, or on the road."""
     generator = np.random.default_rng(0)
@@ -33,13 +35,13 @@ def _log(sky: tuple[int, int, int], strikes: bool, wall: tuple[int, int, int] = 
     poses = bodies @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
     camera = LogCamera("front", Pinhole(120, 120, 120, 60), *SIZE, (Packed("street", buffer.getvalue),) * 3, times, poses)
     # ten metres ahead: to the right and up to 5 m, or below
-    y, z = np.meshgrid(np.linspace(-10.5, -1.0, 80), np.linspace(*((0.0, 4.9) if strikes else (-4.0, -1.0)), 60))
+    y, z = np.meshgrid(np.linspace(-10.5, -1.0, 80), np.linspace(*((0.0, up_to) if strikes else (-4.0, -1.0)), 60))
     xyz = np.stack([np.full(y.size, 10.0), y.ravel(), z.ravel()], 1)
     sweep = Sweep(0, 100_000, lambda: LidarPoints(xyz, np.full(len(xyz), 100_000), np.zeros(len(xyz), np.int64)))
     return Log("street", Path("street"), {"front": camera}, (sweep,), (), Trajectory(times, bodies), {}, ("front",))
 
 
-def _skies(log: Log) -> tuple[bool, np.ndarray, np.ndarray]:
+def _skies(log: Log) -> tuple[str, np.ndarray, np.ndarray]:
     frames = load_frames(log, ["front"], ALL, SIZE, 0)
     return frames.under, frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
 
@@ -71,6 +73,14 @@ def test_beside_blue_what_is_clipped_is_sky_where_lidar_does_not_strike_it():
     assert under == "blue"  # nothing tells
     for mask in (coarse, fine):
         assert mask[3:40, 5:55].mean() > 0.95 and mask[:, 70:].mean() < 0.02
+
+
+def test_of_a_wall_that_beams_reach_only_the_foot_of_all_is_no_sky():
+    low = _log((150, 180, 225), strikes=True, wall=(255, 255, 255), glare=True, up_to=0.35)  # two degrees, as KITTI's lidar
+    under, coarse, fine = _skies(low)
+    assert under == "blinding"
+    for mask in (coarse, fine):
+        assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
 
 
 def test_pictures_without_colour_tell_no_sky():

@@ -18,18 +18,21 @@ REAR_AXLE = [
 ]
 
 
-@pytest.mark.parametrize("lidars", [{0: np.array([0.94, 0.0, 1.84])}, {1: np.array([-1.1, 0, 1]), 2: np.array([3.0, 0.5, 1])}])
+ROOF, BUMPERS = {0: np.array([0.94, 0.0, 1.84])}, {1: np.array([-1.1, 0.0, 0.7]), 2: np.array([3.9, 0.3, 0.7])}
+
+
+@pytest.mark.parametrize("lidars", [ROOF, ROOF | BUMPERS, ROOF | {2: BUMPERS[2]}])
 def test_points_on_the_recording_car_are_no_street(lidars):
     pose = translation(30.0, -4.0, 0.5) @ yaw(2.1)
     ego = Trajectory(torch.tensor([0, 100_000]), torch.stack([pose @ translation(-1.0, 0, 0), pose]))
     xyz = np.array(REAR_AXLE) @ pose[:3, :3].numpy().T + pose[:3, 3].numpy()
-    points = LidarPoints(xyz, np.arange(6), np.arange(6) % 2)
+    points = LidarPoints(xyz, 100_000 + np.arange(6), np.arange(6) % 2)
     log = Log("street", "street", {}, (Sweep(3, 100_000, lambda: points),), (), ego, {}, lidars=lidars)
     (sweep,) = without_recorder(log).sweeps
     left = sweep.read()
     assert (sweep.index, sweep.time_us) == (3, 100_000)
     np.testing.assert_array_equal(left.xyz, xyz[3:])
-    assert left.times_us.tolist() == [3, 4, 5] and left.sensor.tolist() == [1, 0, 1]
+    assert left.times_us.tolist() == [100_003, 100_004, 100_005] and left.sensor.tolist() == [1, 0, 1]
 
 
 def test_a_log_opens_without_them(drive):
@@ -37,3 +40,12 @@ def test_a_log_opens_without_them(drive):
     for sweep in log.sweeps:
         local = sweep.read().xyz - log.ego.at(sweep.time_us)[:3, 3].numpy()
         assert len(local) and np.linalg.norm(local[:, :2], axis=1).min() > 1
+
+
+def test_its_points_stand_where_it_was_when_each_was_taken():
+    """At 20 m/s, two metres a turn: against the stamp's place alone, half of the bonnet would be street."""
+    ego = Trajectory(torch.tensor([0, 200_000]), torch.stack([translation(0.0, 0, 0), translation(4.0, 0, 0)]))
+    times = np.linspace(0, 100_000, 60).astype(np.int64)
+    bonnet = np.stack([3.3 + 20e-6 * times, np.full(60, 0.3), np.full(60, 0.9)], 1)
+    log = Log("street", "street", {}, (Sweep(0, 100_000, lambda: LidarPoints(bonnet, times, 0 * times)),), (), ego, {}, lidars=ROOF)
+    assert len(without_recorder(log).sweeps[0].read().xyz) == 0
