@@ -73,7 +73,7 @@ class Trajectory:
             return torch.stack([self.at(int(t)) for t in times_us])  # which names the one
         if len(self) == 1:
             return self.world_from_body.expand(len(times_us), 4, 4)
-        later = torch.searchsorted(self.times_us, times_us).clamp(1, len(self) - 1)
+        later = torch.searchsorted(self.times_us, times_us.contiguous()).clamp(1, len(self) - 1)
         before, after = self.times_us[later - 1], self.times_us[later]
         share = (times_us - before).double() / (after - before)
         return interpolate(self.world_from_body[later - 1], self.world_from_body[later], share)
