@@ -94,9 +94,7 @@ def refits(
 
 def exposed_as(scene: Scene, config: FitConfig) -> FitConfig:
     """A fit that gives frames exposures of their own only where the scene's have them: its cameras are what shows it."""
-    if any(camera.gains is not None for camera in scene.rig.values()):
-        return config
-    return replace(config, refine=tuple(kind for kind in config.refine if kind != "gains"))
+    return config if any(camera.gains is not None for camera in scene.rig.values()) else config.without("gains")
 
 
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
@@ -182,8 +180,8 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
 
 def _fit(scene: Scene, log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
     names, span = choose(log, list(log.cameras))
-    config = replace(config, refine=tuple(kind for kind in config.refine if kind not in ("exposures", "gains")))
-    start, fit = begin(log, names, span, size, config, held_out=0, device=device, exposed=scene.rig)
+    known = config.without("exposures", "gains")
+    start, fit = begin(log, names, span, size, known, held_out=0, device=device, exposed=scene.rig)
     with Progress(f"fit {path.name}", total=config.steps) as steps:
         while fit.step_count < config.steps:
             fit.step()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from recon.fit.motion import REFINED
 
@@ -40,3 +40,7 @@ class FitConfig:
     """Of depths that are not as measured, times what suits who measured them (`recon/seeds/measured.py`)."""
     seed: int = 0
     """Of the order of views."""
+
+    def without(self, *kinds: str) -> FitConfig:
+        """The same fit that leaves these of `refine` as they are."""
+        return replace(self, refine=tuple(kind for kind in self.refine if kind not in kinds))

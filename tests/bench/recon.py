@@ -69,7 +69,7 @@ def measured_depths(log: Log, config: FitConfig) -> Setting:
 
 def _unrefined(what: str) -> None:
     def leave_out(log: Log, config: FitConfig) -> Setting:
-        return log, replace(config, refine=tuple(r for r in config.refine if r != what))
+        return log, config.without(what)
 
     PARTS[f"refinement of {what}"] = leave_out
 
