@@ -15,6 +15,7 @@ from recon.fit.model import Splats, draw
 from recon.frames import Frames, View
 from recon.ground import estimate_ground
 from recon.log import Log, Track
+from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
 from recon.seeds.fill import unexplained
@@ -32,6 +33,9 @@ from scenes.trajectory import Trajectory
 
 SEED_PART = 0.5
 """Of the splat budget that lidar may take: the rest grows where pictures ask for it."""
+
+BEYOND_PART = 0.1
+"""Of the splat budget that what pictures show beyond lidar may take besides."""
 
 ACTORS_PART, MOST_OF_ONE = 0.15, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
@@ -86,9 +90,10 @@ def prepare(
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
         ground = estimate_ground(sparse.xyz, log.ego)
-        cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers)
         gains = np.ones((len(frames.names), 3)) if told is None else told
+        cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers, gains)
         ground = estimate_ground(cloud.xyz, log.ego)
+        beyond = Cloud.cat([])
     else:
         ground = estimate_ground(split.static, log.ego)
         seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
@@ -99,9 +104,11 @@ def prepare(
             raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
         cloud = Cloud(split.static[known], rgb[known])
         report("measuring depth")
-        measured = [by_lidar(log, frames, sweeps, split, movers), by_all_sweeps(log, frames, split, movers)]
+        struck = by_lidar(log, frames, sweeps, split, movers)
+        beyond, agreed = beyond_lidar(log, frames, struck, ground, movers, gains)
+        measured = [struck, by_all_sweeps(log, frames, split, movers), agreed]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
-    cloud, sides = thin(cloud, path.query(cloud.xyz)[0], int(budget * SEED_PART))
+    cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
     reach = sharpest * np.maximum(path.query(cloud.xyz)[0], NEAREST)
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
@@ -128,6 +135,12 @@ def prepare(
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
     return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured))
+
+
+def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:
+    """Of each cloud about as many points as it may have, together, and their voxels' sides (`thin`)."""
+    few = [thin(cloud, path.query(cloud.xyz)[0], most) for cloud, most in parts if len(cloud.xyz)]
+    return Cloud.cat([cloud for cloud, _ in few]), np.concatenate([sides for _, sides in few])
 
 
 def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:

@@ -1,4 +1,4 @@
-"""How many splats, and where: split where the gradient pulls hardest, drop what does not show or leaves its box."""
+"""How many splats, and where: split those in whose pixels most is wrong, drop what does not show or leaves its box."""
 
 from __future__ import annotations
 
@@ -27,18 +27,26 @@ BOX_MARGIN = 0.25
 
 @dataclass
 class Growth:
-    """How hard pictures pulled at each splat since the last densification: sum of gradients in pixels, far splats by their smaller motion
-    in it, and times seen."""
+    """How much is wrong where each splat shows, since the last densification: the sum `[N]` of pictures' errors times the splat's weights
+    in them (Bulò et al. 2024, equation 1), and how many such pictures show it `[N]`.
 
-    pull: torch.Tensor
-    seen: torch.Tensor
+    Pulls at a splat's place, by which Kerbl et al. (2023) split, cancel where it is too large for what it shows: leaves and gravel.
+    """
+
+    errors: torch.Tensor
+    shown: torch.Tensor
 
     @staticmethod
     def none(count: int, device: torch.device | str = "cpu") -> Growth:
         return Growth(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
+    def add(self, which: torch.Tensor, errors: torch.Tensor) -> None:
+        """What is wrong `[M]` in one more picture where splats `which` `[M]` show."""
+        self.errors.index_add_(0, which, errors)
+        self.shown.index_add_(0, which, (errors > 0).to(errors))
+
     def tensors(self) -> dict[str, torch.Tensor]:
-        return {"pull": self.pull, "seen": self.seen}
+        return {"errors": self.errors, "shown": self.shown}
 
 
 def grow(
@@ -46,15 +54,15 @@ def grow(
 ) -> tuple[Splats, dict[str, torch.Tensor]]:
     """Splats after one round, and what each carries with it, `[N, ...]`, of which new splats start with zeros.
 
-    Dropped: fainter than `FAINT`, outside their actor's box. Split: those with the largest mean pull, as many as make the budget
-    last `rounds_left` rounds, in two along their longest axis.
+    Dropped: fainter than `FAINT`, outside their actor's box. Split: those where most is wrong in the mean picture, as many as make the
+    budget last `rounds_left` rounds, in two along their longest axis.
     """
     fields = {k: v.detach() for k, v in splats.fields.items()}
     group = splats.group_of()
     keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
-    pull = torch.where(keep & (growth.seen > 0), growth.pull / growth.seen.clamp_min(1), torch.zeros_like(growth.pull))
-    count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((pull > 0).sum()))
-    parents = pull.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=pull.device)
+    wrong = torch.where(keep, growth.errors / growth.shown.clamp_min(1), 0.0)
+    count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((wrong > 0).sum()))
+    parents = wrong.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=wrong.device)
 
     scales = fields["log_scales"][parents]
     axis = scales.argmax(1)

@@ -41,6 +41,9 @@ than what shines through a wall, which Adam would turn into noise that a shifted
 ASIDE_EVERY = 2
 """Every how many steps it is looked at what is open from aside of the path."""
 
+BLAME_EVERY = 3
+"""Every how many steps of those in which splats are added it is found out where what is wrong."""
+
 GUESSED_FROM = 0.8
 """Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
 
@@ -137,13 +140,17 @@ class Fit:
         known = self._known(view)
         by_lot = self._drawn_by_lot(shown)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
-        rgb, alpha, depth = self._render(by_lot, view, camera, ends, self.openings.backdrop(self.sky, self.generator), shift, bool(known))
+        blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
+        sky = self.openings.backdrop(self.sky, self.generator)
+        rgb, alpha, depth, shows = self._render(by_lot, view, camera, ends, sky, shift, bool(known), blank)
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         if view.gain is not None:
             rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         haze = self.openings.haze(alpha, view, camera)
+        if shows is not None:
+            haze = haze + (shows[..., 0] * (rgb.detach() - target).abs().mean(-1)).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
             haze = haze + self.openings.gaps(draw(self._placed(shown, view, aside), aside, "alpha")[0], aside)
         if depth is not None:
@@ -157,7 +164,9 @@ class Fit:
         if self.guessed is not None and colours is not None:
             colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
-        self.descent.follow(self.splats, which, shown, rates, self.growth)
+        self.descent.follow(self.splats, which, shown, rates)
+        if blank is not None and blank.grad is not None:
+            self.growth.add(which, blank.grad[:, 0])
         self._follow()
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
@@ -198,12 +207,18 @@ class Fit:
         sky: Callable[[torch.Tensor], torch.Tensor],
         shift: Sequence[int],
         with_depth: bool,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes, and depth where it is wanted;
-        shift: of the sky's samples (`developed`)."""
+        features: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes; depth where it is wanted, and
+        what the picture shows of their `features` `[N, C]`. shift: of the sky's samples (`developed`)."""
         placed = self._placed(shown, view, camera)
-        rgb, alpha, *depth = draw(self.motion.as_read(placed, ends, view, camera), camera, "rgb", "alpha", *["depth"] * with_depth)
-        return developed(rgb, alpha, sky, self._exposure(view), camera, shift), alpha, depth[0] if depth else None
+        outputs = ["rgb", "alpha", *["depth"] * with_depth, *["features"] * (features is not None)]
+        of_groups = None if features is None else features.split(shown.sizes)
+        theirs = None if of_groups is None else [of_groups[p.instance] for p in placed]
+        drawn = draw(self.motion.as_read(placed, ends, view, camera), camera, *outputs, features=theirs)
+        found = dict(zip(outputs, drawn, strict=True))
+        rgb = developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)
+        return rgb, found["alpha"], found.get("depth"), found.get("features")
 
     def _exposure(self, view: View) -> torch.Tensor:
         """The affine exposure `[3, 4]` of a view: its camera's, as many times as it was exposed."""
@@ -284,6 +299,10 @@ class Fit:
         self.limbs.follow(self.progress)
 
     # ---- growth
+
+    def _blaming(self) -> bool:
+        """Whether this step asks which splats show what is wrong."""
+        return self._growing() and self.step_count % BLAME_EVERY == 0
 
     def _growing(self) -> bool:
         return self.config.grow_span[0] <= self.progress <= self.config.grow_span[1]

@@ -121,9 +121,9 @@ MODEL = SplatModel(projection="ewa")
 """What is trained: EWA costs less than UT, and splats this small look the same under both."""
 
 
-def draw(placed: list[Placed], camera: Camera, *outputs: str) -> list[torch.Tensor]:
-    """The named outputs of one picture under `MODEL`."""
-    frame = rasterize(placed, camera, outputs, model=MODEL)
+def draw(placed: list[Placed], camera: Camera, *outputs: str, features: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
+    """The named outputs of one picture under `MODEL`; features `[N, C]` of each of the placed."""
+    frame = rasterize(placed, camera, outputs, model=MODEL, features=features)
     return [getattr(frame, name) for name in outputs]
 
 

@@ -1,7 +1,8 @@
-"""Seeds where there is no lidar: how far away everything in the pictures is, kept where pictures agree on it."""
+"""Seeds where lidar has none: how far away everything in the pictures is, kept where pictures agree on it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,29 +60,60 @@ class Depths:
         back = np.linalg.inv(self.plate.cam_from_world)
         return (self.plate.rays().double().numpy() * self.depth[..., None]) @ back[:3, :3].T + back[:3, 3]
 
+    def cells(self, size: Sequence[int], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column `[h, w]` of what its pixels show on a grid of a size (rows, columns) over the picture of the view's camera."""
+        x, y = np.nan_to_num(self.plate.at.numpy()).transpose(2, 0, 1)
+        row, column = y * (size[0] / camera.height), x * (size[1] / camera.width)
+        return row.clip(0, size[0] - 1).astype(np.int64), column.clip(0, size[1] - 1).astype(np.int64)
 
-def cloud_from_pictures(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> tuple[Cloud, Measured]:
+
+def cloud_from_pictures(
+    log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track], gains: np.ndarray
+) -> tuple[Cloud, Measured]:
     """Points `[N, 3]` with colours where training pictures agree how far it is, and these depths.
 
-    Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a point.
+    gains: the cameras' exposures `[C, 3]`. Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a
+    point.
+    """
+    cloud, measured = agreed_points(log, frames, sparse, ground, movers, gains)
+    if len(cloud.xyz) < len(sparse.xyz):
+        cloud = Cloud.cat([cloud, *_points_themselves(log, frames, sparse, movers, gains)])
+    if not len(cloud.xyz):
+        raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
+    return cloud, Measured(measured, PICTURES)
+
+
+def agreed_points(
+    log: Log,
+    frames: Frames,
+    sparse: SparsePoints,
+    ground: Ground,
+    movers: list[Track],
+    gains: np.ndarray,
+    known: Mapping[tuple[int, int], np.ndarray] | None = None,
+    within: float = np.inf,
+) -> tuple[Cloud, dict[tuple[int, int], torch.Tensor]]:
+    """As `cloud_from_pictures`, but for what pictures do not agree on; nothing where none do. Depths as `Measured` has them.
+
+    known: by a view's camera and index what needs no finding in it, bool `[h, w]` on its grid; within: metres up to
+    which anything is looked for.
     """
     found = depths(log, frames, sparse, ground)
-    parts: list[Cloud] = []
-    measured = {}
+    parts, measured = [], {}
     for own, mask in zip(found, agreed(found), strict=True):
-        camera = log.camera(frames.names[own.view.camera]).camera(own.view.index, frames.width, frames.height)
-        clear = mask & _clear(own, camera, movers)
-        column, row = np.floor(own.plate.at.numpy()[clear]).astype(np.int64).T
-        parts.append(Cloud(own.points()[clear], own.view.image.numpy()[row, column] / 255))
-        measured[own.view.camera, own.view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
-    if sum(len(p.xyz) for p in parts) < len(sparse.xyz):
-        parts += _points_themselves(log, frames, sparse, movers)
-    if not any(len(p.xyz) for p in parts):
-        raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
-    return Cloud(np.concatenate([p.xyz for p in parts]), np.concatenate([p.rgb for p in parts])), Measured(measured, PICTURES)
+        view = own.view
+        camera = log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height)
+        clear = mask & _clear(own, camera, movers) & (own.depth < within)
+        if known is not None:
+            there = known[view.camera, view.index]
+            clear &= ~there[own.cells(there.shape, camera)]
+        row, column = (index[clear] for index in own.cells((camera.height, camera.width), camera))
+        parts.append(Cloud(own.points()[clear], view.evenly(row, column) / gains[view.camera]))
+        measured[view.camera, view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
+    return Cloud.cat(parts), measured
 
 
-def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: list[Track]) -> list[Cloud]:
+def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: list[Track], gains: np.ndarray) -> list[Cloud]:
     """The sparse points as the training pictures show them, for pictures that stand too far apart to be compared."""
     made = []
     for view in frames.training():
@@ -90,7 +122,7 @@ def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: l
         points = sparse.xyz[sparse.seen[name][view.index]]
         row, column, depth, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
         inside &= (depth < nearest_box(camera, movers)[row, column]) & view.shows_street(row, column)
-        made.append(Cloud(points[inside], view.image.numpy()[row[inside], column[inside]] / 255))
+        made.append(Cloud(points[inside], view.evenly(row[inside], column[inside]) / gains[view.camera]))
     return made
 
 
@@ -193,8 +225,7 @@ def agreed(found: list[Depths]) -> list[np.ndarray]:
 
 def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
     """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
-    x, y = np.nan_to_num(own.plate.at.numpy()).transpose(2, 0, 1)
-    column, row = x.clip(0, camera.width - 1).astype(np.int64), y.clip(0, camera.height - 1).astype(np.int64)
+    row, column = own.cells((camera.height, camera.width), camera)
     clear = own.view.shows_street(row, column)
     if not movers:
         return clear

@@ -36,6 +36,12 @@ class Cloud:
     def select(self, which: np.ndarray) -> Cloud:
         return Cloud(self.xyz[which], self.rgb[which])
 
+    @staticmethod
+    def cat(clouds: Sequence[Cloud]) -> Cloud:
+        """The points of all of them, in order."""
+        nothing = np.zeros((0, 3))
+        return Cloud(np.concatenate([nothing, *(c.xyz for c in clouds)]), np.concatenate([nothing, *(c.rgb for c in clouds)]))
+
 
 def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, movers: list[Track], local_pose=None) -> np.ndarray:
     """Colours `[C, N, 3]` of points as each camera's training frame nearest to the point's sweep shows them; NaN where it does not.

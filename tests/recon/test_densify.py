@@ -20,17 +20,17 @@ def splats():
 BOXES = [np.array([2.0, 2.0, 2.0])] * 2
 
 
-def pulled(s, generator=torch.Generator().manual_seed(3)):  # noqa: B008
+def wrong(s, generator=torch.Generator().manual_seed(3)):  # noqa: B008
     return Growth(torch.rand(len(s), generator=generator), torch.ones(len(s)))
 
 
 def test_growth_ends_at_the_budget():
     s = splats()
     for left in (3, 2, 1):
-        s, _ = grow(s, {}, pulled(s), 140, left, BOXES)
+        s, _ = grow(s, {}, wrong(s), 140, left, BOXES)
         s.groups(4)
     assert len(s) == 140 and sum(s.sizes) == 140
-    s, _ = grow(s, {}, pulled(s), 100, 1, BOXES)
+    s, _ = grow(s, {}, wrong(s), 100, 1, BOXES)
     assert len(s) == 140
 
 
@@ -38,7 +38,7 @@ def test_groups_stay_apart_when_splats_are_added_and_dropped():
     s = splats()
     s.fields["sh"] = s.group_of().float()[:, None, None].expand(-1, 4, 3).clone()
     s.fields["logits"][::7] = -9
-    after, _ = grow(s, {}, pulled(s), 120, 1, BOXES)
+    after, _ = grow(s, {}, wrong(s), 120, 1, BOXES)
     for i, group in enumerate(after.groups(4)):
         assert (group.sh[:, 0] == i).all()
     assert (torch.sigmoid(after.fields["logits"]) > 0.02).all() and len(after) == 120
@@ -64,5 +64,17 @@ def test_a_split_keeps_the_place_and_halves_the_length():
 
 def test_what_splats_carry_follows_them_and_new_ones_start_at_zero():
     s = splats()
-    after, carried = grow(s, {"moments": torch.ones(len(s), 2, 5), "age": torch.ones(len(s))}, pulled(s), 90, 1, BOXES)
+    after, carried = grow(s, {"moments": torch.ones(len(s), 2, 5), "age": torch.ones(len(s))}, wrong(s), 90, 1, BOXES)
     assert carried["moments"].shape == (90, 2, 5) and carried["moments"][:, 1, 4].sum() == carried["age"].sum() == 80
+
+
+def test_those_are_split_in_whose_pixels_most_is_wrong_in_the_mean_picture():
+    s = splats()
+    growth = Growth.none(len(s))
+    for errors in ([5.0, 4.0, 0.0], [5.0, 0.0, 0.0]):  # 4 in the one picture that shows it is less than 5, and more than nothing
+        growth.add(torch.tensor([7, 60, 75]), torch.tensor(errors))
+    assert growth.shown[[7, 60, 75, 0]].tolist() == [2, 1, 0, 0]
+    first, _ = grow(s, {}, growth, 81, 1, BOXES)
+    assert first.sizes == [51, 20, 10]
+    both, _ = grow(s, {}, growth, 99, 1, BOXES)
+    assert both.sizes == [51, 21, 10], "nothing is wrong with the others"

@@ -3,7 +3,7 @@ import math
 import torch
 from randomized import gaussians
 
-from recon.fit.densify import LARGEST, LONGEST, THINNEST, Growth
+from recon.fit.densify import LARGEST, LONGEST, THINNEST
 from recon.fit.descent import Descent, rates_at
 from recon.fit.model import Splats
 
@@ -17,13 +17,13 @@ def splats(count=40):
     return made
 
 
-def follow(descent, all_splats, growth, which, gradients, now):
+def follow(descent, all_splats, which, gradients, now):
     rates = rates_at(now, RATES, FADE)
     descent.catch_up(all_splats, which, 4, rates)
     shown = all_splats.select(which, 4)
     for name, g in gradients.items():
         shown.fields[name].grad = g
-    descent.follow(all_splats, which, shown, rates, growth)
+    descent.follow(all_splats, which, shown, rates)
 
 
 def some_gradients(all_splats, generator, count=None):
@@ -40,7 +40,7 @@ def test_splats_seen_now_and_then_move_as_torchs_adam_moves_them():
     for now in range(1, 121):
         which = everything if now < 50 else (torch.rand(40, generator=generator) < 0.3).nonzero()[:, 0]
         gradients = some_gradients(ours, generator, len(which))
-        follow(descent, ours, Growth.none(40), which, gradients, now)
+        follow(descent, ours, which, gradients, now)
         fades[which] += FADE
         for k, g in gradients.items():
             theirs[k].grad = torch.zeros_like(theirs[k]).index_copy_(0, which, g)
@@ -57,25 +57,24 @@ def test_splats_seen_now_and_then_move_as_torchs_adam_moves_them():
 
 
 def test_splats_that_a_picture_does_not_show_stay_as_they_are():
-    ours, growth = splats(), Growth.none(40)
+    ours = splats()
     before, descent = {k: v.clone() for k, v in ours.fields.items()}, Descent.begin(ours)
     which = torch.tensor([3, 5, 30])
     gradients = some_gradients(ours, torch.Generator().manual_seed(1), 3)
     for g in gradients.values():
         g[1] = 0  # in the view, but hidden
-    follow(descent, ours, growth, which, gradients, 1)
+    follow(descent, ours, which, gradients, 1)
     moved = torch.zeros(40, dtype=torch.bool)
     moved[[3, 30]] = True
     for name, field in ours.fields.items():
         assert torch.equal((field != before[name]).reshape(40, -1).any(1), moved), name
-    assert torch.equal(descent.last == 1, moved) and torch.equal(growth.seen == 1, moved)
-    torch.testing.assert_close(growth.pull[which[::2]], 2.0 * gradients["means"][::2].norm(dim=1))
+    assert torch.equal(descent.last == 1, moved)
 
 
 def test_scales_stay_within_what_cameras_can_tell():
     ours = splats()
     ours.fields["log_scales"][:] = torch.tensor([9.0, -1.0, -30.0])
-    follow(Descent.begin(ours), ours, Growth.none(40), torch.arange(40), some_gradients(ours, torch.Generator().manual_seed(3)), 1)
+    follow(Descent.begin(ours), ours, torch.arange(40), some_gradients(ours, torch.Generator().manual_seed(3)), 1)
     scales = ours.fields["log_scales"].exp()
     assert (scales.amax(1) <= 2 * LARGEST * 1.001).all() and (scales.amin(1) >= 2 * THINNEST * 0.999).all()
     assert (scales.amax(1) <= scales.median(1).values * LONGEST * 1.01).all() and math.isfinite(float(scales.sum()))

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+import torch
+from painted import SIZE, WALL, depth_of, drive
+
+from recon.frames import load_frames
+from recon.ground import estimate_ground
+from recon.log import Log
+from recon.seeds import dense, measured, stereo
+from recon.seeds.beyond import beyond_lidar
+from recon.seeds.measured import Measured, as_known, grid_of
+
+STEPS = [0.0] + [0.6] * 8
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pictures():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dense, "VIEWS", (6, 10))
+        patch.setattr(stereo, "WIDTH", 160)
+        patch.setattr(measured, "WIDTH", 160)
+        yield
+
+
+def _struck(log: Log, frames, reached) -> Measured:
+    """What a lidar measures of each training view where `reached` (a row's part of the picture) says so."""
+    depths = {}
+    for view in frames.training():
+        camera = grid_of(log.camera("front").camera(view.index, *SIZE))
+        rows = (torch.arange(camera.height)[:, None] + 0.5) / camera.height
+        depths[view.camera, view.index] = as_known(np.where(reached(rows), depth_of(camera), np.nan))
+    return Measured(depths, 0.25)
+
+
+@pytest.fixture(scope="module")
+def made():
+    log = drive(STEPS, ("front",))
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    road = np.stack(np.meshgrid(np.arange(-5, 25, 0.5), np.arange(-10, 10, 0.5), [0.0]), -1).reshape(-1, 3)
+    return log, frames, estimate_ground(road, log.ego)
+
+
+def test_what_stands_above_the_beams_is_found_in_pictures(made):
+    log, frames, ground = made
+    struck = _struck(log, frames, lambda row: row > 0.5)  # the road, and the wall's foot
+    cloud, found = beyond_lidar(log, frames, struck, ground, [], np.full((1, 3), 0.5))
+    off = np.abs(cloud.xyz[:, 0] / WALL - 1)
+    assert np.median(off) < 0.02 and (off < 0.05).mean() > 0.9
+    assert cloud.xyz[:, 2].min() > 1, "nothing where lidar has measured"
+    assert len(cloud.xyz) > 20_000, "most of what it has not"
+    assert 0.9 < cloud.rgb.mean() < 1.1, "blotches are grey in the mean, and this camera is exposed by half"
+    assert found.weight == struck.weight
+    for which, depth in found.views.items():
+        assert not (depth.isfinite() & struck.views[which].isfinite()).any()
+
+
+def test_nothing_is_looked_for_where_lidar_saw_all_or_nothing(made):
+    log, frames, ground = made
+    for reached in (lambda row: row > 0, lambda row: row > 2):
+        cloud, _ = beyond_lidar(log, frames, _struck(log, frames, reached), ground, [], np.ones((1, 3)))
+        assert cloud.xyz.shape == (0, 3)
+        assert cloud.rgb.shape == (0, 3)
+
+
+def test_between_beams_nothing_is_looked_for(made):
+    log, frames, ground = made
+    beams = _struck(log, frames, lambda row: (row * 90 % 5 < 1) & (row > 0.3))
+    cloud, _ = beyond_lidar(log, frames, beams, ground, [], np.ones((1, 3)))
+    assert len(cloud.xyz) > 5_000
+    assert cloud.xyz[:, 2].min() > 2, "the beams' highest row is a fifth of the picture above the horizon"
