@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,22 +49,33 @@ are under that, it is not known at all."""
 
 @dataclass(frozen=True)
 class Depths:
-    """A picture, its plate, and the depth z `[h, w]` of its pixels."""
+    """A picture, its camera at the picture's size, its plate, and the depth z `[h, w]` of its pixels, NaN where it is not known."""
 
     view: View
+    camera: Camera
     plate: Plate
     depth: np.ndarray
+
+    def only(self, mask: np.ndarray) -> Depths:
+        """The depths of a mask `[h, w]` alone."""
+        return replace(self, depth=np.where(mask, self.depth, np.nan))
 
     def points(self) -> np.ndarray:
         """What its pixels show, `[h, w, 3]` in the world."""
         back = np.linalg.inv(self.plate.cam_from_world)
         return (self.plate.rays().double().numpy() * self.depth[..., None]) @ back[:3, :3].T + back[:3, 3]
 
-    def cells(self, size: Sequence[int], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column `[h, w]` of what its pixels show on a grid of a size (rows, columns) over the picture of the view's camera."""
+    def cells(self, size: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column `[h, w]` of what its pixels show on a grid of a size (rows, columns) over the picture."""
         x, y = np.nan_to_num(self.plate.at.numpy()).transpose(2, 0, 1)
-        row, column = y * (size[0] / camera.height), x * (size[1] / camera.width)
+        row, column = y * (size[0] / self.camera.height), x * (size[1] / self.camera.width)
         return row.clip(0, size[0] - 1).astype(np.int64), column.clip(0, size[1] - 1).astype(np.int64)
+
+    def cloud(self, gains: np.ndarray) -> Cloud:
+        """What is known of it, with the picture's colours; gains: the cameras' exposures `[C, 3]`."""
+        known = np.isfinite(self.depth)
+        row, column = (index[known] for index in self.cells((self.camera.height, self.camera.width)))
+        return Cloud(self.points()[known], self.view.evenly(row, column) / gains[self.view.camera])
 
 
 def cloud_from_pictures(
@@ -75,42 +86,24 @@ def cloud_from_pictures(
     gains: the cameras' exposures `[C, 3]`. Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a
     point.
     """
-    cloud, measured = agreed_points(log, frames, sparse, ground, movers, gains)
+    found = believed(log, frames, sparse, ground, movers)
+    cloud = Cloud.cat([own.cloud(gains) for own in found])
     if len(cloud.xyz) < len(sparse.xyz):
         cloud = Cloud.cat([cloud, *_points_themselves(log, frames, sparse, movers, gains)])
     if not len(cloud.xyz):
         raise ValueError(f"{log.path}: no training picture shows what another one shows; match more pictures, or take other cameras")
-    return cloud, Measured(measured, PICTURES)
+    return cloud, measured_by(found, PICTURES)
 
 
-def agreed_points(
-    log: Log,
-    frames: Frames,
-    sparse: SparsePoints,
-    ground: Ground,
-    movers: list[Track],
-    gains: np.ndarray,
-    known: Mapping[tuple[int, int], np.ndarray] | None = None,
-    within: float = np.inf,
-) -> tuple[Cloud, dict[tuple[int, int], torch.Tensor]]:
-    """As `cloud_from_pictures`, but for what pictures do not agree on; nothing where none do. Depths as `Measured` has them.
+def measured_by(found: Sequence[Depths], weight: float) -> Measured:
+    """Their depths, to be held to."""
+    return Measured({(own.view.camera, own.view.index): by_pictures(own.plate, own.depth, own.camera) for own in found}, weight)
 
-    known: by a view's camera and index what needs no finding in it, bool `[h, w]` on its grid; within: metres up to
-    which anything is looked for.
-    """
+
+def believed(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> list[Depths]:
+    """Depths on which pictures agree, NaN in all other pixels, in the sky, and where the boxes of `movers` may hide what is there."""
     found = depths(log, frames, sparse, ground)
-    parts, measured = [], {}
-    for own, mask in zip(found, agreed(found), strict=True):
-        view = own.view
-        camera = log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height)
-        clear = mask & _clear(own, camera, movers) & (own.depth < within)
-        if known is not None:
-            there = known[view.camera, view.index]
-            clear &= ~there[own.cells(there.shape, camera)]
-        row, column = (index[clear] for index in own.cells((camera.height, camera.width), camera))
-        parts.append(Cloud(own.points()[clear], view.evenly(row, column) / gains[view.camera]))
-        measured[view.camera, view.index] = by_pictures(own.plate, np.where(clear, own.depth, np.nan), camera)
-    return Cloud.cat(parts), measured
+    return [own.only(mask & _clear(own, movers)) for own, mask in zip(found, agreed(found), strict=True)]
 
 
 def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: list[Track], gains: np.ndarray) -> list[Cloud]:
@@ -131,13 +124,14 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
     found = []
     for c, name in enumerate(frames.names):
         views = frames.of(c)
-        plates = [plate_of(v.image, log.camera(name).camera(v.index, frames.width, frames.height)) for v in views]
+        cameras = [log.camera(name).camera(v.index, frames.width, frames.height) for v in views]
+        plates = [plate_of(v.image, camera) for v, camera in zip(views, cameras, strict=True)]
         points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
         chosen = _chosen(plates, points)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
             for i in chosen:
                 depth = _depth_of(i, plates, points[i], ground)
-                found += [Depths(views[i], plates[i], depth)] if depth is not None else []
+                found += [Depths(views[i], cameras[i], plates[i], depth)] if depth is not None else []
                 steps.step()
     return found
 
@@ -223,11 +217,11 @@ def agreed(found: list[Depths]) -> list[np.ndarray]:
     return masks
 
 
-def _clear(own: Depths, camera: Camera, movers: list[Track]) -> np.ndarray:
+def _clear(own: Depths, movers: list[Track]) -> np.ndarray:
     """Mask `[h, w]` of what is no sky, and before the boxes of `movers`."""
-    row, column = own.cells((camera.height, camera.width), camera)
+    row, column = own.cells((own.camera.height, own.camera.width))
     clear = own.view.shows_street(row, column)
     if not movers:
         return clear
-    depth = camera.lens.depth(own.plate.rays().double() * torch.from_numpy(own.depth)[..., None]).numpy()
-    return clear & (depth < nearest_box(camera, movers)[row, column])
+    depth = own.camera.lens.depth(own.plate.rays().double() * torch.from_numpy(own.depth)[..., None]).numpy()
+    return clear & (depth < nearest_box(own.camera, movers)[row, column])
