@@ -42,7 +42,7 @@ ASIDE_EVERY = 2
 """Every how many steps it is looked at what is open from aside of the path."""
 
 BLAME_EVERY = 3
-"""Every how many steps of those in which splats are added it is found out where what is wrong."""
+"""Every how many steps it is found out which splats show what is wrong, as long as some are added."""
 
 GUESSED_FROM = 0.8
 """Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
@@ -166,7 +166,7 @@ class Fit:
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates)
         if blank is not None and blank.grad is not None:
-            self.growth.add(which, blank.grad[:, 0])
+            self.growth.add(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
@@ -302,13 +302,13 @@ class Fit:
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""
-        return self._growing() and self.step_count % BLAME_EVERY == 0
+        return self.progress <= self.config.grow_span[1] and self.step_count % BLAME_EVERY == 0
 
     def _growing(self) -> bool:
         return self.config.grow_span[0] <= self.progress <= self.config.grow_span[1]
 
     def _grow(self) -> None:
-        """Split where the gradient pulls, drop what does not show."""
+        """Split where most is wrong, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
         self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None

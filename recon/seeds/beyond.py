@@ -6,6 +6,7 @@ Its points are held fast in the pictures' stereo, so that what is found between 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy import ndimage
 
 from recon.frames import Frames
@@ -30,8 +31,8 @@ aside. Without this drive 002's skyline blurred, and its held-out frames lost 0.
 def beyond_lidar(
     log: Log, frames: Frames, struck: Measured, ground: Ground, movers: list[Track], gains: np.ndarray
 ) -> tuple[Cloud, Measured]:
-    """Points `[N, 3]` with colours in training pictures of which lidar measured a part, where it did not, and their depths; none where
-    pictures do not agree, or beams went through.
+    """Points `[N, 3]` with colours in training pictures of which lidar measured a part, where it did not; none where pictures do not agree,
+    or beams went through. And what lidar measured, with these points' depths beside it.
 
     struck: what it measured of each; gains: the cameras' exposures `[C, 3]`.
     """
@@ -39,7 +40,9 @@ def beyond_lidar(
     found = believed(log, frames, _points(log, frames, struck, grids), ground, movers)
     kept = [own.only(_beyond(own, struck)) for own in found]
     kept = [own.only(~_seen_through(own, struck, grids)) for own in kept]
-    return Cloud.cat([own.cloud(gains) for own in kept]), measured_by(kept, struck.weight)
+    more = measured_by(kept, struck.weight).views
+    both = {which: torch.where(depth.isfinite(), depth, more.get(which, depth)) for which, depth in struck.views.items()}
+    return Cloud.cat([own.cloud(gains) for own in kept]), Measured(both, struck.weight)
 
 
 def _points(log: Log, frames: Frames, struck: Measured, grids: dict[tuple[int, int], Camera]) -> SparsePoints:

@@ -30,6 +30,10 @@ BASELINES, ALLOWED = (0.06, 0.2), 2.5
 """Distances to the pictures that one is compared with, before and after it, in distances to what it shows; and how many times more or less
 is allowed."""
 
+LEAST = BASELINES[0] / ALLOWED
+"""Distance to another picture, in distances to what one shows, from which on they show it from two places: of a car that waits, shaking by
+a millimetre, they look alike at any depth."""
+
 NEARER = 0.6
 """Part of the distance to the nearest points from which on depths are tried: between the points there may be something nearer."""
 
@@ -181,7 +185,7 @@ def companions(i: int, plates: list[Plate], typical: float) -> list[int]:
             ratio[~(side & along)] = np.inf
             if ratio.min(initial=np.inf) < np.log(ALLOWED):
                 found.append(int(ratio.argmin()))
-    apart = np.where(along & (away > 0), away, np.inf)
+    apart = np.where(along & (away > LEAST), away, np.inf)
     # photos far apart have none at those: the nearest are better than none
     return list(dict.fromkeys(found)) or [int(j) for j in apart.argsort()[:2] if apart[j] < 1]
 
@@ -202,13 +206,15 @@ def ground_depth(plate: Plate, ground: Ground) -> np.ndarray:
 
 def agreed(found: list[Depths]) -> list[np.ndarray]:
     """Masks `[h, w]` of what at least `AGREEING` other pictures find in the same place, and no more see through: the rest is guessed, or
-    moves."""
+    moves. Pictures from the same place, of a car that waits, make the same mistakes, and are not asked."""
     masks = []
     for own in found:
         points = own.points()
         agree, through = np.zeros((2, *own.depth.shape), np.int64)
-        facing = [other for other in found if other is not own and other.plate.axis() @ own.plate.axis() > 0]
-        for other in sorted(facing, key=lambda d: float(np.linalg.norm(d.plate.eye() - own.plate.eye())))[:OTHERS]:
+        away = [float(np.linalg.norm(other.plate.eye() - own.plate.eye())) for other in found]
+        least = LEAST * float(np.nanmedian(own.depth)) if np.isfinite(own.depth).any() else np.inf
+        facing = [i for i, other in enumerate(found) if away[i] > least and other.plate.axis() @ own.plate.axis() > 0]
+        for other in (found[i] for i in sorted(facing, key=away.__getitem__)[:OTHERS]):
             row, column, z, inside = other.plate.shown(points)
             there = other.depth[row, column]
             agree += inside & (np.abs(there - z) < AGREE * z)

@@ -42,6 +42,12 @@ class Measured:
     views: dict[tuple[int, int], torch.Tensor]
     weight: float
 
+    def without(self, known: Measured) -> Measured:
+        """The depths of pixels that `known` says nothing of."""
+        other = {which: known.views[which].isfinite() for which in self.views if which in known.views}
+        views = {which: depth.masked_fill(other[which], torch.nan) if which in other else depth for which, depth in self.views.items()}
+        return Measured(views, self.weight)
+
     def to(self, device: torch.device | str) -> Measured:
         """The same depths on a device."""
         return Measured({which: depth.to(device) for which, depth in self.views.items()}, self.weight)

@@ -7,7 +7,8 @@ from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import Log
 from recon.seeds import dense, measured, stereo
-from recon.seeds.beyond import beyond_lidar
+from recon.seeds.beyond import _points, _seen_through, beyond_lidar
+from recon.seeds.dense import DUG, believed
 from recon.seeds.measured import Measured, as_known, grid_of
 
 STEPS = [0.0] + [0.6] * 8
@@ -42,16 +43,28 @@ def made():
 
 def test_what_stands_above_the_beams_is_found_in_pictures(made):
     log, frames, ground = made
-    struck = _struck(log, frames, lambda row: row > 0.5)  # the road, and the wall's foot
+    struck = _struck(log, frames, lambda row: row > 0.65)  # the road, and nothing of the wall
     cloud, found = beyond_lidar(log, frames, struck, ground, [], np.full((1, 3), 0.5))
     off = np.abs(cloud.xyz[:, 0] / WALL - 1)
     assert np.median(off) < 0.02 and (off < 0.05).mean() > 0.9
-    assert cloud.xyz[:, 2].min() > 1, "nothing where lidar has measured"
+    assert cloud.xyz[:, 2].min() > -DUG, "nothing under the road"
     assert len(cloud.xyz) > 20_000, "most of what it has not"
     assert 0.9 < cloud.rgb.mean() < 1.1, "blotches are grey in the mean, and this camera is exposed by half"
     assert found.weight == struck.weight
-    for which, depth in found.views.items():
-        assert not (depth.isfinite() & struck.views[which].isfinite()).any()
+    added = 0
+    for which, depth in struck.views.items():
+        assert torch.equal(found.views[which][depth.isfinite()], depth[depth.isfinite()])
+        added += int((found.views[which].isfinite() & ~depth.isfinite()).sum())
+    assert added > 20_000
+
+
+def test_a_car_that_waits_finds_nothing():
+    log = drive([0.0] + [0.001, -0.002, 0.001] * 3, ("front",))
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    road = np.stack(np.meshgrid(np.arange(-5, 25, 0.5), np.arange(-10, 10, 0.5), [0.0]), -1).reshape(-1, 3)
+    struck = _struck(log, frames, lambda row: row > 0.65)
+    cloud, _ = beyond_lidar(log, frames, struck, estimate_ground(road, log.ego), [], np.ones((1, 3)))
+    assert len(cloud.xyz) == 0, "of a shaking car, pictures look alike at any depth"
 
 
 def test_nothing_is_looked_for_where_lidar_saw_all_or_nothing(made):
@@ -64,7 +77,21 @@ def test_nothing_is_looked_for_where_lidar_saw_all_or_nothing(made):
 
 def test_between_beams_nothing_is_looked_for(made):
     log, frames, ground = made
-    beams = _struck(log, frames, lambda row: (row * 90 % 5 < 1) & (row > 0.3))
+    beams = _struck(log, frames, lambda row: (row * 90 % 5 >= 4) & (row > 0.3))
     cloud, _ = beyond_lidar(log, frames, beams, ground, [], np.ones((1, 3)))
     assert len(cloud.xyz) > 5_000
     assert cloud.xyz[:, 2].min() > 2, "the beams' highest row is a fifth of the picture above the horizon"
+
+
+def test_what_more_sweeps_see_through_than_strike_is_not_believed(made):
+    log, frames, ground = made
+    struck = _struck(log, frames, lambda row: row > 0.65)
+    grids = {k: grid_of(log.camera("front").camera(k[1], *SIZE)) for k in struck.views}
+    own = believed(log, frames, _points(log, frames, struck, grids), ground, [])[0]
+    wall = own.only(own.points()[..., 2] > 2)
+    share = np.isfinite(wall.depth).mean()
+    assert share > 0.2
+    full = _struck(log, frames, lambda row: row > 0)
+    for through, expected in ((1, 0.0), (8, share)):  # of nine views, not all of which show all of it
+        beams = {k: d if i >= through else torch.full_like(d, 60.0) for i, (k, d) in enumerate(full.views.items())}
+        assert abs(_seen_through(wall, Measured(beams, 0.25), grids).mean() - expected) < 0.1 * share, through
