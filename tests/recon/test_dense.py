@@ -70,7 +70,7 @@ def test_depths_are_those_of_what_pictures_show(plain):
 def test_a_car_that_stands_before_it_goes_learns_depth_from_where_it_went():
     log = drive([0.0] * 6 + [0.6] * 8, ("front",))
     errors, share = _off((log, *_started(log)), until=5)
-    assert np.median(errors) < 0.03 and len(share) >= 2 and share.mean() > 0.5
+    assert np.median(errors) < 0.03 and len(share) >= 2 and share.mean() > 0.35
 
 
 def test_what_moves_is_no_seed_and_what_stands_behind_it_is(plain, crossed):
