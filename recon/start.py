@@ -106,8 +106,8 @@ def prepare(
         cloud = Cloud(split.static[known], rgb[known])
         report("measuring depth")
         struck = by_lidar(log, frames, sweeps, split, movers)
-        beyond, known = beyond_lidar(log, frames, struck, ground, movers, gains)
-        measured = [known, by_all_sweeps(log, frames, split, movers).without(known)]
+        beyond, agreed = beyond_lidar(log, frames, struck, ground, movers, gains)
+        measured = [struck, by_all_sweeps(log, frames, split, movers).without(agreed), agreed]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())

@@ -217,7 +217,7 @@ def test_depth_follows_what_was_measured(drive):
     after = []
     for weight in (0.0, 1.0):
         _, fit = begin(log, names, span, SIZE, replace(CONFIG, steps=400, depth_weight=weight), 4)
-        assert [len(m.views) for m in fit.measured] == 2 * [len(fit.training)]
+        assert [len(m.views) for m in fit.measured[:2]] == 2 * [len(fit.training)]
         fit.measured = [Measured({k: 1.15 * depth for k, depth in fit.measured[0].views.items()}, 0.5)]
         before = _mistakes(fit)
         for _ in range(40):
