@@ -110,7 +110,8 @@ def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lamb
     print(f"{log.path}: its sweeps lie up to {_unlike(found):.2f} m apart by its recorded poses, which are corrected", file=sys.stderr)
     poses = about(np.stack([cloud.centre for cloud in surfaces(turns)]), found)
     path = {"times_us": [turn[0].time_us for turn in turns], "poses": poses.flatten(1).tolist()}
-    return as_aligned(replace(log, meta={**log.meta, MOVED: path}))
+    log = replace(log, meta={**log.meta, MOVED: path})
+    return as_aligned(log, log.meta)
 
 
 def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
@@ -120,9 +121,9 @@ def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
     return poses
 
 
-def as_aligned(log: Log, meta: dict | None = None) -> Log:
-    """A log as recorded, moved as its `meta` says, or that of a log or scene which was `aligned`; as it is where nothing was."""
-    path = (log.meta if meta is None else meta).get(MOVED)
+def as_aligned(log: Log, meta: dict) -> Log:
+    """A log as recorded, moved as the `meta` of a log or scene says that was `aligned`; as it is where nothing was."""
+    path = meta.get(MOVED)
     if path is None:
         return log
     poses = torch.tensor(path["poses"], dtype=torch.float64).view(-1, 4, 4)

@@ -15,7 +15,7 @@ from recon.egomask import at_size, ego_mask
 from recon.gains import gains_along, picture_gains
 from recon.log import Log, LogCamera
 from recon.project import project
-from recon.skies import WHITE, like_sky, sky_mask
+from recon.skies import WHITE, SkyKind, like_sky, sky_mask
 from scenes.camera import Camera, followed
 from scenes.poses import inverse
 from scenes.trajectory import between
@@ -90,14 +90,14 @@ class Frames:
     """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
 
     From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
-    shows at its edges, no other one does. `under` is one of `SKIES`.
+    shows at its edges, no other one does. `under` is one of `SkyKind`.
     """
 
     names: list[str]
     width: int
     height: int
     views: list[View]
-    under: str = "blue"
+    under: SkyKind = "blue"
 
     def training(self) -> list[View]:
         return [v for v in self.views if not v.held_out]
@@ -168,8 +168,8 @@ def load_frames(
     return Frames(names, *size, views, under)
 
 
-def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], str]:
-    """The views, and which of `SKIES` theirs is: then each is told its sky as such a one is known.
+def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list[View], SkyKind]:
+    """The views, and which of `SkyKind` theirs is: then each is told its sky as such a one is known.
 
     One that is not blue takes colour, and what lidar strikes is left out: a white wall fits the description as well. Beside blue, white is
     sky only where there is lidar to tell.
@@ -180,7 +180,8 @@ def _under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[lis
         return views, "blue"
     chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
     points = [s.read().xyz for s in chosen]
-    kind, more = ("blinding", DAZZLED) if blue >= BLUE else ("overcast", 2)
+    kind: SkyKind = "blinding" if blue >= BLUE else "overcast"
+    more = DAZZLED if blue >= BLUE else 2
     if kind == "blinding" and float(np.mean([(v.image[::4, ::4].amin(-1) >= WHITE).float().mean() for v in views])) < blue * (DAZZLED - 1):
         return views, "blue"
     told = []
@@ -280,7 +281,7 @@ def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, in
     return at_size(small, size[1], size[0])
 
 
-def _sky(image: torch.Tensor, ego: torch.Tensor | None, kind: str = "blue") -> torch.Tensor:
+def _sky(image: torch.Tensor, ego: torch.Tensor | None, kind: SkyKind = "blue") -> torch.Tensor:
     """The sky of an image on a grid about 240 cells wide: without its rim, but for what of that looks like it, where splats of its colour
     would stand before walls as soon as it is seen from elsewhere. Nothing of it is in the recording car."""
     step = max(1, image.shape[1] // 240)

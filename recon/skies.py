@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ FREE = 0.05
 HIDDEN = 128
 """Rows of the grid of directions in which the sky is never seen: 1.4 degrees each."""
 
-SKIES = ("blue", "overcast", "blinding")
+SkyKind = Literal["blue", "overcast", "blinding"]
 """How skies look: what is no blue sky is known by less, and may as well be a white wall."""
 
 WHITE = 250
@@ -33,9 +34,9 @@ TINT, BRIGHTEST = 32, 0.8
 """Of an overcast sky: levels between its channels at most, and part of the light of the picture's brightest fiftieth that it has."""
 
 
-def sky_mask(image: np.ndarray, kind: str = "blue") -> np.ndarray:
-    """Pixels `[H, W]` of a uint8 image that are surely sky, as one of `SKIES` looks: smooth, bright enough, joined to the image's top row,
-    and bluish; under an overcast sky without colour and the brightest there is; under a blinding one bluish or clipped."""
+def sky_mask(image: np.ndarray, kind: SkyKind = "blue") -> np.ndarray:
+    """Pixels `[H, W]` of a uint8 image that are surely sky, as such a one looks: smooth, bright enough, joined to the image's top row, and
+    bluish; under an overcast sky without colour and the brightest there is; under a blinding one bluish or clipped."""
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     grey = rgb.mean(-1)
     edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
