@@ -30,6 +30,9 @@ WINDOW = 5
 FLAT = 2.0
 """Levels of 255 of noise: squares whose contrast is not above it look like nothing in particular."""
 
+GREY = 128.0
+"""Level that plates count from: sums of squares lose less."""
+
 NUDGE, JUMP = 0.06, 0.5
 """What it costs a pixel to be one inverse depth off its neighbour, or any number; a correlation of 1 costs 0, of none 1."""
 
@@ -51,7 +54,8 @@ BEYOND = 0.5
 
 @dataclass(frozen=True)
 class Plate:
-    """A picture as a pinhole camera sees it: grey levels `[h, w]` float32, focal length and centre in pixels, `cam_from_world` `[4, 4]`.
+    """A picture as a pinhole camera sees it: grey levels `[h, w]` float32 less `GREY`, focal length and centre in pixels, `cam_from_world`
+    `[4, 4]`.
 
     at: where its pixels lie in the picture that it was made from, `[h, w, 2]` in that one's pixels; `inside` `[h, w]` whether they do.
     """
@@ -62,6 +66,11 @@ class Plate:
     cam_from_world: np.ndarray
     at: torch.Tensor
     inside: np.ndarray
+
+    def contrast(self) -> np.ndarray:
+        """Standard deviation `[h, w]` of the grey levels in the squares that are compared, noise taken off, in parts of their mean."""
+        mean, spread = _moments(self.grey[None])
+        return ((spread.square() - FLAT * FLAT).clamp_min(0).sqrt() / (mean + GREY).clamp_min(1))[0].numpy()
 
     def rays(self) -> torch.Tensor:
         """Directions `[h, w, 3]` of its pixels, z = 1."""
@@ -92,7 +101,7 @@ def plate_of(image: torch.Tensor, camera: Camera) -> Plate:
     shrink = min(1.0, WIDTH / camera.width)
     w, h = max(16, round(camera.width * shrink)), max(16, round(camera.height * shrink))
     small = camera.resized(w, h)
-    grey = F.interpolate(image.float().mean(2)[None, None], (h, w), mode="area") - 128
+    grey = F.interpolate(image.float().mean(2)[None, None], (h, w), mode="area") - GREY
     focal = small.lens.focal()
     plate = Plate(grey[0, 0], (float(focal[0]), float(focal[1])), (w / 2, h / 2), inverse(camera.world_from_cam).numpy(), grey, np.ones(0))
     rays = plate.rays().double()
