@@ -7,9 +7,10 @@ from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import Log
 from recon.seeds import dense, measured, stereo
-from recon.seeds.beyond import _points, _seen_through, beyond_lidar
+from recon.seeds.beyond import PLAIN, _points, _seen_through, beyond_lidar
 from recon.seeds.dense import DUG, believed
 from recon.seeds.measured import Measured, as_known, grid_of
+from recon.seeds.stereo import plate_of
 
 STEPS = [0.0] + [0.6] * 8
 
@@ -95,3 +96,15 @@ def test_what_more_sweeps_see_through_than_strike_is_not_believed(made):
     for through, expected in ((1, 0.0), (8, share)):  # of nine views, not all of which show all of it
         beams = {k: d if i >= through else torch.full_like(d, 60.0) for i, (k, d) in enumerate(full.views.items())}
         assert abs(_seen_through(wall, Measured(beams, 0.25), grids).mean() - expected) < 0.1 * share, through
+
+
+def test_plain_walls_are_not_guessed(made):
+    log, _, ground = made
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    for view in frames.views:
+        view.image[:90] = 210  # above the horizon
+    plate = plate_of(frames.views[0].image, log.camera("front").camera(0, *SIZE))
+    assert plate.contrast()[:42].max() < PLAIN < np.median(plate.contrast()[48:])
+    cloud, _ = beyond_lidar(log, frames, _struck(log, frames, lambda row: row > 0.65), ground, [], np.ones((1, 3)))
+    above = cloud.xyz[:, 2] > 1.5 + 0.05 * WALL  # of the eye's height, and a little
+    assert above.sum() < 0.02 * len(cloud.xyz)
