@@ -7,8 +7,8 @@ from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import Log
 from recon.seeds import dense, measured, stereo
-from recon.seeds.beyond import PLAIN, _points, _seen_through, beyond_lidar
-from recon.seeds.dense import DUG, believed
+from recon.seeds.beyond import _beyond, _points, _seen_through, beyond_lidar
+from recon.seeds.dense import DUG, Depths, believed
 from recon.seeds.measured import Measured, as_known, grid_of
 from recon.seeds.stereo import plate_of
 
@@ -99,12 +99,13 @@ def test_what_more_sweeps_see_through_than_strike_is_not_believed(made):
 
 
 def test_plain_walls_are_not_guessed(made):
-    log, _, ground = made
-    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
-    for view in frames.views:
-        view.image[:90] = 210  # above the horizon
-    plate = plate_of(frames.views[0].image, log.camera("front").camera(0, *SIZE))
-    assert plate.contrast()[:42].max() < PLAIN < np.median(plate.contrast()[48:])
-    cloud, _ = beyond_lidar(log, frames, _struck(log, frames, lambda row: row > 0.65), ground, [], np.ones((1, 3)))
-    above = cloud.xyz[:, 2] > 1.5 + 0.05 * WALL  # of the eye's height, and a little
-    assert above.sum() < 0.02 * len(cloud.xyz)
+    log, frames, _ = made
+    view, camera = frames.views[0], log.camera("front").camera(0, *SIZE)
+    half = view.image.clone()
+    half[:90, :160] = 210  # of the wall, its left half
+    plate = plate_of(half, camera)
+    own = Depths(view, camera, plate, depth_of(camera.resized(160, 90)).numpy())
+    asked = _beyond(own, _struck(log, frames, lambda row: row > 0.65))
+    assert not asked[:42, :77].any()
+    assert asked[:42, 83:].mean() > 0.95
+    assert not asked[62:].any(), "there lidar has measured"
