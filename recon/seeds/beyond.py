@@ -24,7 +24,7 @@ rows apart."""
 
 REACH = 60.0
 """Metres up to which pictures are asked: what is farther they misjudge, at the size at which they are compared, and it hardly moves from
-aside. Without this drive 002's skyline blurred, and its held-out frames lost 0.6 dB."""
+aside. Of seeds from any distance drive 002's skyline blurred."""
 
 PLAIN = 0.05
 """Contrast of squares up to which pictures are not asked: plain and clipped road looks alike at any depth; white clouds of it stood in
