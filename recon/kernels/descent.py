@@ -126,7 +126,7 @@ def descend(
     """Row k of the gradients is splat which[k]'s; those without a gradient were hidden, and catch up when they are shown again."""
     k = first + wp.tid()
     i = int(which[k])
-    if wp.length(g_means[k]) * reach[i] > 0.0:
+    if wp.length(g_means[k]) > 0.0:
         last[i] = rates.now
         move = wp.vec3()
         grow = wp.vec3()
