@@ -17,7 +17,6 @@ MARGIN = 0.15
 SWEPT_MARGIN = 0.4
 """Metres around a moving box within which points are kept out of the static background."""
 
-
 FEW = 5
 """Points by whose times a box is dated, at least."""
 
@@ -60,6 +59,15 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
+
+    def taken(sweep: Sweep, track: Track, which: np.ndarray, local: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        """Which of the points `local` in a track's frame are its own; those around it, of the sweep's `which`, are no longer kept."""
+        keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
+        own = inside(local, track.size, MARGIN, below=-0.08)  # the floor is left out: those are points of the road
+        if own.any():
+            found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+        return own
+
     for sweep in sweeps:
         points = sweep.read()
         keep = np.ones(len(points.xyz), dtype=bool)
@@ -69,10 +77,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
             if at is None:
                 continue
             which, local = near.box(track, track.world_from_box[at])
-            keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
-            own = _own(local, track)
-            if own.any():
-                found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+            own = taken(sweep, track, which, local, keep)
             sensor = points.sensor[which] == track.sensor[at]
             timed = own & sensor if (own & sensor).sum() >= FEW else own
             if timed.sum() >= FEW:
@@ -94,10 +99,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
             around = inside(local, track.size, REACH, below=-0.08)
             if around.sum() >= FEW:  # it moved in the time from its points to the stamp
                 which, local = near.box(track, path.near(int(np.median(times[which][around]))))
-            keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
-            own = _own(local, track)
-            if own.any():
-                found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+            taken(sweep, track, which, local, keep)
         static.append(xyz[keep])
     return Split(
         np.concatenate(static) if static else np.zeros((0, 3)),
@@ -119,11 +121,6 @@ class _Near:
         which = np.flatnonzero((np.abs(self.x - float(pose[0, 3])) < reach) & (np.abs(self.y - float(pose[1, 3])) < reach))
         back = inverse(pose).numpy()
         return which, self.xyz[which] @ back[:3, :3].T + back[:3, 3]
-
-
-def _own(local: np.ndarray, track: Track) -> np.ndarray:
-    # the floor is left out: those are points of the road
-    return inside(local, track.size, MARGIN, below=-0.08)
 
 
 def _between(track: Track, time_us: int) -> bool:

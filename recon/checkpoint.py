@@ -19,7 +19,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 10
+VERSION = 11
 
 
 def checkpoint_path(output: Path) -> Path:

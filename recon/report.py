@@ -7,7 +7,8 @@ from dataclasses import replace
 import torch
 
 from recon.fit.shutter import as_read
-from recon.frames import Frames, View
+from recon.frames import Frames
+from recon.view import View
 from render import render_frame
 from render.compare import psnr, ssim
 from scenes.camera import Camera, RigCamera

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from recon.actors import split_points
 from recon.fit.densify import LARGEST
 from recon.fit.model import Splats, draw
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.ground import estimate_ground
 from recon.log import Log, Track
 from recon.seeds.beyond import beyond_lidar
@@ -25,6 +25,7 @@ from recon.seeds.standing import by_all_sweeps
 from recon.seeds.sweep import companions
 from recon.seeds.triangulate import triangulated
 from recon.skies import SkyPicture, like_sky
+from recon.view import View
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground

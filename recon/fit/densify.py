@@ -1,4 +1,4 @@
-"""How many splats, and where: split those in whose pixels most is wrong, drop what does not show or leaves its box."""
+"""How many splats, and where: split those that do worst, drop what does not show or leaves its box."""
 
 from __future__ import annotations
 
@@ -27,26 +27,34 @@ BOX_MARGIN = 0.25
 
 @dataclass
 class Growth:
-    """How much is wrong where each splat shows, since the last densification: the sum `[N]` of pictures' errors times the splat's weights
-    in them (Bulò et al. 2024, equation 1), and how many such pictures show it `[N]`.
+    """What tells where splats are missing, of each splat `[N]`, since the last densification.
 
-    Pulls at a splat's place, by which Kerbl et al. (2023) split, cancel where it is too large for what it shows: leaves and gravel.
+    errors: sum of pictures' errors times its weights in them (Bulò et al. 2024, equation 1), of as many pictures as it was `shown` in.
+    pull: sum of gradients of its place in pixels, far ones by their smaller motion in it (Kerbl et al. 2023), of as many as it was
+    `pulled` in. What no splat can show better is wrong however many there are, and pulls cancel where a splat is too large for what it
+    shows: each alone sends splats where they bring less (tests/bench/README.md).
     """
 
     errors: torch.Tensor
     shown: torch.Tensor
+    pull: torch.Tensor
+    pulled: torch.Tensor
 
     @staticmethod
     def none(count: int, device: torch.device | str = "cpu") -> Growth:
-        return Growth(torch.zeros(count, device=device), torch.zeros(count, device=device))
+        return Growth(*torch.zeros(4, count, device=device))
 
-    def add(self, which: torch.Tensor, errors: torch.Tensor) -> None:
+    def blame(self, which: torch.Tensor, errors: torch.Tensor) -> None:
         """What is wrong `[M]` in one more picture where splats `which` `[M]` show."""
         self.errors.index_add_(0, which, errors)
         self.shown.index_add_(0, which, (errors > 0).to(errors))
 
+    def need(self) -> torch.Tensor:
+        """How much each splat `[N]` is in need of another: the geometric mean of error and pull in the mean picture."""
+        return (self.errors / self.shown.clamp_min(1) * self.pull / self.pulled.clamp_min(1)).sqrt()
+
     def tensors(self) -> dict[str, torch.Tensor]:
-        return {"errors": self.errors, "shown": self.shown}
+        return {"errors": self.errors, "shown": self.shown, "pull": self.pull, "pulled": self.pulled}
 
 
 def grow(
@@ -54,15 +62,15 @@ def grow(
 ) -> tuple[Splats, dict[str, torch.Tensor]]:
     """Splats after one round, and what each carries with it, `[N, ...]`, of which new splats start with zeros.
 
-    Dropped: fainter than `FAINT`, outside their actor's box. Split: those where most is wrong in the mean picture, as many as make the
-    budget last `rounds_left` rounds, in two along their longest axis.
+    Dropped: fainter than `FAINT`, outside their actor's box. Split: those in most `need`, as many as make the budget last
+    `rounds_left` rounds, in two along their longest axis.
     """
     fields = {k: v.detach() for k, v in splats.fields.items()}
     group = splats.group_of()
     keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
-    wrong = torch.where(keep, growth.errors / growth.shown.clamp_min(1), 0.0)
-    count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((wrong > 0).sum()))
-    parents = wrong.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=wrong.device)
+    need = torch.where(keep, growth.need(), 0.0)
+    count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((need > 0).sum()))
+    parents = need.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=need.device)
 
     scales = fields["log_scales"][parents]
     axis = scales.argmax(1)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import torch
 import warp as wp
 
-from recon.fit.densify import LARGEST, LONGEST, THINNEST
+from recon.fit.densify import LARGEST, LONGEST, THINNEST, Growth
 from recon.fit.model import FIELDS, Splats
 from recon.kernels.descent import BETA1, BETA2, Rates, catch_up, descend
 from render.launch import run, stage, view
@@ -50,11 +50,11 @@ class Descent:
         """Take their momentum from the colours of splats `which`, bool `[N]`."""
         self.moments[which, :, COLOURS:] = 0
 
-    def follow(self, splats: Splats, which: torch.Tensor, shown: Splats, rates: Rates) -> None:
-        """Move splats `which` `[M]`, which have caught up, along the gradients of `shown`, copies of theirs."""
+    def follow(self, splats: Splats, which: torch.Tensor, shown: Splats, rates: Rates, growth: Growth) -> None:
+        """Move splats `which` `[M]`, which have caught up, along the gradients of `shown`, copies of theirs, and tell `growth`."""
         gradients = [g.contiguous() for g in (shown.fields[name].grad for name in FIELDS) if g is not None]
         arrays = [view(g, kind) for g, kind in zip(gradients, _TYPES, strict=True)] + _fields(splats)
-        arrays += [view(t, float) for t in (self.moments, self.last)]
+        arrays += [view(t, float) for t in (self.moments, self.last, growth.pull, growth.pulled)]
         with stage(which.device):
             run(descend, len(which), [view(which, wp.int64), rates, *arrays], which.device)
 

@@ -20,10 +20,11 @@ from recon.fit.motion import Moment, Motion
 from recon.fit.openings import Openings
 from recon.fit.sight import Eye, in_sight
 from recon.fit.unseen import as_neighbours, shown_parts
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.measured import Measured, mistake
+from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -142,20 +143,22 @@ class Fit:
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
         sky = self.openings.backdrop(self.sky, self.generator)
-        rgb, alpha, depth, shows = self._render(by_lot, view, camera, ends, sky, shift, bool(known), blank)
+        outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
+        drawn = self._render(by_lot, view, camera, ends, sky, shift, outputs, blank)
+        rgb, alpha = drawn["rgb"], drawn["alpha"]
         if view.ego is not None:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         if view.gain is not None:
             rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
         haze = self.openings.haze(alpha, view, camera)
-        if shows is not None:
-            haze = haze + (shows[..., 0] * (rgb.detach() - target).abs().mean(-1)).sum()  # nothing, whose gradient says who shows errors
+        if blank is not None:
+            wrong = (rgb.detach() - target).abs().mean(-1)
+            haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
             haze = haze + self.openings.gaps(draw(self._placed(shown, view, aside), aside, "alpha")[0], aside)
-        if depth is not None:
-            for weight, there in known:
-                haze = haze + self.config.depth_weight * weight * mistake(depth, alpha, there)
+        for weight, there in known:
+            haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)
         unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
@@ -164,9 +167,9 @@ class Fit:
         if self.guessed is not None and colours is not None:
             colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
-        self.descent.follow(self.splats, which, shown, rates)
+        self.descent.follow(self.splats, which, shown, rates, self.growth)
         if blank is not None and blank.grad is not None:
-            self.growth.add(which, blank.grad[:, 0] * self.shrink() ** 2)
+            self.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
@@ -184,7 +187,7 @@ class Fit:
         camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
-        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), (0, 0), False)[0]
+        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky))["rgb"]
 
     def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
         """Indices of the splats that a picture of a view, and one from aside, may show."""
@@ -205,20 +208,19 @@ class Fit:
         camera: Camera,
         ends: list[Moment],
         sky: Callable[[torch.Tensor], torch.Tensor],
-        shift: Sequence[int],
-        with_depth: bool,
+        shift: Sequence[int] = (0, 0),
+        outputs: Sequence[str] = ("rgb", "alpha"),
         features: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Picture `[H, W, 3]` and alpha of a view by the splats in sight, exposed as its camera exposes; depth where it is wanted, and
-        what the picture shows of their `features` `[N, C]`. shift: of the sky's samples (`developed`)."""
+    ) -> dict[str, torch.Tensor]:
+        """Outputs of a view by the splats in sight, by name: "rgb" `[H, W, 3]`, before the sky and exposed as its camera exposes; "alpha";
+        "depth", and what the picture shows of the splats' `features` `[N, C]`, where they are wanted. shift: of the sky's samples
+        (`developed`)."""
         placed = self._placed(shown, view, camera)
-        outputs = ["rgb", "alpha", *["depth"] * with_depth, *["features"] * (features is not None)]
         of_groups = None if features is None else features.split(shown.sizes)
         theirs = None if of_groups is None else [of_groups[p.instance] for p in placed]
         drawn = draw(self.motion.as_read(placed, ends, view, camera), camera, *outputs, features=theirs)
         found = dict(zip(outputs, drawn, strict=True))
-        rgb = developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)
-        return rgb, found["alpha"], found.get("depth"), found.get("features")
+        return found | {"rgb": developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)}
 
     def _exposure(self, view: View) -> torch.Tensor:
         """The affine exposure `[3, 4]` of a view: its camera's, as many times as it was exposed."""
@@ -308,7 +310,7 @@ class Fit:
         return self.config.grow_span[0] <= self.progress <= self.config.grow_span[1]
 
     def _grow(self) -> None:
-        """Split where most is wrong, drop what does not show."""
+        """Split where most is wrong and pictures pull, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
         self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None

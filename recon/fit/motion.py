@@ -10,7 +10,8 @@ import torch
 
 from recon.fit.model import Knots, scaled, small_poses
 from recon.fit.shutter import shifts_of
-from recon.frames import Frames, View
+from recon.frames import Frames
+from recon.view import View
 from scenes.camera import Camera, RigCamera
 from scenes.gaussians import Placed
 from scenes.poses import inverse

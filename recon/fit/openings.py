@@ -9,9 +9,10 @@ import torch
 import torch.nn.functional as F
 
 from recon.fit.motion import Motion
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.seeds.points import spread
 from recon.skies import always_hidden, cells
+from recon.view import View
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera

@@ -120,13 +120,16 @@ def descend(
     g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3], g_logits: wp.array[float],
     g_sh: wp.array2d[wp.vec3],
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3], logits: wp.array[float], sh: wp.array2d[wp.vec3],
-    reach: wp.array[float], moments: wp.array3d[float], last: wp.array[float],
+    reach: wp.array[float], moments: wp.array3d[float], last: wp.array[float], pull: wp.array[float], pulled: wp.array[float],
     first: int,
 ):  # fmt: skip
     """Row k of the gradients is splat which[k]'s; those without a gradient were hidden, and catch up when they are shown again."""
     k = first + wp.tid()
     i = int(which[k])
-    if wp.length(g_means[k]) > 0.0:
+    size = wp.length(g_means[k]) * reach[i]
+    if size > 0.0:
+        pull[i] = pull[i] + size
+        pulled[i] = pulled[i] + 1.0
         last[i] = rates.now
         move = wp.vec3()
         grow = wp.vec3()

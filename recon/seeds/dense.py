@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.log import Log, SparsePoints, Track
 from recon.project import project
 from recon.seeds.measured import PICTURES, Measured, by_pictures
 from recon.seeds.points import Cloud, nearest_box, spread
 from recon.seeds.stereo import Plate, plate_of, swept
+from recon.view import View
 from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.frames import View
 from recon.seeds.points import Cloud
 from recon.seeds.sweep import swept_depth
+from recon.view import View
 from scenes.camera import Camera
 
 FAR = 250.0

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon.actors import Split
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.log import Log, Track
 from recon.seeds.measured import Measured, as_known, grid_of, nearest_points
 from recon.seeds.points import Cloud, nearest_box, thin
+from recon.view import View
 from scenes.camera import Camera
 
 POINTS = 300_000

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from recon.frames import View
+from recon.view import View
 from scenes.camera import Camera
 from scenes.poses import inverse
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.log import Log, SparsePoints
 from recon.readers.colmap import colmap_lens
 from recon.readers.sfm import triangulate
+from recon.view import View
 from scenes.poses import inverse
 
 AHEAD = (1, 2, 4, 8)

@@ -21,7 +21,12 @@ BOXES = [np.array([2.0, 2.0, 2.0])] * 2
 
 
 def wrong(s, generator=torch.Generator().manual_seed(3)):  # noqa: B008
-    return Growth(torch.rand(len(s), generator=generator), torch.ones(len(s)))
+    return as_wrong_as(torch.rand(len(s), generator=generator))
+
+
+def as_wrong_as(errors):
+    """One picture showed every splat and pulled at each with the same force."""
+    return Growth(errors, *torch.ones(3, len(errors)))
 
 
 def test_growth_ends_at_the_budget():
@@ -56,7 +61,7 @@ def test_a_split_keeps_the_place_and_halves_the_length():
     s.fields["log_scales"] = torch.tensor([[0.0, -2.0, -3.0]])
     s.fields["quats"] = torch.tensor([[1.0, 0, 0, 0]])
     middle = s.fields["means"].clone()
-    after, _ = grow(s, {}, Growth(torch.ones(1), torch.ones(1)), 2, 1, [])
+    after, _ = grow(s, {}, as_wrong_as(torch.ones(1)), 2, 1, [])
     torch.testing.assert_close(after.fields["means"].mean(0, keepdim=True), middle)
     torch.testing.assert_close((after.fields["means"][0] - after.fields["means"][1]).abs(), torch.tensor([1.0, 0, 0]))
     assert (after.fields["log_scales"][:, 0] < -0.4).all()
@@ -68,13 +73,15 @@ def test_what_splats_carry_follows_them_and_new_ones_start_at_zero():
     assert carried["moments"].shape == (90, 2, 5) and carried["moments"][:, 1, 4].sum() == carried["age"].sum() == 80
 
 
-def test_those_are_split_in_whose_pixels_most_is_wrong_in_the_mean_picture():
+def test_those_are_split_that_are_most_in_need_in_the_mean_picture():
     s = splats()
     growth = Growth.none(len(s))
-    for errors in ([5.0, 4.0, 0.0], [5.0, 0.0, 0.0]):  # 4 in the one picture that shows it is less than 5, and more than nothing
-        growth.add(torch.tensor([7, 60, 75]), torch.tensor(errors))
-    assert growth.shown[[7, 60, 75, 0]].tolist() == [2, 1, 0, 0]
+    for errors in ([5.0, 4.0, 0.0, 9.0], [5.0, 0.0, 0.0, 9.0]):  # 4 in the one picture that shows it is less than 5, and more than nothing
+        growth.blame(torch.tensor([7, 60, 75, 76]), torch.tensor(errors))
+    assert growth.shown[[7, 60, 75, 76, 0]].tolist() == [2, 1, 0, 2, 0]
+    growth.pull[[7, 60, 75]], growth.pulled[[7, 60, 75]] = torch.tensor([4.0, 2.0, 100.0]), torch.tensor([4.0, 2.0, 1.0])
+    torch.testing.assert_close(growth.need()[[7, 60, 75, 76]], torch.tensor([5**0.5, 2.0, 0.0, 0.0]))
     first, _ = grow(s, {}, growth, 81, 1, BOXES)
     assert first.sizes == [51, 20, 10]
     both, _ = grow(s, {}, growth, 99, 1, BOXES)
-    assert both.sizes == [51, 21, 10], "nothing is wrong with the others"
+    assert both.sizes == [51, 21, 10], "nothing is wrong with the others, or nothing pulls at them"

@@ -3,7 +3,7 @@ import math
 import torch
 from randomized import gaussians
 
-from recon.fit.densify import LARGEST, LONGEST, THINNEST
+from recon.fit.densify import LARGEST, LONGEST, THINNEST, Growth
 from recon.fit.descent import Descent, rates_at
 from recon.fit.model import Splats
 
@@ -23,7 +23,9 @@ def follow(descent, all_splats, which, gradients, now):
     shown = all_splats.select(which, 4)
     for name, g in gradients.items():
         shown.fields[name].grad = g
-    descent.follow(all_splats, which, shown, rates)
+    growth = Growth.none(len(all_splats))
+    descent.follow(all_splats, which, shown, rates, growth)
+    return growth
 
 
 def some_gradients(all_splats, generator, count=None):
@@ -63,12 +65,14 @@ def test_splats_that_a_picture_does_not_show_stay_as_they_are():
     gradients = some_gradients(ours, torch.Generator().manual_seed(1), 3)
     for g in gradients.values():
         g[1] = 0  # in the view, but hidden
-    follow(descent, ours, which, gradients, 1)
+    growth = follow(descent, ours, which, gradients, 1)
     moved = torch.zeros(40, dtype=torch.bool)
     moved[[3, 30]] = True
     for name, field in ours.fields.items():
         assert torch.equal((field != before[name]).reshape(40, -1).any(1), moved), name
     assert torch.equal(descent.last == 1, moved)
+    assert torch.equal(growth.pulled == 1, moved)
+    torch.testing.assert_close(growth.pull[which], 2 * gradients["means"].norm(dim=1))  # in pixels: times reach
 
 
 def test_scales_stay_within_what_cameras_can_tell():

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from recon.frames import View
 from recon.seeds.fill import FAR, unexplained
 from recon.seeds.sweep import companions, swept_depth
 from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sky, seen_sky, sky_mask
+from recon.view import View
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
 

@@ -182,11 +182,12 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
     fit._weights = torch.eye(len(fit.training))[0]  # the view that is drawn
     camera = fit.motion.camera(view).resized(*fit._size(fit.shrink()))
     everything = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-    ones, ends = torch.ones(len(fit.splats), 1), fit.motion.readout(view, camera)
+    ones, ends, sky = torch.ones(len(fit.splats), 1), fit.motion.readout(view, camera), partial(sample_equirect, fit.sky)
     with torch.no_grad():
-        rgb, alpha, _, shows = fit._render(everything, view, camera, ends, partial(sample_equirect, fit.sky), (0, 0), False, ones)
-    torch.testing.assert_close(shows[..., 0], alpha)  # a picture's weights of all splats are its alpha
-    wrong = (rgb - fit._target(view, fit.shrink())).abs().mean(-1)
+        drawn = fit._render(everything, view, camera, ends, sky, outputs=("rgb", "alpha", "features"), features=ones)
+    alpha = drawn["alpha"]
+    torch.testing.assert_close(drawn["features"][..., 0], alpha)  # a picture's weights of all splats are its alpha
+    wrong = (drawn["rgb"] - fit._target(view, fit.shrink())).abs().mean(-1)
     fit.step()
     assert abs(float(fit.growth.errors.sum() / (wrong * alpha).sum()) / fit.shrink() ** 2 - 1) < 0.1, (
         "but for what the backdrop changes where alpha is low"
@@ -204,10 +205,9 @@ def _mistakes(fit):
     for view in fit.training:
         camera = fit.motion.camera(view).resized(*SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-        _, alpha, depth, _ = fit._render(
-            shown, view, camera, fit.motion.readout(view, camera), partial(sample_equirect, fit.sky), (0, 0), True
-        )
-        found.append(float(mistake(depth, alpha, fit.measured[0].views[view.camera, view.index])))
+        sky, ends = partial(sample_equirect, fit.sky), fit.motion.readout(view, camera)
+        drawn = fit._render(shown, view, camera, ends, sky, outputs=("rgb", "alpha", "depth"))
+        found.append(float(mistake(drawn["depth"], drawn["alpha"], fit.measured[0].views[view.camera, view.index])))
     return np.mean(found)
 
 

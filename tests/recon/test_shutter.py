@@ -9,8 +9,9 @@ from recon.album import at_once
 from recon.fit.model import Knots
 from recon.fit.motion import EGO, Motion
 from recon.fit.shutter import as_read
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.report import read_out
+from recon.view import View
 from render import render_frame
 from render.compare import psnr
 from scenes import Camera, Pinhole

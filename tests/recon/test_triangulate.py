@@ -3,11 +3,12 @@ import pytest
 import torch
 from painted import SIZE, depth_of, drive
 
-from recon.frames import View, load_frames
+from recon.frames import load_frames
 from recon.project import project
 from recon.readers.colmap import colmap_lens, lens_of
 from recon.readers.sfm import ModelCamera
 from recon.seeds.triangulate import matched, triangulated
+from recon.view import View
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
 from scenes.poses import inverse
 
