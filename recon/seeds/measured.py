@@ -11,11 +11,13 @@ import torch.nn.functional as F
 from scipy import ndimage
 
 from recon.actors import Split
-from recon.frames import Frames, View
+from recon.frames import Frames
 from recon.log import Log, Sweep, Track
 from recon.project import project
 from recon.seeds.points import nearest_box
 from recon.seeds.stereo import WIDTH, Plate
+from recon.view import View
+from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.poses import inverse
 
@@ -24,6 +26,10 @@ SOON_US = 100_000
 
 HIDING, AROUND = 1.1, (9, 5)
 """How many times nearer a point within so many rows and columns must be to hide another: lidar looks over what hides it from cameras."""
+
+ROAD = 1.2
+"""Metres above the road that a camera stands at least: below the horizon what a lower point hides rises more steeply from there than a road
+does, whose near end hides nothing of its far one."""
 
 SLACK = 0.05
 """Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""
@@ -80,7 +86,12 @@ def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np
     row, column, found, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
     depth = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(depth, (row[inside], column[inside]), found[inside])
-    hidden = (depth > HIDING * ndimage.minimum_filter(depth, AROUND)) | (depth > before)
+    around = ndimage.minimum_filter(depth, AROUND)
+    reach, columns = AROUND[0] // 2, AROUND[1]
+    no_lower = ndimage.minimum_filter(depth, (reach + 1, columns), origin=(reach // 2, 0))
+    steepest = reach / (ROAD * camera.lens.focal()[1])  # a plane's inverse depth falls by as much with every row
+    may_be_road = (world_directions(camera)[..., 2] < 0).numpy() & (1 / around - 1 / depth < steepest)
+    hidden = (depth > HIDING * np.where(may_be_road, no_lower, around)) | (depth > before)
     return np.where(hidden | np.isinf(depth), np.nan, depth)
 
 

@@ -8,7 +8,7 @@ from painted import SIZE, drive, sweep_of, wall
 from recon.actors import split_points
 from recon.frames import load_frames
 from recon.log import Track
-from recon.seeds.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake
+from recon.seeds.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake, nearest_points
 from recon.seeds.stereo import plate_of
 from scenes.camera import Camera
 from scenes.lenses import Fisheye, OpenCV, Pinhole
@@ -50,6 +50,38 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     assert np.nanmax(distance) == pytest.approx(17.0, abs=0.3) and np.nanmin(distance) == pytest.approx(12.0, abs=0.1)
     assert (0, 1) in measured and (0, 2) not in _by_lidar(log, frames, [sweep_of(200_000 - SOON_US - 1, wall(12.0, -3, 3))], []).views
     assert _by_lidar(log, frames, [], []).views == {}
+
+
+def _swept(stop):
+    """Where beams 0.42 degrees apart, from 1.9 m above the road, strike it or what `stop` [N, 3] -> [N] says stands there, x ahead."""
+    down, turn = np.meshgrid(np.radians(np.arange(1.5, 25, 0.42)), np.radians(np.arange(-30, 30, 0.1)), indexing="ij")
+    ray = np.stack([np.cos(turn), np.sin(turn), -np.tan(down)], -1).reshape(-1, 3)
+    return np.array([0, 0, 1.9]) + ray * np.minimum(1.9 / -ray[:, 2], stop(ray))[:, None]
+
+
+@pytest.mark.parametrize("size", [(960, 540), (1242, 375)])
+def test_a_road_hides_nothing_of_itself_and_a_fence_does(size):
+    forward = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]], dtype=torch.float64)
+    whole = Camera(Pinhole(700, 700, size[0] / 2, size[1] / 2), *size, forward)
+    camera = grid_of(whole)
+    rays = camera.lens.unproject(camera.pixel_centres()).numpy()
+    falls = np.maximum(rays[..., 1] / rays[..., 2], 1e-9)
+
+    def known(stop):
+        return nearest_points(_swept(stop), camera, np.full(falls.shape, np.inf))
+
+    bare, road = 1.6 / falls, known(lambda ray: np.full(len(ray), np.inf))
+    for near, far in ((6, 12), (12, 20), (20, 30)):
+        band = (bare > near) & (bare < far)
+        there = np.isfinite(road[band])
+        # beams are 0.42 degrees apart, rows of the grid 0.31 and 0.4
+        assert there.mean() > 0.5, (near, far)
+        assert np.abs(road[band][there] / bare[band][there] - 1).max() < 0.2
+    # a fence 1.62 m high, 8 m ahead, over which the lidar looks and the camera does not
+    fence = known(lambda ray: np.where(1.9 + 8 * ray[:, 2] / ray[:, 0] < 1.62, 8 / ray[:, 0], np.inf))
+    behind = np.isfinite(fence) & (fence > 8.5)
+    assert (np.isfinite(fence) & (np.abs(fence - 8) < 0.1)).sum() > 1000
+    assert behind.sum() == 0
 
 
 @pytest.mark.parametrize(
