@@ -41,8 +41,12 @@ def balanced(log: Log, names: list[str], views: list[View]) -> list[View]:
         colours.append(smooth[row[inside], column[inside]])
         shown.append(points[inside])
     gains = picture_gains(colours, shown, len(log.points.xyz))
-    even = [replace(v, gain=torch.from_numpy(g).float()).evenly() for v, g in zip(views, gains, strict=True)]
-    return [replace(v, image=torch.from_numpy((255 * e).round().clip(0, 255).astype(np.uint8))) for v, e in zip(views, even, strict=True)]
+    return [_divided(v, torch.from_numpy(g).float()) for v, g in zip(views, gains, strict=True)]
+
+
+def _divided(view: View, gain: torch.Tensor) -> View:
+    """A view with a gain `[3]` taken out of its picture."""
+    return replace(view, image=(view.image.float() / gain).round().clamp(0, 255).to(torch.uint8))
 
 
 def exposed(log: Log, names: list[str], views: list[View]) -> list[View]:

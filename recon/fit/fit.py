@@ -212,7 +212,7 @@ class Fit:
         outputs: Sequence[str] = ("rgb", "alpha"),
         features: torch.Tensor | None = None,
     ) -> dict[str, torch.Tensor]:
-        """Outputs of a view by the splats in sight, by name: "rgb" `[H, W, 3]`, before the sky and exposed as its camera exposes; "alpha";
+        """Outputs of a view by the splats in sight, by name: "rgb" `[H, W, 3]`, with the sky behind, exposed as its camera does; "alpha";
         "depth", and what the picture shows of the splats' `features` `[N, C]`, where they are wanted. shift: of the sky's samples
         (`developed`)."""
         placed = self._placed(shown, view, camera)

@@ -29,7 +29,7 @@ HIDING, AROUND = 1.1, (9, 5)
 
 ROAD = 1.2
 """Metres above the road that a camera stands at least: below the horizon what a lower point hides rises more steeply from there than a road
-does, whose near end hides nothing of its far one."""
+does, whose near end hides nothing of its far one. Some 50 metres away nothing does."""
 
 SLACK = 0.05
 """Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""
@@ -37,7 +37,7 @@ SLACK = 0.05
 LIDAR, PICTURES = 0.005, 0.02
 """What mistakes weigh beside a picture's loss. Lidar is where splats begin, and more would cost held-out pictures more than depth gains: on
 drive 002's front camera 0.13 dB for 2.6 % that become 1.2, and at 0.02 0.23 dB for 0.8. What pictures agree on begins farther off, and
-costs nothing."""
+costs nothing. Twice as much for lidar would cost KITTI 0009 0.5 dB, and its depth would be 1.6 % off for 2.0."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,21 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split, mo
 
 
 def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np.ndarray:
-    """Depth `[h, w]` of points `[N, 3]` that a camera sees, NaN where it sees none; neither behind others nor behind what is `before`."""
+    """Depth `[h, w]` of points `[N, 3]` that a camera sees, NaN where it sees none; neither behind others, which a road is not behind its
+    own near end, nor behind what is `before`."""
     row, column, found, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
-    depth = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(depth, (row[inside], column[inside]), found[inside])
+    cell, found = row[inside] * camera.width + column[inside], found[inside]
+    nearest = np.full(camera.height * camera.width, np.inf)
+    np.minimum.at(nearest, cell, found)
+    # a cell's row of a far road spans a tenth of its depth: the nearest of its points would be too near by half of that
+    same = found <= HIDING * nearest[cell]
+    count, inverses = (np.bincount(cell[same], w, len(nearest)) for w in (None, 1 / found[same]))
+    depth = np.where(count > 0, count / np.maximum(inverses, 1e-9), np.inf).reshape(camera.height, camera.width)
+
     around = ndimage.minimum_filter(depth, AROUND)
-    reach, columns = AROUND[0] // 2, AROUND[1]
-    no_lower = ndimage.minimum_filter(depth, (reach + 1, columns), origin=(reach // 2, 0))
-    steepest = reach / (ROAD * camera.lens.focal()[1])  # a plane's inverse depth falls by as much with every row
+    rows, columns = AROUND[0] // 2, AROUND[1]
+    no_lower = ndimage.minimum_filter(depth, (rows + 1, columns), origin=(rows // 2, 0))
+    steepest = rows / (ROAD * camera.lens.focal()[1])  # a plane's inverse depth falls by as much with every row
     may_be_road = (world_directions(camera)[..., 2] < 0).numpy() & (1 / around - 1 / depth < steepest)
     hidden = (depth > HIDING * np.where(may_be_road, no_lower, around)) | (depth > before)
     return np.where(hidden | np.isinf(depth), np.nan, depth)

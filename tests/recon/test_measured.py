@@ -52,36 +52,57 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     assert _by_lidar(log, frames, [], []).views == {}
 
 
-def _swept(stop):
-    """Where beams 0.42 degrees apart, from 1.9 m above the road, strike it or what `stop` [N, 3] -> [N] says stands there, x ahead."""
-    down, turn = np.meshgrid(np.radians(np.arange(1.5, 25, 0.42)), np.radians(np.arange(-30, 30, 0.1)), indexing="ij")
-    ray = np.stack([np.cos(turn), np.sin(turn), -np.tan(down)], -1).reshape(-1, 3)
-    return np.array([0, 0, 1.9]) + ray * np.minimum(1.9 / -ray[:, 2], stop(ray))[:, None]
+AHEAD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]], dtype=torch.float64)
+"""A camera 1.6 m above the road that looks along x."""
+
+
+def _struck(size, apart, *fences):
+    """Depth on the grid of a camera of a size, as beams `apart` degrees, from 1.9 m above, strike the road and fences: x ahead, from z to
+    z. And how far away the bare road is."""
+    camera = grid_of(Camera(Pinhole(700, 700, size[0] / 2, size[1] / 2), *size, AHEAD))
+    down, turn = np.meshgrid(np.radians(np.arange(-10, 25, apart)), np.radians(np.arange(-30, 30, 0.1)), indexing="ij")
+    ray = np.stack([np.ones_like(down), np.tan(turn), -np.tan(down) / np.cos(turn)], -1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        first = np.where(ray[:, 2] < 0, -1.9 / ray[:, 2], np.inf)
+    for x, low, high in fences:
+        z = 1.9 + x * ray[:, 2]
+        first = np.where((z > low) & (z < high), np.minimum(first, x), first)
+    points = np.array([0, 0, 1.9]) + ray[np.isfinite(first)] * first[np.isfinite(first)][:, None]
+    rays = camera.lens.unproject(camera.pixel_centres()).numpy()
+    nowhere = np.full(rays.shape[:2], np.inf)
+    return nearest_points(points, camera, nowhere), 1.6 / np.maximum(rays[..., 1] / rays[..., 2], 1e-9)
 
 
 @pytest.mark.parametrize("size", [(960, 540), (1242, 375)])
-def test_a_road_hides_nothing_of_itself_and_a_fence_does(size):
-    forward = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]], dtype=torch.float64)
-    whole = Camera(Pinhole(700, 700, size[0] / 2, size[1] / 2), *size, forward)
-    camera = grid_of(whole)
-    rays = camera.lens.unproject(camera.pixel_centres()).numpy()
-    falls = np.maximum(rays[..., 1] / rays[..., 2], 1e-9)
-
-    def known(stop):
-        return nearest_points(_swept(stop), camera, np.full(falls.shape, np.inf))
-
-    bare, road = 1.6 / falls, known(lambda ray: np.full(len(ray), np.inf))
+@pytest.mark.parametrize("apart", [0.42, 0.17])
+def test_a_road_hides_nothing_of_itself(size, apart):
+    road, bare = _struck(size, apart)
     for near, far in ((6, 12), (12, 20), (20, 30)):
         band = (bare > near) & (bare < far)
         there = np.isfinite(road[band])
-        # beams are 0.42 degrees apart, rows of the grid 0.31 and 0.4
+        off = road[band][there] / bare[band][there] - 1
+        # rows of the grid are 0.31 and 0.4 degrees apart
         assert there.mean() > 0.5, (near, far)
-        assert np.abs(road[band][there] / bare[band][there] - 1).max() < 0.2
-    # a fence 1.62 m high, 8 m ahead, over which the lidar looks and the camera does not
-    fence = known(lambda ray: np.where(1.9 + 8 * ray[:, 2] / ray[:, 0] < 1.62, 8 / ray[:, 0], np.inf))
-    behind = np.isfinite(fence) & (fence > 8.5)
-    assert (np.isfinite(fence) & (np.abs(fence - 8) < 0.1)).sum() > 1000
-    assert behind.sum() == 0
+        assert abs(off.mean()) < 0.015 and np.abs(off).max() < 0.2, (near, far)
+
+
+@pytest.mark.parametrize("size", [(960, 540), (1242, 375)])
+@pytest.mark.parametrize("apart", [0.42, 1.33])
+@pytest.mark.parametrize("fence", [(8, 0, 0.7), (8, 0, 1.2), (8, 0, 1.62), (12, 0, 1.0)])
+def test_a_fence_over_which_only_the_lidar_looks_hides_what_is_behind(size, apart, fence):
+    found, bare = _struck(size, apart, fence)
+    x, _, height = fence
+    hidden = bare < x * 1.6 / max(1.6 - height, 1e-9)  # the camera's ray to that road meets the fence
+    behind = hidden & (bare > x)
+    assert (behind & (np.abs(found - x) < 0.1)).sum() > 20
+    assert (behind & (found > 1.1 * x)).sum() == 0
+
+
+def test_above_the_horizon_what_is_lower_hides_too():
+    found, _ = _struck((960, 540), 0.42, (20, 1.9, 3.0), (23, 1.9, 3.4))
+    rows = np.nonzero((np.abs(found - 20) < 0.1).any(1))[0]
+    assert (np.abs(found[: rows.min()] - 23) < 0.1).sum() == 0
+    assert len(rows) > 3
 
 
 @pytest.mark.parametrize(
