@@ -48,7 +48,7 @@ SHARED, PER_PICTURE = (1_840, 112_000), (10, 450)
 cameras of drive 002 get 4,240 steps and 220,000 splats, the 400 of five 5,840 and 292,000."""
 
 MOST = 8000, 450_000
-"""Of both, whatever the drive: two fifths and more beyond what five cameras of drive 002 get, whose fit takes a quarter of an hour."""
+"""Of both, whatever the drive: two fifths and more beyond what five cameras of drive 002 get, whose fit takes a third of an hour."""
 
 PER_PHOTO = 25, 2500
 """The same of each photo that stands steps apart from the next: nothing is shared by most of them."""

@@ -77,7 +77,7 @@ def load_frames(
 ) -> Frames:
     """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
 
-    `report` is called after each. Photos of a log without lidar are brought to one exposure (`picture_gains`); where lidar tells that a
+    `report` is called after each. Photos of a log without lidar are brought to one exposure (`balanced`); where lidar tells that a
     camera's exposure follows the light, its views say their `gain`, if `gains` are asked for. Raises ValueError where a camera has no
     frame left to train on, or a file does not decode.
     """

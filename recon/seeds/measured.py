@@ -29,7 +29,7 @@ HIDING, AROUND = 1.1, (9, 5)
 
 ROAD = 1.2
 """Metres above the road that a camera stands at least: below the horizon what a lower point hides rises more steeply from there than a road
-does, whose near end hides nothing of its far one. Some 50 metres away nothing does."""
+does, whose near end hides nothing of its far one. From some 50 metres on nothing lower hides anything."""
 
 SLACK = 0.05
 """Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""

@@ -72,7 +72,7 @@ def test_splats_that_a_picture_does_not_show_stay_as_they_are():
         assert torch.equal((field != before[name]).reshape(40, -1).any(1), moved), name
     assert torch.equal(descent.last == 1, moved)
     assert torch.equal(growth.pulled == 1, moved)
-    torch.testing.assert_close(growth.pull[which], 2 * gradients["means"].norm(dim=1))  # in pixels: times reach
+    torch.testing.assert_close(growth.pull[which], 2 * gradients["means"].norm(dim=1))  # times reach
 
 
 def test_scales_stay_within_what_cameras_can_tell():
