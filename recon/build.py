@@ -261,7 +261,7 @@ def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
-    return Fit(frames, motion, start.splats.to(device), start.sky, start.exposures, limbs, config, start.measured)
+    return Fit(frames, motion, start.splats.to(device), start.sky, start.exposures, limbs, config, start.measured, start.ground)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

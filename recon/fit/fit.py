@@ -13,6 +13,7 @@ from recon.fit.config import FitConfig
 from recon.fit.densify import Growth, grow
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
+from recon.fit.flat import FlatGround
 from recon.fit.limbs import Limbs
 from recon.fit.losses import PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
@@ -28,6 +29,7 @@ from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
+from scenes.ground import Ground
 from scenes.poses import inverse
 from scenes.scene import dimmed
 from scenes.sky import sample_equirect
@@ -55,8 +57,9 @@ FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
 could not hold up anything against it at the end."""
 
-RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 8e-3, "logits": 4e-2, "colours": 5e-3, "harmonics": 5e-4}
-"""Adam's step a field; of means in parts of each splat's reach: 0.1 pixel."""
+RATES = {"means": 4e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 2e-2, "harmonics": 2e-3}
+"""Adam's step a field; of means in parts of each splat's reach: 0.4 pixels. A splat is in sight of some hundred steps at most, which must
+take it from where it begins to what pictures show: at a quarter of these lengths fits ended half way."""
 
 
 class Fit:
@@ -76,6 +79,7 @@ class Fit:
         limbs: Limbs,
         config: FitConfig,
         measured: Sequence[Measured],
+        ground: Ground,
     ):
         self.device = splats.reach.device
         self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
@@ -90,6 +94,7 @@ class Fit:
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
         self.openings = Openings(frames, motion, self.device)
+        self.flat_ground = FlatGround(ground, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self.guessed: torch.Tensor | None = None
@@ -168,6 +173,7 @@ class Fit:
             colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
+        self.flat_ground.press(self.splats, which, self._settled())
         if blank is not None and blank.grad is not None:
             self.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()
@@ -281,8 +287,12 @@ class Fit:
         top, left = (int(torch.randint(0, n + 1, (1,), generator=self.generator)) for n in (camera.height - height, camera.width - width))
         return top, left, height, width
 
+    def _settled(self) -> float:
+        """How long steps still are: towards the end they become ever shorter."""
+        return 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
+
     def _rates(self) -> Rates:
-        settle = 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
+        settle = self._settled()
         steps = {name: rate * (0.01**self.progress if name == "means" else settle) for name, rate in RATES.items()}
         return rates_at(self.step_count + 1, steps, FADE * settle)
 

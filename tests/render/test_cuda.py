@@ -9,6 +9,7 @@ import warp as wp
 
 from recon.kernels import descent as descent_kernels
 from recon.kernels import develop as develop_kernels
+from recon.kernels import press as press_kernels
 from recon.kernels import sight as sight_kernels
 from render import block_compositing, rasterize
 from render.block_compositing import draw_blocks, draw_blocks_backward
@@ -55,6 +56,7 @@ KERNELS = {
     "carry": lambda: carry_kernel(LENS_FUNCTIONS["fisheye"]),
     "see": lambda: flow_kernels.see,
     "shadow": lambda: shadow_kernels.fall,
+    "press": lambda: press_kernels.press,
     "sight": lambda: sight_kernels.mark,
     "frames": lambda: canonical_kernels.make_frames,
     "settled": lambda: settled_kernels.settle,
