@@ -57,7 +57,7 @@ FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
 could not hold up anything against it at the end."""
 
-RATES = {"means": 4e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 2e-2, "harmonics": 2e-3}
+RATES = {"means": 4e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 2e-2, "harmonics": 1e-3}
 """Adam's step a field; of means in parts of each splat's reach: 0.4 pixels. A splat is in sight of some hundred steps at most, which must
 take it from where it begins to what pictures show: at a quarter of these lengths fits ended half way."""
 
