@@ -46,6 +46,10 @@ class Descent:
             args = [view(which, wp.int64), rates, sh_count, *_fields(splats), view(self.moments, float), view(self.last, float)]
             run(catch_up, len(which), args, which.device)
 
+    def coloured(self) -> torch.Tensor:
+        """At whose colours any picture has pulled: bool `[N]`."""
+        return (self.moments[:, 1, COLOURS:] > 0).any(1)
+
     def still_colours(self, which: torch.Tensor) -> None:
         """Take their momentum from the colours of splats `which`, bool `[N]`."""
         self.moments[which, :, COLOURS:] = 0

@@ -57,9 +57,10 @@ FADE = 0.003
 """Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
 could not hold up anything against it at the end."""
 
-RATES = {"means": 4e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 2e-2, "harmonics": 1e-3}
-"""Adam's step a field; of means in parts of each splat's reach: 0.4 pixels. A splat is in sight of some hundred steps at most, which must
-take it from where it begins to what pictures show: at a quarter of these lengths fits ended half way."""
+RATES = {"means": 3e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 1e-2, "harmonics": 1e-3}
+"""Adam's step a field; of means in parts of each splat's reach: 0.3 pixels. A splat is in sight of some hundred steps, which must take it
+from where it begins to what pictures show: with scales and places at a quarter of this fits ended half way. Twice as long a step of colours
+puts into them what depth should say (tests/bench/README.md)."""
 
 
 class Fit:
@@ -259,7 +260,7 @@ class Fit:
             which = self._in_sight(view, camera, [], None)
             shown = torch.cat(shown_parts(self._placed(self.splats.select(which, 1), view, camera), camera))
             part[which] = torch.maximum(part[which], shown)
-        self.guessed = as_neighbours(self.splats, part)
+        self.guessed = as_neighbours(self.splats, part, self.descent.coloured())
         self.descent.still_colours(self.guessed)
 
     def _size(self, shrink: int) -> tuple[int, int]:

@@ -54,14 +54,15 @@ def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
     return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * camera.lens.valid(middle)
 
 
-def as_neighbours(splats: Splats, part: torch.Tensor) -> torch.Tensor:
-    """Give splats of which less than `SEEN` was shown, by the largest `part` `[N]` of each in any picture, the colours of their group's
-    nearest others, in place. Returns which these are, bool `[N]`; of groups without any other none, and none that no picture looks at."""
+def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor) -> torch.Tensor:
+    """Give splats at whose colours pictures have `pulled`, bool `[N]`, but which none shows to `SEEN`, by the largest `part` `[N]` of each
+    in any picture, the colours of their group's nearest others, in place. Returns which these are, bool `[N]`; of groups without any other
+    none."""
     unknown, begin = torch.zeros_like(part, dtype=torch.bool), 0
     for size in splats.sizes:
         mine = slice(begin, begin + size)
         begin += size
-        hidden = (part[mine] > 0) & (part[mine] < SEEN)
+        hidden = pulled[mine] & (part[mine] < SEEN)
         known = (part[mine] >= SEEN).nonzero()[:, 0]
         if len(known) < NEIGHBOURS or not hidden.any():
             continue

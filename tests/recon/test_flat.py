@@ -3,10 +3,13 @@
 import torch
 from randomized import gaussians
 
+from recon import open_log
+from recon.build import begin, choose
 from recon.fit.flat import ON, PRESSED, FlatGround
 from recon.fit.model import Splats
 from scenes.ground import Ground
 from scenes.poses import matrix_from_quat
+from tests.recon.test_fit import CONFIG, SIZE
 
 SLOPE = (0.1, -0.05)
 UP = torch.nn.functional.normalize(torch.tensor([-SLOPE[0], -SLOPE[1], 1.0]), dim=0)
@@ -77,3 +80,22 @@ def test_beyond_the_ground_its_rim_goes_on():
     FlatGround(hillside(), torch.device("cpu")).press(splats, torch.arange(60), 1.0)
     after = covariance(splats)
     assert (after[:30] != before[:30]).any(dim=(1, 2)).all() and after.isfinite().all()
+
+
+def test_a_fit_presses_its_road(drive, monkeypatch):
+    """As thick as it is after forty steps, against a fit that presses nothing."""
+    log = open_log(drive)
+    names, span = choose(log)
+
+    def thickness() -> torch.Tensor:
+        start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+        for _ in range(40):
+            fit.step()
+        means = fit.splats.fields["means"][: fit.splats.sizes[0]]
+        on = (means[:, 2] - start.ground.height(means[:, :2])).abs() < ON
+        on &= fit.descent.last[: len(on)] > 0  # seen at all
+        return covariance(fit.splats)[: len(on)][on][:, 2, 2].sqrt().median()
+
+    pressed = thickness()
+    monkeypatch.setattr("recon.fit.flat.PRESSED", 0.0)
+    assert pressed < 0.9 * thickness()

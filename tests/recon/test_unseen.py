@@ -76,11 +76,12 @@ def test_hidden_splats_take_the_colours_of_known_ones_beside_them():
     groups = [[0.5] * 40 + [0.01] * 10 + [0.0] * 5, [0.9] * (NEIGHBOURS - 1) + [0.01] * 4]
     splats, part = splats_of(groups, lambda p: grey if p >= SEEN else orange)
     before = splats.fields["sh"].clone()
-    guessed = as_neighbours(splats, part)
-    assert guessed.nonzero()[:, 0].tolist() == list(range(40, 50)), "not what no picture looks at, nor an actor of which nothing is known"
+    guessed = as_neighbours(splats, part, part > 0)
+    assert guessed.nonzero()[:, 0].tolist() == list(range(40, 50)), "not what no picture pulls at, nor an actor of which nothing is known"
     after = splats.fields["sh"]
     assert torch.equal(after[~guessed], before[~guessed])
     torch.testing.assert_close(after[40:50], before[:1].expand(10, -1, -1))
+    assert as_neighbours(splats, part, part >= 0)[50:55].all(), "pulled at by a rim that no small picture shows"
 
 
 def test_the_nearest_count_most():
@@ -89,7 +90,7 @@ def test_the_nearest_count_most():
     means[:20], means[20:60], means[60] = torch.rand(20, 3) * 0.1, 3 + torch.rand(40, 3), torch.zeros(3)
     sh[20:60] += 1.0
     splats.fields["log_scales"][60] = math.log(0.05)
-    as_neighbours(splats, part)
+    as_neighbours(splats, part, part > 0)
     torch.testing.assert_close(sh[60], sh[0])
 
 
