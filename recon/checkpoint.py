@@ -19,7 +19,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 11
+VERSION = 12
 
 
 def checkpoint_path(output: Path) -> Path:

@@ -52,7 +52,7 @@ class Descent:
 
     def still_colours(self, which: torch.Tensor) -> None:
         """Take their momentum from the colours of splats `which`, bool `[N]`."""
-        self.moments[which, :, COLOURS:] = 0
+        self.moments[which, 0, COLOURS:] = 0
 
     def follow(self, splats: Splats, which: torch.Tensor, shown: Splats, rates: Rates, growth: Growth) -> None:
         """Move splats `which` `[M]`, which have caught up, along the gradients of `shown`, copies of theirs, and tell `growth`."""

@@ -1,4 +1,5 @@
-"""The fit: rendered pictures are compared with recorded ones, and splats, sky, exposures and poses follow the gradient."""
+"""The fit: rendered pictures are compared with recorded ones, and splats, sky, exposures and poses follow the gradient; what lies on the
+ground is pressed flat besides."""
 
 from __future__ import annotations
 
@@ -59,8 +60,8 @@ could not hold up anything against it at the end."""
 
 RATES = {"means": 3e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 1e-2, "harmonics": 1e-3}
 """Adam's step a field; of means in parts of each splat's reach: 0.3 pixels. A splat is in sight of some hundred steps, which must take it
-from where it begins to what pictures show: with scales and places at a quarter of this fits ended half way. Twice as long a step of colours
-puts into them what depth should say (tests/bench/README.md)."""
+from where it begins to what pictures show: with places at a third and scales at a quarter of this, fits ended half way. Twice as long a
+step of colours puts into them what depth should say."""
 
 
 class Fit:
@@ -174,7 +175,7 @@ class Fit:
             colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
-        self.flat_ground.press(self.splats, which, self._settled())
+        self.flat_ground.press(self.splats, which, self.descent, rates, self._settled())
         if blank is not None and blank.grad is not None:
             self.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()

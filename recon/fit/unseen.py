@@ -27,8 +27,8 @@ NEIGHBOURS = 16
 
 
 def shown_parts(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
-    """Of each group's splats `[N]`, the part of its weight that a picture shows, what stands before it and what is beyond the border taken
-    off. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture (`footprint`)."""
+    """Of each group's splats `[N]`, the part of its weight that a picture shows, what stands before it taken off; 0 where its middle is
+    out of the picture. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture (`footprint`)."""
     groups = [p.gaussians.detach() for p in placed]
     blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
     drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
@@ -41,17 +41,19 @@ def shown_parts(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
 
 def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
     """Sum of the opacities `[N]` that each splat alone has over a picture's pixels, were it in the middle of it: at the border a pinhole
-    draws it larger. 0 where the lens does not reach its middle."""
+    draws it larger. 0 where its middle is out of the picture."""
     g = placed.gaussians
     cam_from_local = (inverse(camera.world_from_cam) @ placed.world_from_local).to(g.means)
     middle = g.means @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
+    pixels, size = camera.lens.project(middle), torch.tensor([camera.width, camera.height]).to(middle)
+    inside = ((pixels >= 0) & (pixels < size)).all(1) & camera.lens.valid(middle)
     # seen along d, an ellipsoid of axes s is sqrt((s2 s3 d1)^2 + (s1 s3 d2)^2 + (s1 s2 d3)^2) wide
     axes = cam_from_local[:3, :3] @ matrix_from_quat(g.quats)
     along = (axes * middle[:, :, None]).sum(1)
     scales = g.log_scales.exp()
     across = (along / scales).norm(dim=1) * scales.prod(1) / middle.norm(dim=1).pow(3).clamp_min(1e-9)
     fx, fy = camera.lens.focal()
-    return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * camera.lens.valid(middle)
+    return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * inside
 
 
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor) -> torch.Tensor:

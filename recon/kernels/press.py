@@ -11,7 +11,7 @@ ROUNDNESS = wp.constant(0.01)  # keeps a turn finite where two axes are as long 
 
 @wp.struct
 class Grid:
-    """Where heights `[Y, X]` are: at `(x, y) + cell * (column, row)`."""
+    """Where heights and slopes `[Y, X]` are: at `(x, y) + cell * (column, row)`."""
 
     x: float
     y: float
@@ -20,35 +20,37 @@ class Grid:
 
 @wp.kernel
 def press(
-    which: wp.array[wp.int64], count: int, grid: Grid, heights: wp.array2d[float], part: float, near: float,
+    which: wp.array[wp.int64], count: int, last: wp.array[float], now: float,
+    grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], part: float, near: float,
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
-    """Of splats `which`, those of the first `count` nearer than `near` to the ground lose `part` of their extent along its normal.
+    """Of splats `which`, those of the first `count` that moved `now`, are nearer than `near` to the ground and no thicker than that lose
+    `part` of their extent along its normal.
 
     With D = 1 - part n n^T a covariance becomes D C D, to first order in `part`: in the splat's own axes its diagonal is what its scales
     lose, and the rest is a turn of its axes.
     """
     i = int(which[first + wp.tid()])
-    if i >= count:
+    if i >= count or last[i] != now:
         return
     p = means[i]
-    column = wp.clamp((p[0] - grid.x) / grid.cell, 0.0, float(heights.shape[1] - 1))
-    row = wp.clamp((p[1] - grid.y) / grid.cell, 0.0, float(heights.shape[0] - 1))
-    c = wp.min(int(column), heights.shape[1] - 2)
-    r = wp.min(int(row), heights.shape[0] - 2)
+    column = (p[0] - grid.x) / grid.cell
+    row = (p[1] - grid.y) / grid.cell
+    inside = column >= 0.0 and row >= 0.0 and column < float(heights.shape[1] - 1) and row < float(heights.shape[0] - 1)
+    if not inside:
+        return
+    c = int(column)
+    r = int(row)
     u = column - float(c)
     v = row - float(r)
-    near_left = heights[r, c]
-    near_right = heights[r, c + 1]
-    far_left = heights[r + 1, c]
-    far_right = heights[r + 1, c + 1]
-    height = (near_left * (1.0 - u) + near_right * u) * (1.0 - v) + (far_left * (1.0 - u) + far_right * u) * v
+    height = (heights[r, c] * (1.0 - u) + heights[r, c + 1] * u) * (1.0 - v) + (
+        heights[r + 1, c] * (1.0 - u) + heights[r + 1, c + 1] * u
+    ) * v
     if wp.abs(p[2] - height) > near:
         return
-    along_x = ((near_right - near_left) * (1.0 - v) + (far_right - far_left) * v) / grid.cell
-    along_y = ((far_left - near_left) * (1.0 - u) + (far_right - near_right) * u) / grid.cell
-    up = wp.normalize(wp.vec3(-along_x, -along_y, 1.0))
+    slope = slopes[int(row + 0.5), int(column + 0.5)]
+    up = wp.normalize(wp.vec3(-slope[0], -slope[1], 1.0))
 
     q = quats[i]
     w = q[0]
@@ -57,6 +59,9 @@ def press(
     double = 2.0 * wp.cross(up, xyz) / wp.dot(q, q)
     n = up + w * double + wp.cross(double, xyz)
     scales = log_scales[i]
+    thick = wp.length(wp.vec3(n[0] * wp.exp(scales[0]), n[1] * wp.exp(scales[1]), n[2] * wp.exp(scales[2])))
+    if thick > near:
+        return
     turn = wp.vec3()
     for k in range(3):
         a = (k + 1) % 3

@@ -22,6 +22,7 @@ from recon.build import begin, choose, fit_config, fit_size
 from recon.fit.descent import Descent
 from recon.fit.develop import Develop
 from recon.fit.fit import Fit
+from recon.fit.flat import FlatGround
 from recon.fit.losses import PictureLoss
 from recon.fit.motion import Motion
 from recon.fit.openings import Openings
@@ -31,7 +32,8 @@ PARTS = [
     (Fit, "step"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
     (Motion, "actor_poses"), (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
     (PictureLoss, "forward"), (Openings, "gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
-    (Openings, "haze"), (Develop, "backward"), (Descent, "follow"), (Fit, "_follow"),
+    (Openings, "haze"), (Develop, "backward"), (Descent, "follow"), (FlatGround, "press"),
+    (Fit, "_follow"),
 ]  # fmt: skip
 
 

@@ -82,3 +82,18 @@ def test_scales_stay_within_what_cameras_can_tell():
     scales = ours.fields["log_scales"].exp()
     assert (scales.amax(1) <= 2 * LARGEST * 1.001).all() and (scales.amin(1) >= 2 * THINNEST * 0.999).all()
     assert (scales.amax(1) <= scales.median(1).values * LONGEST * 1.01).all() and math.isfinite(float(scales.sum()))
+
+
+def test_it_is_known_whose_colours_were_pulled_at():
+    """By what they were once, too, and when their momentum has been taken from them."""
+    ours, everything = splats(), torch.arange(40)
+    descent = Descent.begin(ours)
+    gradients = some_gradients(ours, torch.Generator().manual_seed(2))
+    gradients["sh"][:25] = 0
+    follow(descent, ours, everything, gradients, 1)
+    assert torch.equal(descent.coloured(), everything >= 25)
+    before = ours.fields["sh"].clone()
+    descent.still_colours(everything >= 30)
+    descent.catch_up(ours, everything, 4, rates_at(9, RATES, FADE))
+    moved = (ours.fields["sh"] != before).any(2).any(1)
+    assert torch.equal(descent.coloured(), everything >= 25) and torch.equal(moved, (everything >= 25) & (everything < 30))
