@@ -183,11 +183,12 @@ def _moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _pin(cost: torch.Tensor, plate: Plate, points: np.ndarray, step: float) -> None:
-    """Make the pixels of known points expensive everywhere else."""
+    """Make the pixels of known points expensive everywhere else; of several in one pixel the last counts."""
     row, column, z, inside = plate.shown(points)
     place = torch.from_numpy(1 / z[inside] / step).float()
     away = (torch.arange(PLANES) - place[:, None]).abs()
-    cost[torch.from_numpy(row[inside]), torch.from_numpy(column[inside])] += PINNED * (away / 2).clamp_max(1.0)
+    # NumPy's, since torch's threads write in any order, and which point counts would be left to chance
+    cost.numpy()[row[inside], column[inside]] += (PINNED * (away / 2).clamp_max(1.0)).numpy()
 
 
 def _smoothed(cost: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:

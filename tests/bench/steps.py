@@ -32,8 +32,7 @@ PARTS = [
     (Fit, "step"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
     (Motion, "actor_poses"), (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
     (PictureLoss, "forward"), (Openings, "gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
-    (Openings, "haze"), (Develop, "backward"), (Descent, "follow"), (FlatGround, "press"),
-    (Fit, "_follow"),
+    (Openings, "haze"), (Develop, "backward"), (Descent, "follow"), (FlatGround, "press"), (Fit, "_follow"),
 ]  # fmt: skip
 
 
