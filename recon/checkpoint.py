@@ -19,7 +19,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 12
+VERSION = 13
 
 
 def checkpoint_path(output: Path) -> Path:

@@ -16,7 +16,7 @@ from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
 from recon.fit.limbs import Limbs
-from recon.fit.losses import PictureLoss
+from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
 from recon.fit.motion import Moment, Motion
 from recon.fit.openings import Openings
@@ -34,9 +34,6 @@ from scenes.ground import Ground
 from scenes.poses import inverse
 from scenes.scene import dimmed
 from scenes.sky import sample_equirect
-
-WINDOW = (180, 320)
-"""Rows and columns of the part of a picture in which similarity is taken."""
 
 SKY_PRIOR = 3e-6
 """Of the squared distance of the sky from its first picture, in a step's gradient: a twentieth of what a picture's sky weighs, and more
@@ -67,8 +64,8 @@ step of colours puts into them what depth should say."""
 class Fit:
     """The state of a fit: step it, checkpoint it with `tensors`, go on with `restore`.
 
-    It runs on the device of its splats, with sky, exposures, limbs, pictures and measured depths; poses stay on the host, and so does the
-    generator, so that the same views are drawn on every device.
+    It runs on the device of its splats, with sky, exposures, limbs, pictures and measured depths; poses stay on the host, and so do the
+    generator and what is due, so that the same views are drawn on every device.
     """
 
     def __init__(
@@ -95,6 +92,8 @@ class Fit:
         self.recent_loss = 0.0
         self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
         self._weights = self._chances()
+        # draws that each view is behind: from anywhere, or views of equal weight would come all at once
+        self.due = torch.rand(len(self.training), generator=self.generator)
         self.openings = Openings(frames, motion, self.device)
         self.flat_ground = FlatGround(ground, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
@@ -103,7 +102,7 @@ class Fit:
         self._optimise()
 
     def _chances(self) -> torch.Tensor:
-        """How often each training view is drawn: less while the car stands."""
+        """How often each training view should be drawn: less while the car stands."""
         drawn = [self.motion.row[v.camera, v.index] for v in self.training]
         return torch.where(self.motion.speeds()[drawn] > 0.5, 1.0, self.config.still_weight)
 
@@ -134,7 +133,7 @@ class Fit:
             self._grow()
         if self.guessed is None and self.progress >= GUESSED_FROM:
             self._guess()
-        view = self.training[int(torch.multinomial(self._weights, 1, generator=self.generator))]
+        view = self._next()
         camera = self.motion.camera(view).resized(*self._size(self.shrink()))
         target = self._target(view, self.shrink())
         aside = None
@@ -157,7 +156,8 @@ class Fit:
             rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
         if view.gain is not None:
             rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
-        loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, self._window(camera))
+        lattice = (STEP, *torch.randint(0, STEP, (2,), generator=self.generator).tolist())
+        loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, lattice)
         haze = self.openings.haze(alpha, view, camera)
         if blank is not None:
             wrong = (rgb.detach() - target).abs().mean(-1)
@@ -182,6 +182,13 @@ class Fit:
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
+
+    def _next(self) -> View:
+        """The view that is most overdue, or nearly: each comes as often as it should, and none waits for long."""
+        self.due = self.due + self._weights / self._weights.sum()  # anew: a checkpoint may hold the other
+        k = int((self.due + 0.5 * torch.rand(len(self.due), generator=self.generator)).argmax())
+        self.due[k] -= 1
+        return self.training[k]
 
     def _known(self, view: View) -> list[tuple[float, torch.Tensor]]:
         """The depths that a view is held to, and their weights."""
@@ -283,12 +290,6 @@ class Fit:
         assert view.ego is not None
         return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
 
-    def _window(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Where similarity is taken: all of a small picture, a random part of a large one."""
-        height, width = min(camera.height, WINDOW[0]), min(camera.width, WINDOW[1])
-        top, left = (int(torch.randint(0, n + 1, (1,), generator=self.generator)) for n in (camera.height - height, camera.width - width))
-        return top, left, height, width
-
     def _settled(self) -> float:
         """How long steps still are: towards the end they become ever shorter."""
         return 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
@@ -344,6 +345,7 @@ class Fit:
             "motion": self.motion.tensors(),
             "limbs": self.limbs.tensors(),
             "adam": [o.state_dict() for o in (self.rest_adam, self.pose_adam)],
+            "due": self.due,
             "generator": self.generator.get_state(),
             "step": self.step_count,
             "loss": self.recent_loss,
@@ -360,6 +362,7 @@ class Fit:
         self._optimise()
         for optimiser, saved in zip((self.rest_adam, self.pose_adam), state["adam"], strict=True):
             optimiser.load_state_dict(saved)
+        self.due = state["due"]
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
 

@@ -173,6 +173,22 @@ def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
         _span(log, names, 0, -1)
 
 
+def test_views_come_as_often_as_they_should_and_none_waits_for_long(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    count = len(fit.training)
+    fit._weights = torch.where(torch.arange(count) < count // 2, 0.4, 1.0)
+    share = fit._weights / fit._weights.sum()
+    place = {id(view): k for k, view in enumerate(fit.training)}
+    drawn = torch.tensor([place[id(fit._next())] for _ in range(20 * count)])
+    assert (torch.bincount(drawn, minlength=count) - share * len(drawn)).abs().max() <= 1.5
+    for k in range(count):
+        assert (drawn == k).nonzero()[:, 0].diff().max() * share[k] <= 2
+    rounds = {tuple(drawn[at : at + count].tolist()) for at in range(0, len(drawn), count)}
+    assert len(rounds) > 15, "in another order each time"
+
+
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):
     log = open_log(drive)
     names, span = choose(log)
