@@ -58,16 +58,24 @@ class Growth:
 
 
 def grow(
-    splats: Splats, carried: dict[str, torch.Tensor], growth: Growth, budget: int, rounds_left: int, boxes: list[np.ndarray]
+    splats: Splats,
+    carried: dict[str, torch.Tensor],
+    growth: Growth,
+    budget: int,
+    rounds_left: int,
+    boxes: list[np.ndarray],
+    astray: torch.Tensor | None = None,
 ) -> tuple[Splats, dict[str, torch.Tensor]]:
     """Splats after one round, and what each carries with it, `[N, ...]`, of which new splats start with zeros.
 
-    Dropped: fainter than `FAINT`, outside their actor's box. Split: those in most `need`, as many as make the budget last
-    `rounds_left` rounds, in two along their longest axis.
+    Dropped: fainter than `FAINT`, outside their actor's box, `astray` (bool `[N]`). Split: those in most `need`, as many as make the budget
+    last `rounds_left` rounds, in two along their longest axis.
     """
     fields = {k: v.detach() for k, v in splats.fields.items()}
     group = splats.group_of()
     keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
+    if astray is not None:
+        keep &= ~astray
     need = torch.where(keep, growth.need(), 0.0)
     count = min(max(0, (budget - int(keep.sum())) // rounds_left), int((need > 0).sum()))
     parents = need.topk(count).indices if count else torch.zeros(0, dtype=torch.long, device=need.device)

@@ -21,6 +21,7 @@ from recon.fit.model import Splats, draw, placed_groups
 from recon.fit.motion import Moment, Motion
 from recon.fit.openings import Openings
 from recon.fit.sight import Eye, in_sight
+from recon.fit.swept import Swept
 from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
@@ -79,6 +80,7 @@ class Fit:
         config: FitConfig,
         measured: Sequence[Measured],
         ground: Ground,
+        swept: Swept,
     ):
         self.device = splats.reach.device
         self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
@@ -95,7 +97,7 @@ class Fit:
         # draws that each view is behind: from anywhere, or views of equal weight would come all at once
         self.due = torch.rand(len(self.training), generator=self.generator)
         self.openings = Openings(frames, motion, self.device)
-        self.flat_ground = FlatGround(ground, self.device)
+        self.flat_ground, self.swept = FlatGround(ground, self.device), swept
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self.guessed: torch.Tensor | None = None
@@ -325,7 +327,8 @@ class Fit:
     def _grow(self) -> None:
         """Split where most is wrong and pictures pull, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
-        self.splats, carried = grow(self.splats, self.descent.tensors(), self.growth, self.config.budget, left, self.motion.boxes)
+        carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
+        self.splats, carried = grow(self.splats, carried, self.growth, self.config.budget, left, self.motion.boxes, astray)
         self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None
 
     # ---- checkpoints

@@ -189,6 +189,18 @@ def test_views_come_as_often_as_they_should_and_none_waits_for_long(drive):
     assert len(rounds) > 15, "in another order each time"
 
 
+def test_nothing_is_left_standing_where_something_drove(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    track = start.tracks[0]
+    middle = track.world_from_box[len(track.world_from_box) // 2, :3, 3].float() + torch.tensor([0, 0, 0.6 * float(track.size[2])])
+    fit.splats.fields["means"][:20] = middle
+    assert fit.swept.holds(fit.splats)[:20].all()
+    fit._grow()
+    assert not fit.swept.holds(fit.splats).any()
+
+
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):
     log = open_log(drive)
     names, span = choose(log)
