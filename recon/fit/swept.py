@@ -28,13 +28,9 @@ class Swept:
     """
 
     def __init__(self, tracks: Sequence[Track], ground: Ground, device: torch.device | str):
-        passed = np.concatenate([np.zeros((0, 4)), *(_passed(track) for track in tracks)])
-        xy = torch.from_numpy(passed[:, :2])
-        passed[:, 2] = np.maximum(passed[:, 2], ground.height(xy).numpy() + ABOVE)
-        keys, cell = np.unique(_keys(xy).numpy(), return_inverse=True)
-        low, high = np.full(len(keys), np.inf), np.full(len(keys), -np.inf)
-        np.minimum.at(low, cell, passed[:, 2])
-        np.maximum.at(high, cell, passed[:, 3])
+        each = [_cells(_passed(track), ground) for track in tracks]  # one by one: traffic passes over every cell a thousand times
+        nothing = (np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        keys, low, high = _spans(*(np.concatenate(parts) for parts in zip(nothing, *each, strict=True)))
         self.keys = torch.from_numpy(keys).to(device)
         self.low, self.high = (torch.from_numpy(z).float().to(device) for z in (low, high))
 
@@ -49,6 +45,21 @@ class Swept:
         cell = torch.searchsorted(self.keys, keys).clamp_max(len(self.keys) - 1)
         mask[:count] = (self.keys[cell] == keys) & (means[:, 2] > self.low[cell]) & (means[:, 2] < self.high[cell])
         return mask
+
+
+def _cells(passed: np.ndarray, ground: Ground) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of places `[M, 4]` that a box passed over: cells, and from and up to which height nothing stands there, `[K]` each."""
+    xy = torch.from_numpy(passed[:, :2])
+    return _spans(_keys(xy).numpy(), np.maximum(passed[:, 2], ground.height(xy).numpy() + ABOVE), passed[:, 3])
+
+
+def _spans(keys: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each key once, rising, with the least and the greatest height that it comes with."""
+    once, place = np.unique(keys, return_inverse=True)
+    least, greatest = np.full(len(once), np.inf), np.full(len(once), -np.inf)
+    np.minimum.at(least, place, low)
+    np.maximum.at(greatest, place, high)
+    return once, least, greatest
 
 
 def _keys(xy: torch.Tensor) -> torch.Tensor:
