@@ -46,8 +46,8 @@ HELD_OUT = 8
 
 SHARED, PER_PICTURE = (1_600, 170_000), (8, 700)
 """Steps that a fit takes and splats that it may have: for what a drive's pictures share, and for each of them besides. The 240 of three
-cameras of drive 002 get 3,520 steps and 338,000 splats, the 400 of five 4,800 and 450,000. Fewer splats and more steps that take as long
-cost the front camera among five 0.7 dB: what was wrong then, was nearly as wrong in the pictures that were fitted to."""
+cameras of drive 002 get 3,520 steps and 338,000 splats, the 400 of five 4,800 and 450,000. Two fifths fewer
+splats cost the front camera among five 0.7 dB: what was wrong then was nearly as wrong in the pictures that were fitted to."""
 
 MOST = 6500, 650_000
 """Of both, whatever the drive: a third and more beyond what five cameras of drive 002 get, whose fit takes a third of an hour."""
