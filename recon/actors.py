@@ -40,6 +40,17 @@ class Split:
     actors: dict[str, tuple[np.ndarray, np.ndarray]]
     tracks: tuple[Track, ...]
 
+    def moved(self, sweep: int, time_us: int) -> np.ndarray:
+        """Points `[N, 3]` that the sweep of an index has of what moves, where that is at a moment, in the world."""
+        placed = [np.zeros((0, 3))]
+        for track in self.tracks:
+            if track.name not in self.actors or not (path := track.trajectory()).covers(time_us):
+                continue
+            local, of = self.actors[track.name]
+            pose = path.at(time_us).numpy()
+            placed.append(local[of == sweep] @ pose[:3, :3].T + pose[:3, 3])
+        return np.concatenate(placed)
+
 
 def inside(local: np.ndarray, size: np.ndarray, margin: float, below: float = 0.0) -> np.ndarray:
     """Mask `[N]` of box-frame points within the box grown by `margin` metres; the floor by `below`."""

@@ -21,7 +21,6 @@ from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
 from recon.fit.run import run
 from recon.fit.strides import stride_of
-from recon.fit.swept import Swept
 from recon.frames import Frames, load_frames
 from recon.live import Live
 from recon.log import Log, Sweep, Track
@@ -263,8 +262,8 @@ def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
-    swept = Swept(start.tracks, start.ground, device)
-    return Fit(frames, motion, start.splats.to(device), start.sky, start.exposures, limbs, config, start.measured, start.ground, swept)
+    splats = start.splats.to(device)
+    return Fit(frames, motion, splats, start.sky, start.exposures, limbs, config, start.measured, start.ground, start.swept)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from recon.fit.config import FitConfig
+from recon.fit.swept import Swept
 from recon.log import Track
 from recon.seeds.measured import Measured
 from recon.start import Start
@@ -19,7 +20,7 @@ from scenes.ground import Ground
 from scenes.lenses import LENSES
 from scenes.trajectory import Trajectory
 
-VERSION = 13
+VERSION = 14
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -70,6 +71,7 @@ def _plain_start(start: Start) -> dict:
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
         "measured": [[m.views, m.weight] for m in start.measured],
+        "swept": start.swept.keys,
     }  # fmt: skip
 
 
@@ -97,4 +99,5 @@ def _start(plain: dict, fit: dict) -> Start:
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
-    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, tuple(Measured(*m) for m in plain["measured"]))
+    measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
+    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, measured, swept)

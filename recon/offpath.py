@@ -43,20 +43,20 @@ def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
 def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequence[float] = SHIFTS) -> list[dict]:
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
-    depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, d being the expected
-    depth; points: how many those are. holes: share of pixels below the horizon with alpha under 0.9; holes_above: the same above it, where
-    from the recorded path no sky is ever seen (None where it is seen everywhere): between a tree and the house behind it, and through
-    windows. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in
-    both; first camera.
+    depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, d being the expected depth;
+    points: how many those are. movers_error: the same of points in moving boxes, where these are at the picture's moment. holes: share of
+    pixels below the horizon with alpha under 0.9; holes_above: the same above it, where from the recorded path no sky is ever seen (None
+    where it is seen everywhere): between a tree and the house behind it, and through windows. flicker: mean absolute difference to the
+    previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
-    static = [(s, split_points(log, [s], movers).static) for s in sweeps]
+    splits = [(s, split_points(log, [s], movers)) for s in sweeps]
     hidden = always_hidden(looks_of(scene))
     rows = []
     for shift in shifts:
-        errors, holes = [], {"holes": np.zeros(2), "holes_above": np.zeros(2)}
+        errors, moving, holes = [], [], {"holes": np.zeros(2), "holes_above": np.zeros(2)}
         paths = [scene.ego.shifted(lateral=side) for side in (shift, -shift)]
-        for k, (sweep, points) in enumerate(static):
+        for k, (sweep, split) in enumerate(splits):
             for name in scene.rig:
                 times = scene.frame_times(name)
                 time = int(times[(times - sweep.time_us).abs().argmin()])
@@ -69,24 +69,34 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 ground = directions[..., 2] < 0
                 for which, solid in (("holes", ground), ("holes_above", ~ground & hidden[cells(directions, len(hidden))])):
                     holes[which] += [int((solid & (alpha < SOLID)).sum()), int(solid.sum())]
-                errors.append(depth_errors(depth.numpy(), points, camera))
-        found = np.concatenate(errors) if errors else np.zeros(0)
-        row = {"shift_m": shift, "depth_error": float(np.median(found)) if len(found) else None, "points": len(found)}
+                points = np.concatenate([split.static, split.moved(sweep.index, time)])
+                off = depth_errors(depth.numpy(), points, camera)
+                errors.append(off[: len(split.static)])
+                moving.append(off[len(split.static) :])
+        row = {"shift_m": shift, "depth_error": _median(errors), "movers_error": _median(moving)}
+        row["points"] = int(sum(np.isfinite(e).sum() for e in errors))
         row |= {which: float(open_ / solid) if solid else None for which, (open_, solid) in holes.items()}
         rows.append(row | {"flicker": flicker_along(scene, shift)})
     return rows
 
 
 def depth_errors(depth: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Relative errors of `depth` `[H, W]` at the world points `[N, 3]` that `camera` sees; 1 where nothing was drawn."""
+    """Relative errors `[N]` of `depth` `[H, W]` at world points `[N, 3]`; NaN at those that `camera` does not see, 1 where nothing was
+    drawn."""
     row, column, z, seen = project(points, inverse(camera.world_from_cam).numpy(), camera)
-    row, column, z = row[seen], column[seen], z[seen]
     nearest = np.full(depth.shape, np.inf)
-    np.minimum.at(nearest, (row, column), z)
+    np.minimum.at(nearest, (row[seen], column[seen]), z[seen])
     nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
-    open_ = z <= HIDING * nearest[row, column]
-    drawn = depth[row[open_], column[open_]]
-    return np.where(np.isfinite(drawn), np.abs(drawn - z[open_]) / z[open_], 1.0)
+    drawn = depth[row, column]
+    off = np.where(np.isfinite(drawn), np.abs(drawn - z) / np.where(seen, z, 1.0), 1.0)
+    return np.where(seen & (z <= HIDING * nearest[row, column]), off, np.nan)
+
+
+def _median(parts: Sequence[np.ndarray]) -> float | None:
+    """Of what is known; None where nothing is."""
+    found = np.concatenate([np.zeros(0), *parts])
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if len(found) else None
 
 
 def flicker_along(scene: Scene, shift: float) -> float:
@@ -118,9 +128,10 @@ def _planes(image: torch.Tensor | None) -> torch.Tensor:
 
 def off_path_text(rows: Sequence[dict]) -> str:
     """The rows for people."""
-    lines = [f"{'off the path':<14} {'depth error':>12} {'lidar points':>13} {'holes':>8} {'above':>8} {'flicker, levels':>16}"]
+    heads = ("lidar points", "depth error", "movers'", "holes", "above", "flicker, levels")
+    lines = [f"{'off the path':<14}" + "".join(f" {head:>15}" for head in heads)]
     for r in rows:
-        error, holes, above = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "holes", "holes_above"))
+        parts = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "movers_error", "holes", "holes_above"))
         where = f"{r['shift_m']:g} m aside" if r["shift_m"] else "as recorded"
-        lines.append(f"{where:<14} {error:>12} {r['points']:>13} {holes:>8} {above:>8} {r['flicker']:>16.2f}")
+        lines.append(f"{where:<14}" + "".join(f" {part:>15}" for part in (r["points"], *parts, f"{r['flicker']:.2f}")))
     return "\n".join(lines)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from recon.actors import split_points
 from recon.fit.densify import LARGEST
 from recon.fit.model import Splats, draw
+from recon.fit.swept import Swept
 from recon.frames import Frames
 from recon.ground import estimate_ground
 from recon.log import Log, Track
@@ -19,7 +20,7 @@ from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
 from recon.seeds.fill import unexplained
-from recon.seeds.measured import Measured, by_lidar
+from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
 from recon.seeds.standing import by_all_sweeps
 from recon.seeds.sweep import companions
@@ -54,8 +55,8 @@ WIDEST_SEED = 0.012
 
 @dataclass
 class Start:
-    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig, and the
-    depths that were measured in views."""
+    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig, the
+    depths that were measured in views, and where nothing stands."""
 
     splats: Splats
     tracks: list[Track]
@@ -65,6 +66,7 @@ class Start:
     ground: Ground
     rig: dict[str, RigCamera]
     measured: tuple[Measured, ...]
+    swept: Swept
 
 
 def prepare(
@@ -107,7 +109,8 @@ def prepare(
         report("measuring depth")
         struck = by_lidar(log, frames, sweeps, split, movers)
         beyond, agreed = beyond_lidar(log, frames, struck, ground, movers, gains)
-        measured = [struck, by_all_sweeps(log, frames, split, movers).without(agreed), agreed]
+        everything = struck.completed(by_lidar_of_movers(log, frames, sweeps, split))
+        measured = [everything, by_all_sweeps(log, frames, split, movers).without(agreed), agreed]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
     sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
@@ -127,6 +130,9 @@ def prepare(
             near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)
             reaches.append(torch.full((len(made),), sharpest * near))
 
+    standing = [t for t in log.tracks if not t.moving]
+    swept = Swept.by([*split.tracks, *standing], span_us, ground, split.static, split.static_sweep)
+
     report("filling what lidar missed")
     filled, sky = _fill(log, frames, background, groups, tracks, gains, sh_count, ground)
     reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], NEAREST)).float()
@@ -135,7 +141,7 @@ def prepare(
     if exposures is None:
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured))
+    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured), swept)
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:

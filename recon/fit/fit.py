@@ -97,7 +97,7 @@ class Fit:
         # draws that each view is behind: from anywhere, or views of equal weight would come all at once
         self.due = torch.rand(len(self.training), generator=self.generator)
         self.openings = Openings(frames, motion, self.device)
-        self.flat_ground, self.swept = FlatGround(ground, self.device), swept
+        self.flat_ground, self.swept = FlatGround(ground, self.device), swept.to(self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self.guessed: torch.Tensor | None = None
@@ -263,7 +263,8 @@ class Fit:
 
     @torch.no_grad()
     def _guess(self) -> None:
-        """Give what pictures hardly show its neighbours' colours, to keep."""
+        """Give what pictures hardly show its neighbours' colours, to keep, once what faded or went astray since the last growth is gone."""
+        self._renew(0)
         part = torch.zeros_like(self.splats.reach)
         for view in self.training:
             camera = self.motion.camera(view).resized(*self._size(4))
@@ -327,8 +328,12 @@ class Fit:
     def _grow(self) -> None:
         """Split where most is wrong and pictures pull, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
+        self._renew(self.config.budget, left)
+
+    def _renew(self, budget: int, rounds_left: int = 1) -> None:
+        """One round of `grow`; with no budget, splats are dropped and none is split."""
         carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
-        self.splats, carried = grow(self.splats, carried, self.growth, self.config.budget, left, self.motion.boxes, astray)
+        self.splats, carried = grow(self.splats, carried, self.growth, budget, rounds_left, self.motion.boxes, astray)
         self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None
 
     # ---- checkpoints

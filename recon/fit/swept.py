@@ -3,7 +3,8 @@ from beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,67 +14,77 @@ from recon.fit.model import Splats
 from recon.log import Track
 from scenes.ground import Ground
 
-CELL = 0.25
-"""Side of a cell of the ground, in metres."""
+CELL = 0.2
+"""Side of a voxel, in metres: it belongs to what holds its middle."""
 
-WITHIN, ABOVE = 0.2, 0.3
-"""Metres that boxes may be too long, wide and high; and above their base, and above the ground, which a long box crosses on a slope, up to
-which a road may reach."""
+CLOSE = 0.2
+"""Metres by which boxes may be too large, and too small."""
+
+ABOVE = 0.3
+"""Metres above a box's base, and above the ground, which a long box crosses on a slope, up to which a road may reach."""
+
+STOOD = 8
+"""Sweeps whose points in a column say that something stood there at another time: a car that waited before it was found, or after it was
+lost. What only passes is seen there in fewer."""
+
+LAYERS = 2**20
+"""Voxels along each axis that keys tell apart: 200 km."""
+
+POSES = 256
+"""Of a box that are looked at together."""
 
 
+@dataclass(frozen=True)
 class Swept:
-    """What boxes passed through.
+    """Voxels that boxes passed through: keys int64 `[K]`, rising."""
 
-    keys: of the ground's cells, int64 `[K]`, rising; low, high `[K]`: between which heights, in metres, boxes passed over them
-    """
+    keys: torch.Tensor
 
-    def __init__(self, tracks: Sequence[Track], ground: Ground, device: torch.device | str):
-        each = [_cells(_passed(track), ground) for track in tracks]  # one by one: traffic passes over every cell a thousand times
-        nothing = (np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-        keys, low, high = _spans(*(np.concatenate(parts) for parts in zip(nothing, *each, strict=True)))
-        self.keys = torch.from_numpy(keys).to(device)
-        self.low, self.high = (torch.from_numpy(z).float().to(device) for z in (low, high))
+    @staticmethod
+    def by(tracks: Sequence[Track], span_us: tuple[int, int], ground: Ground, static: np.ndarray, sweep: np.ndarray) -> Swept:
+        """What the boxes of moving `tracks` passed through within a span of time, but where those of the others stand, and where lidar's
+        `static` points `[N, 3]`, of sweeps `[N]`, show that something stood."""
+        swept = _union(_voxels(_poses(t, span_us), t.size, -CLOSE, ABOVE) for t in tracks if t.moving)
+        middles = (_cells(swept) + 0.5) * CELL
+        swept = swept[middles[:, 2] > ground.height(torch.from_numpy(middles[:, :2])).numpy() + ABOVE]
+        standing = _union(_voxels(t.world_from_box.numpy(), t.size, CLOSE, -CLOSE) for t in tracks if not t.moving)
+        swept = np.setdiff1d(swept, standing, assume_unique=True)
+        return Swept(torch.from_numpy(swept[~np.isin(swept // LAYERS, _stood(swept, static, sweep))]))
+
+    def to(self, device: torch.device | str) -> Swept:
+        """The same on a device."""
+        return Swept(self.keys.to(device))
 
     def holds(self, splats: Splats) -> torch.Tensor:
         """Mask `[N]` of the splats of the background that stand where boxes passed."""
         count = splats.sizes[0]
         mask = torch.zeros(len(splats), dtype=torch.bool, device=self.keys.device)
-        if not len(self.keys):
-            return mask
-        means = splats.fields["means"][:count].detach()
-        keys = _keys(means[:, :2])
-        cell = torch.searchsorted(self.keys, keys).clamp_max(len(self.keys) - 1)
-        mask[:count] = (self.keys[cell] == keys) & (means[:, 2] > self.low[cell]) & (means[:, 2] < self.high[cell])
+        if len(self.keys):
+            x, y, z = (splats.fields["means"][:count].detach() / CELL).floor().long().unbind(1)
+            keys = _keys(x, y, z)
+            mask[:count] = self.keys[torch.searchsorted(self.keys, keys).clamp_max(len(self.keys) - 1)] == keys
         return mask
 
 
-def _cells(passed: np.ndarray, ground: Ground) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of places `[M, 4]` that a box passed over: cells, and from and up to which height nothing stands there, `[K]` each."""
-    xy = torch.from_numpy(passed[:, :2])
-    return _spans(_keys(xy).numpy(), np.maximum(passed[:, 2], ground.height(xy).numpy() + ABOVE), passed[:, 3])
+def _keys(x, y, z):
+    """Numbers of cells by their places along the axes, int64, arrays or tensors: one a cell, and those of a column follow one another."""
+    half = LAYERS // 2
+    return ((x + half) * LAYERS + y + half) * LAYERS + z + half
 
 
-def _spans(keys: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each key once, rising, with the least and the greatest height that it comes with."""
-    once, place = np.unique(keys, return_inverse=True)
-    least, greatest = np.full(len(once), np.inf), np.full(len(once), -np.inf)
-    np.minimum.at(least, place, low)
-    np.maximum.at(greatest, place, high)
-    return once, least, greatest
+def _cells(keys: np.ndarray) -> np.ndarray:
+    """Places `[K, 3]` along the axes of cells by their numbers."""
+    return np.stack([keys // LAYERS**2, keys // LAYERS % LAYERS, keys % LAYERS], 1) - LAYERS // 2
 
 
-def _keys(xy: torch.Tensor) -> torch.Tensor:
-    """Numbers int64 `[N]` of the cells in which places `[N, 2]` are."""
-    cell = (xy / CELL).floor().long()
-    return cell[:, 0] * 2**32 + cell[:, 1]
+def _union(parts: Iterable[np.ndarray]) -> np.ndarray:
+    """The numbers that are in any of the parts, rising."""
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *parts]))
 
 
-def _passed(track: Track) -> np.ndarray:
-    """Places `[M, 4]` that a box passed over, less than a cell apart: x, y, and from and up to which height nothing stands there."""
-    half, top = track.size[:2] / 2 - WITHIN, track.size[2] - WITHIN
-    if (half <= 0).any() or top <= ABOVE:
-        return np.zeros((0, 4))
-    steps = np.ceil(track.world_from_box[:, :2, 3].diff(dim=0).norm(dim=1).numpy() / (CELL / 2)).astype(int)
+def _poses(track: Track, span_us: tuple[int, int]) -> np.ndarray:
+    """World from box `[P, 4, 4]`, on its way through a span of time, less than a cell apart; not where it was not seen for long."""
+    steps = np.ceil(track.world_from_box[:, :2, 3].diff(dim=0).norm(dim=1).numpy() / CELL).astype(int)
     gaps = np.diff(track.times_us)
     between = [
         np.linspace(time, time + gap, step, endpoint=False)[1:]
@@ -81,8 +92,40 @@ def _passed(track: Track) -> np.ndarray:
         if gap <= APART_US and step > 1
     ]
     times = np.unique(np.concatenate([track.times_us, *between]).round().astype(np.int64))
-    poses = track.trajectory().at_each(torch.from_numpy(times)).numpy()
-    x, y = (np.linspace(-h, h, int(np.ceil(4 * h / CELL)) + 1) for h in half)
-    floor = np.stack(np.meshgrid(x, y, [0.0], indexing="ij"), -1).reshape(-1, 3)
-    world = (floor @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]).reshape(-1, 3)
-    return np.concatenate([world, world[:, 2:]], 1) + [0, 0, ABOVE, top]
+    times = times[(times >= span_us[0]) & (times <= span_us[1])]
+    return track.trajectory().at_each(torch.from_numpy(times)).numpy()
+
+
+def _voxels(poses: np.ndarray, size: np.ndarray, more: float, above: float) -> np.ndarray:
+    """Numbers of the voxels in a box `[length, width, height]`, grown by `more` metres, from `above` its base on, at any of its poses."""
+    half, top = size[:2] / 2 + more, size[2] + more
+    if (half <= 0).any() or top <= above:
+        return np.zeros(0, np.int64)
+    reach = np.arange(-(around := int(np.ceil(np.hypot(*half) / CELL))), around + 1)
+    columns = np.stack(np.meshgrid(reach, reach, indexing="ij"), -1).reshape(-1, 2)
+    runs = []
+    for some in np.split(poses, range(POSES, len(poses), POSES)):
+        base, normal = some[:, :3, 3], some[:, :3, 2]
+        cells = np.floor(base[:, None, :2] / CELL).astype(np.int64) + columns
+        away = (cells + 0.5) * CELL - base[:, None, :2]
+        rise = -np.einsum("pcx,px->pc", away, normal[:, :2]) / normal[:, 2:]  # of the base's plane
+        local = np.einsum("pcx,pxl->pcl", away, some[:, :2, :2]) + rise[..., None] * some[:, None, 2, :2]
+        inside = (np.abs(local) <= half).all(-1)
+        floor = (rise + base[:, None, 2])[inside] / CELL - 0.5
+        first, last = np.ceil(floor + above / CELL), np.floor(floor + top / CELL)
+        # traffic passes through every column a hundred times: each run of voxels once
+        runs.append(np.unique(np.column_stack([cells[inside], first.astype(np.int64), last.astype(np.int64)]), axis=0))
+    x, y, first, last = np.unique(np.concatenate([np.zeros((0, 4), np.int64), *runs]), axis=0).T
+    layers = np.arange((last - first).max(initial=-1) + 1)
+    z = first[:, None] + layers
+    return np.unique(_keys(x[:, None], y[:, None], z)[z <= last[:, None]])
+
+
+def _stood(swept: np.ndarray, static: np.ndarray, sweep: np.ndarray) -> np.ndarray:
+    """Numbers of the columns, and of those beside them, in whose `swept` voxels points of `STOOD` sweeps lie."""
+    keys = _keys(*np.floor(static / CELL).astype(np.int64).T)
+    there = np.isin(keys, swept)
+    seen = np.unique(np.stack([keys[there] // LAYERS, sweep[there]]), axis=1)[0]
+    columns, sweeps = np.unique(seen, return_counts=True)
+    beside = [x * LAYERS + y for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    return np.unique(columns[sweeps >= STOOD][:, None] + beside)

@@ -49,6 +49,16 @@ def test_groups_stay_apart_when_splats_are_added_and_dropped():
     assert (torch.sigmoid(after.fields["logits"]) > 0.02).all() and len(after) == 120
 
 
+def test_what_is_astray_goes_and_is_not_split_and_without_a_budget_nothing_is():
+    s = splats()
+    astray = torch.arange(len(s)) % 3 == 0
+    s.fields["sh"] = astray.float()[:, None, None].expand(-1, 4, 3).clone()
+    after, _ = grow(s, {}, as_wrong_as(1 + 9 * astray.float()), 100, 1, BOXES, astray)
+    assert len(after) == 100 and not after.fields["sh"].any()
+    after, carried = grow(s, {"mine": torch.arange(len(s))}, as_wrong_as(torch.ones(len(s))), 0, 1, BOXES, astray)
+    assert torch.equal(carried["mine"], (~astray).nonzero()[:, 0]) and torch.equal(after.fields["means"], s.fields["means"][~astray])
+
+
 def test_splats_of_an_actor_that_leave_its_box_are_dropped_and_the_background_is_free():
     s = splats()
     s.fields["means"][0], s.fields["means"][55] = torch.tensor([500.0, 0, -9]), torch.tensor([5.0, 0, 0])

@@ -8,7 +8,7 @@ from painted import SIZE, drive, sweep_of, wall
 from recon.actors import split_points
 from recon.frames import load_frames
 from recon.log import Track
-from recon.seeds.measured import SLACK, SOON_US, by_lidar, by_pictures, grid_of, mistake, nearest_points
+from recon.seeds.measured import SLACK, SOON_US, Measured, by_lidar, by_lidar_of_movers, by_pictures, grid_of, mistake, nearest_points
 from recon.seeds.stereo import plate_of
 from scenes.camera import Camera
 from scenes.lenses import Fisheye, OpenCV, Pinhole
@@ -50,6 +50,40 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     assert np.nanmax(distance) == pytest.approx(17.0, abs=0.3) and np.nanmin(distance) == pytest.approx(12.0, abs=0.1)
     assert (0, 1) in measured and (0, 2) not in _by_lidar(log, frames, [sweep_of(200_000 - SOON_US - 1, wall(12.0, -3, 3))], []).views
     assert _by_lidar(log, frames, [], []).views == {}
+
+
+def test_lidar_measures_what_moves_where_it_is_when_the_picture_is_taken():
+    log = drive([0.0, 0.5, 0.5], ("front",))
+    frames = load_frames(log, ["front"], ALL, SIZE, 0)
+    poses = torch.stack([translation(6.5 - 0.2, 0.0, 0.0), translation(6.5, 0.0, 0.0), translation(9.3, 0.0, 0.0)])
+    car = Track("veh_1", "car", True, np.array([1.0, 2.0, 3.0]), np.array([0, 20_000, 300_000]), poses, np.zeros(3), ())
+    back, post = wall(6.0, -1, 1), wall(4.0, -0.2, 0.2)
+
+    def seen(*parts):
+        sweep = sweep_of(20_000, *parts)
+        return by_lidar_of_movers(log, frames, [sweep], split_points(log, [sweep], [car])).views
+
+    measured = seen(back, wall(12.0, -3, 3))
+    depth = measured[0, 0].float().numpy()  # at 10 m/s it was 20 cm nearer 20 ms before
+    known = np.isfinite(depth)
+    assert known.sum() > 200 and np.abs(depth[known] - 5.8).max() < 0.05
+    later = measured[0, 1].float().numpy()
+    assert np.nanmedian(later) == pytest.approx(6.8 - 0.5, abs=0.05), "where it is by then"
+    hidden = known & ~np.isfinite(seen(back, post)[0, 0].float().numpy())
+    assert hidden.sum() > 20 and (np.nonzero(hidden.any(0))[0] - known.shape[1] / 2 < 20).all(), "behind the post"
+    assert seen(wall(12.0, -3, 3)) == {}
+
+
+def test_depths_are_completed_where_there_are_none():
+    nan = torch.nan
+    ours = Measured({(0, 0): torch.tensor([[1.0, nan]]).half(), (0, 1): torch.tensor([[nan]]).half()}, 0.5)
+    theirs = Measured({(0, 0): torch.tensor([[3.0, 4.0]]).half(), (0, 2): torch.tensor([[5.0]]).half()}, 9.0)
+    both = ours.completed(theirs)
+    assert both.weight == 0.5 and {which: depth.tolist() for which, depth in both.views.items() if which != (0, 1)} == {
+        (0, 0): [[1.0, 4.0]],
+        (0, 2): [[5.0]],
+    }
+    assert both.views[0, 1].isnan().all()
 
 
 AHEAD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]], dtype=torch.float64)

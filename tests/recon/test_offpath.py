@@ -33,6 +33,18 @@ def test_the_street_itself_is_near_its_lidar_on_and_off_the_path(street, log):
     assert "2 m aside" in off_path_text(rows)
 
 
+def test_what_moves_is_measured_where_it_is(street, log):
+    sweeps = held_out_sweeps(log, 4)
+    right = off_path_table(street, log, sweeps, (0.0, 2.0))
+    (actor,) = street.actors
+    nearer = replace(actor, trajectory=actor.trajectory.shifted(forward=-4.0))
+    wrong = off_path_table(replace(street, actors=(nearer,)), log, sweeps, (0.0, 2.0))
+    assert all(row["movers_error"] < 0.1 for row in right) and all(row["movers_error"] > 0.18 for row in wrong)
+    assert wrong[0]["depth_error"] == pytest.approx(right[0]["depth_error"], abs=0.01), "what stands still is another matter"
+    bare = off_path_table(street, replace(log, tracks=()), sweeps, (0.0,))
+    assert bare[0]["movers_error"] is None and "-" in off_path_text(bare)
+
+
 def test_a_torn_road_shows_as_holes_and_a_wrong_one_as_depth_error(street, log):
     sweeps = held_out_sweeps(log, 4)
     means = street.background.gaussians.means
@@ -70,7 +82,7 @@ def test_points_behind_nearer_points_do_not_count(street):
     pose = camera.world_from_cam
     near, far = ((pose @ torch.tensor([0.01, 0.01, z, 1.0], dtype=torch.float64))[:3].numpy() for z in (5.0, 50.0))
     depth = np.full((camera.height, camera.width), 5.0)
-    assert np.allclose(depth_errors(depth, np.stack([near, far]), camera), [0.0], atol=1e-6)
+    assert np.allclose(depth_errors(depth, np.stack([near, far]), camera), [0.0, np.nan], atol=1e-6, equal_nan=True)
     assert np.allclose(depth_errors(depth, far[None], camera), [0.9])
     assert np.allclose(depth_errors(np.full_like(depth, np.inf), near[None], camera), [1.0])
 

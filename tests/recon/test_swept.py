@@ -1,14 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from recon.fit.model import Splats
-from recon.fit.swept import ABOVE, WITHIN, Swept
+from recon.fit.swept import ABOVE, CELL, CLOSE, STOOD, Swept
 from recon.log import Track
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
-from scenes.poses import translation
+from scenes.poses import translation, yaw
 
 DEEP = Ground(torch.full((2, 2), -9.0), (0.0, 0.0), 1.0)
+EVER = (-(10**9), 10**9)
+NONE = np.zeros((0, 3)), np.zeros(0, np.int64)
 
 
 def car(times_us, *places):
@@ -27,33 +31,83 @@ def splats(*places, actors=()):
     return Splats.of(groups, [torch.ones(len(g)) for g in groups])
 
 
+def held(tracks, *places, span=EVER, ground=DEEP, static=NONE):
+    return Swept.by(tracks, span, ground, *static).holds(splats(*places)).tolist()
+
+
 def test_nothing_stands_where_a_car_drove():
-    swept = Swept([car([0, 500_000], (0.0, 5.0, 1.0), (12.0, 5.0, 2.0))], DEEP, "cpu")
+    track = car([0, 500_000], (0.0, 5.0, 1.0), (12.0, 5.0, 2.0))
     hit = [(-1.5, 5, 1.8), (6, 5.5, 2.5), (6.1, 4.3, 2.2), (13.5, 5, 3)]
-    free = [(6, 5, 1.5 + ABOVE / 2), (6, 5, 3.3), (6, 6.2, 2.2), (-2.4, 5, 1.8), (14.4, 5, 3), (6, 50, 2), (-600, 5, 2)]
-    assert swept.holds(splats(*hit, *free)).tolist() == [True] * len(hit) + [False] * len(free)
-    along = np.arange(-2 + 2 * WITHIN, 14 - 2 * WITHIN, 0.03)
-    assert swept.holds(splats(*((x, 5.3, 1 + max(0.0, x) / 12 + 0.8) for x in along))).all(), "between its boxes, too"
+    free = [(6, 5, 1.55), (6, 5, 3.3), (6, 6.2, 2.2), (-2.4, 5, 1.8), (14.4, 5, 3), (6, 50, 2), (-600, 5, 2)]
+    assert held([track], *hit, *free) == [True] * len(hit) + [False] * len(free)
+    along = np.arange(-2 + CLOSE + CELL, 14 - CLOSE - CELL, 0.03)
+    assert all(held([track], *((x, 5.3, 1 + max(0.0, x) / 12 + 0.8) for x in along))), "between its boxes, too"
+
+
+def test_as_much_as_the_box_holds_however_it_stands():
+    pose = translation(3.03, -7.04, 0.51) @ yaw(0.5)
+    track = replace(car([0], (0.0, 0.0, 0.0)), world_from_box=pose[None])
+    rng = np.random.default_rng(0)
+    local = rng.uniform([-2.5, -1.5, -0.5], [2.5, 1.5, 2.0], (20_000, 3))
+    within = np.minimum(2 - np.abs(local[:, 0]), 1 - np.abs(local[:, 1])) - CLOSE
+    within = np.minimum(within, np.minimum(local[:, 2] - ABOVE, 1.6 - CLOSE - local[:, 2]))
+    found = np.array(held([track], *(local @ pose[:3, :3].numpy().T + pose[:3, 3].numpy()).tolist()))
+    corner = CELL * 3**0.5 / 2
+    assert found[within > corner].all() and not found[within < -corner].any()
+    assert abs(found.mean() / (within > 0).mean() - 1) < 0.1
 
 
 def test_where_it_was_not_seen_for_long_nobody_knows():
-    swept = Swept([car([0, 2_000_000], (0.0, 0.0, 0.0), (40.0, 0.0, 0.0))], DEEP, "cpu")
-    assert swept.holds(splats((0, 0, 1), (20, 0, 1), (40, 0, 1))).tolist() == [True, False, True]
+    track = car([0, 2_000_000], (0.0, 0.0, 0.0), (40.0, 0.0, 0.0))
+    assert held([track], (0, 0, 1), (20, 0, 1), (40, 0, 1)) == [True, False, True]
+
+
+def test_what_comes_before_or_after_the_pictures_does_not_count():
+    track = car([0, 500_000, 1_000_000], (0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (20.0, 0.0, 0.0))
+    assert held([track], (0, 0, 1), (10, 0, 1), (20, 0, 1), span=(400_000, 600_000)) == [False, True, False]
 
 
 def test_what_moves_itself_may_stand_there_and_a_drive_without_movers_pays_nothing():
-    swept = Swept([car([0], (0.0, 0.0, 0.0))], DEEP, "cpu")
+    swept = Swept.by([car([0], (0.0, 0.0, 0.0))], EVER, DEEP, *NONE)
     assert swept.holds(splats((0, 0, 1), actors=[[(0, 0, 1)]])).tolist() == [True, False]
-    assert not Swept([], DEEP, "cpu").holds(splats((0, 0, 1))).any()
+    assert held([], (0, 0, 1)) == [False]
 
 
-def test_as_low_as_the_lowest_and_as_high_as_the_highest_that_passed():
-    low, high = car([0], (0.0, 0.0, 0.0)), car([0], (0.0, 0.0, 1.0))
-    heights = [0.2, 0.5, 1.5, 2.3, 2.5]
-    assert Swept([low, high], DEEP, "cpu").holds(splats(*((0, 0, z) for z in heights))).tolist() == [False, True, True, True, False]
+def test_a_bridge_between_two_roads_stays():
+    below, above = car([0], (0.0, 0.0, 0.0)), car([0], (0.0, 0.0, 6.0))
+    assert held([below, above], *((0, 0, z) for z in (0.1, 0.9, 3.0, 5.9, 6.2, 6.9, 7.9))) == [
+        False,
+        True,
+        False,
+        False,
+        False,
+        True,
+        False,
+    ]
 
 
 def test_a_road_that_rises_through_a_level_box_stays():
     heights = torch.tensor([[-0.4, 0.4], [-0.4, 0.4]])
-    swept = Swept([car([0], (0.0, 0.0, 0.0))], Ground(heights, (-2.0, -2.0), 4.0), "cpu")
-    assert swept.holds(splats((1.5, 0, 0.35), (1.5, 0, 0.9), (-1.5, 0, 0.4))).tolist() == [False, True, True]
+    level = car([0], (0.0, 0.0, 0.0))
+    assert held([level], (1.5, 0, 0.35), (1.5, 0, 0.9), (-1.5, 0, 0.4), ground=Ground(heights, (-2.0, -2.0), 4.0)) == [False, True, True]
+
+
+def test_a_parked_car_stays_where_another_passed_through_its_box():
+    """Annotators give a car that parks a new name at times."""
+    moving = car([0, 700_000], (-10.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    parked = replace(car([800_000], (0.0, 0.0, 0.0)), moving=False)
+    assert held([moving, parked], (-8, 0, 1), (0, 0, 1), (0, 0.9, 1), (1.9, 0, 1.5)) == [True, False, False, False]
+
+
+def test_what_lidar_saw_standing_there_at_another_time_stays():
+    track = car([0, 700_000], (-10.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    side = np.array([[x, -0.7, 0.9] for x in np.arange(-1.5, 1.5, 0.05)])
+
+    def seen(sweeps):
+        return np.tile(side, (sweeps, 1)), np.repeat(np.arange(sweeps), len(side))
+
+    asked = [(0, -0.7, 0.6), (0, -0.7, 1.2), (0, -0.7 + CELL, 1), (0, 0.5, 1), (-8, -0.7, 1)]
+    assert held([track], *asked, static=seen(STOOD)) == [False, False, False, True, True]
+    assert held([track], *asked, static=seen(STOOD - 1)) == [True] * 5, "something passed"
+    road = np.tile([[0.0, 0.0, 0.05]], (50, 1)), np.arange(50)
+    assert held([track], (0, 0, 1), static=road) == [True]
