@@ -33,13 +33,14 @@ from scenes.ground import Ground
 from scenes.poses import interpolate, inverse
 from scenes.trajectory import Trajectory
 
-SEED_PART = 0.5
-"""Of the splat budget that lidar may take: the rest grows where pictures ask for it."""
+SEED_PART = 0.3
+"""Of the splat budget that lidar may take: the rest grows where pictures ask for it. With half of it five cameras of drive 002 lose 0.2 dB
+in front, and more is open aside."""
 
-BEYOND_PART = 0.1
+BEYOND_PART = 0.06
 """Of the splat budget that what pictures show beyond lidar may take besides: twice as much brought KITTI 0009 nothing."""
 
-ACTORS_PART, MOST_OF_ONE = 0.15, 3000
+ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
 SKY_HEIGHT = 256

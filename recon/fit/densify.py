@@ -104,6 +104,13 @@ def grow(
     return Splats(after, sizes, assembled(splats.reach, splats.reach[parents])), carried
 
 
+def kept(splats: Splats, carried: dict[str, torch.Tensor], which: torch.Tensor) -> tuple[Splats, dict[str, torch.Tensor]]:
+    """The splats of a mask `[N]`, and what each of them carries with it."""
+    fields = {k: v.detach()[which] for k, v in splats.fields.items()}
+    sizes = torch.bincount(splats.group_of()[which], minlength=len(splats.sizes)).tolist()
+    return Splats(fields, sizes, splats.reach[which]), {k: t[which] for k, t in carried.items()}
+
+
 def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -> torch.Tensor:
     """Mask of splats that stand in their actor's box; the background has none."""
     half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)

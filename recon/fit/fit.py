@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, grow
+from recon.fit.densify import Growth, grow, kept
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
@@ -263,8 +263,8 @@ class Fit:
 
     @torch.no_grad()
     def _guess(self) -> None:
-        """Give what pictures hardly show its neighbours' colours, to keep, once what faded or went astray since the last growth is gone."""
-        self._renew(0)
+        """Give what pictures hardly show its neighbours' colours, to keep, once what went astray since the last growth is gone."""
+        self._renew(*kept(self.splats, self.descent.tensors(), ~self.swept.holds(self.splats)))
         part = torch.zeros_like(self.splats.reach)
         for view in self.training:
             camera = self.motion.camera(view).resized(*self._size(4))
@@ -328,13 +328,13 @@ class Fit:
     def _grow(self) -> None:
         """Split where most is wrong and pictures pull, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
-        self._renew(self.config.budget, left)
-
-    def _renew(self, budget: int, rounds_left: int = 1) -> None:
-        """One round of `grow`; with no budget, splats are dropped and none is split."""
         carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
-        self.splats, carried = grow(self.splats, carried, self.growth, budget, rounds_left, self.motion.boxes, astray)
-        self.growth, self.descent, self.guessed = Growth.none(len(self.splats), self.device), Descent(**carried), None
+        self._renew(*grow(self.splats, carried, self.growth, self.config.budget, left, self.motion.boxes, astray))
+
+    def _renew(self, splats: Splats, carried: dict[str, torch.Tensor]) -> None:
+        """Go on with other splats, and what each carries with it."""
+        self.splats, self.descent = splats, Descent(**carried)
+        self.growth, self.guessed = Growth.none(len(splats), self.device), None
 
     # ---- checkpoints
 

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.fit.densify import Growth, grow
+from recon.fit.densify import Growth, grow, kept
 from recon.fit.model import Splats
 from scenes.gaussians import Gaussians
 
@@ -49,14 +49,22 @@ def test_groups_stay_apart_when_splats_are_added_and_dropped():
     assert (torch.sigmoid(after.fields["logits"]) > 0.02).all() and len(after) == 120
 
 
-def test_what_is_astray_goes_and_is_not_split_and_without_a_budget_nothing_is():
+def test_what_is_astray_goes_and_is_not_split():
     s = splats()
     astray = torch.arange(len(s)) % 3 == 0
     s.fields["sh"] = astray.float()[:, None, None].expand(-1, 4, 3).clone()
     after, _ = grow(s, {}, as_wrong_as(1 + 9 * astray.float()), 100, 1, BOXES, astray)
     assert len(after) == 100 and not after.fields["sh"].any()
-    after, carried = grow(s, {"mine": torch.arange(len(s))}, as_wrong_as(torch.ones(len(s))), 0, 1, BOXES, astray)
-    assert torch.equal(carried["mine"], (~astray).nonzero()[:, 0]) and torch.equal(after.fields["means"], s.fields["means"][~astray])
+
+
+def test_of_what_is_kept_everything_is():
+    s = splats()
+    s.fields["logits"][::7] = -9
+    which = torch.arange(len(s)) % 3 > 0
+    after, carried = kept(s, {"mine": torch.arange(len(s))}, which)
+    mine = which.nonzero()[:, 0]
+    assert torch.equal(carried["mine"], mine) and torch.equal(after.group_of(), s.group_of()[mine])
+    assert all(torch.equal(after.fields[k], s.fields[k][mine]) for k in s.fields) and torch.equal(after.reach, s.reach[mine])
 
 
 def test_splats_of_an_actor_that_leave_its_box_are_dropped_and_the_background_is_free():
