@@ -43,11 +43,11 @@ def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
 def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequence[float] = SHIFTS) -> list[dict]:
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
-    depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees, d being the expected depth;
-    points: how many those are. movers_error: the same of points in moving boxes, where these are at the picture's moment. holes: share of
-    pixels below the horizon with alpha under 0.9; holes_above: the same above it, where from the recorded path no sky is ever seen (None
-    where it is seen everywhere): between a tree and the house behind it, and through windows. flicker: mean absolute difference to the
-    previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
+    depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees past these and what moves, d
+    being the expected depth; points: how many those are. movers_error: the same of points in moving boxes, where these are at the picture's
+    moment. holes: share of pixels below the horizon with alpha under 0.9; holes_above: the same above it, where from the recorded path no
+    sky is ever seen (None where it is seen everywhere): between a tree and the house behind it, and through windows. flicker: mean absolute
+    difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
     splits = [(s, split_points(log, [s], movers)) for s in sweeps]

@@ -92,11 +92,11 @@ def grow(
     fields["means"] = fields["means"].index_add(0, parents, offset)
     fields["log_scales"] = fields["log_scales"].index_copy(0, parents, smaller)
 
-    kept = keep.nonzero()[:, 0]
-    order = torch.argsort(torch.cat([group[kept], group[parents]]), stable=True)
+    old_ones = keep.nonzero()[:, 0]
+    order = torch.argsort(torch.cat([group[old_ones], group[parents]]), stable=True)
 
     def assembled(old: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
-        return torch.cat([old[kept], new])[order]
+        return torch.cat([old[old_ones], new])[order]
 
     after = {k: assembled(fields[k], children[k]) for k in FIELDS}
     sizes = torch.bincount(assembled(group, group[parents]), minlength=len(splats.sizes)).tolist()

@@ -24,8 +24,8 @@ ABOVE = 0.3
 """Metres above a box's base, and above the ground, which a long box crosses on a slope, up to which a road may reach."""
 
 STOOD = 8
-"""Sweeps whose points in a column say that something stood there at another time: a car that waited before it was found, or after it was
-lost. What only passes is seen there in fewer."""
+"""Sweeps, of twice as many in a row, whose points in a column say that something stood there at another time: a car that waited before it
+was found, or after it was lost. What only passes is seen there in fewer."""
 
 LAYERS = 2**20
 """Voxels along each axis that keys tell apart: 200 km."""
@@ -97,7 +97,8 @@ def _poses(track: Track, span_us: tuple[int, int]) -> np.ndarray:
 
 
 def _voxels(poses: np.ndarray, size: np.ndarray, more: float, above: float) -> np.ndarray:
-    """Numbers of the voxels in a box `[length, width, height]`, grown by `more` metres, from `above` its base on, at any of its poses."""
+    """Numbers of the voxels in a box `[length, width, height]`, grown by `more` metres, from `above` its base on, at any of its poses; its
+    sides are taken to be upright."""
     half, top = size[:2] / 2 + more, size[2] + more
     if (half <= 0).any() or top <= above:
         return np.zeros(0, np.int64)
@@ -122,10 +123,14 @@ def _voxels(poses: np.ndarray, size: np.ndarray, more: float, above: float) -> n
 
 
 def _stood(swept: np.ndarray, static: np.ndarray, sweep: np.ndarray) -> np.ndarray:
-    """Numbers of the columns, and of those beside them, in whose `swept` voxels points of `STOOD` sweeps lie."""
+    """Numbers of the columns, and of those beside them, in whose `swept` voxels points of `STOOD` sweeps soon after one another lie."""
+    if not len(swept):
+        return swept
     keys = _keys(*np.floor(static / CELL).astype(np.int64).T)
-    there = np.isin(keys, swept)
-    seen = np.unique(np.stack([keys[there] // LAYERS, sweep[there]]), axis=1)[0]
-    columns, sweeps = np.unique(seen, return_counts=True)
+    there = swept[np.searchsorted(swept, keys).clip(max=len(swept) - 1)] == keys  # points are many: a tenth of the time of `isin`
+    columns, sweeps = np.unique(np.stack([keys[there] // LAYERS, sweep[there]]), axis=1)
+    last = np.arange(STOOD - 1, max(len(columns), STOOD - 1))
+    first = last - (STOOD - 1)
+    stood = (columns[first] == columns[last]) & (sweeps[last] - sweeps[first] < 2 * STOOD)
     beside = [x * LAYERS + y for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    return np.unique(columns[sweeps >= STOOD][:, None] + beside)
+    return np.unique(columns[first][stood][:, None] + beside)

@@ -6,8 +6,9 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import _between, inside, split_points
+from recon.actors import Split, _between, inside, split_points
 from recon.log import Track
+from scenes.poses import translation, yaw
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +87,13 @@ def test_boxes_far_apart_in_time_tell_nothing_between_them(split):
     moment = int(mover.times_us[1]) + 50_000
     assert _between(mover, moment) and not _between(rare, moment)
     assert not _between(mover, int(mover.times_us[0]) - 1) and not _between(mover, int(mover.times_us[-1]) + 1)
+
+
+def test_what_moves_is_where_it_is_at_a_moment():
+    poses = torch.stack([translation(10.0 * i, 0.0, 0.0) @ yaw(0.5 * np.pi * i) for i in range(2)])
+    track = Track("veh_1", "car", True, np.array([4.0, 2.0, 1.6]), np.array([0, 700_000]), poses, np.zeros(2), ())
+    local, of = np.array([[1.0, 0.0, 0.5], [2.0, 0.0, 0.5]]), np.array([4, 7])
+    split = Split(np.zeros((0, 3)), np.zeros(0, np.int64), {"veh_1": (local, of)}, (track,))
+    np.testing.assert_allclose(split.moved(4, 0), [[1, 0, 0.5]], atol=1e-9)
+    np.testing.assert_allclose(split.moved(7, 700_000), [[10, 2, 0.5]], atol=1e-9)
+    assert split.moved(5, 0).shape == split.moved(4, 5_000_000).shape == (0, 3)

@@ -89,7 +89,7 @@ def test_a_bridge_between_two_roads_stays():
 def test_a_road_that_rises_through_a_level_box_stays():
     heights = torch.tensor([[-0.4, 0.4], [-0.4, 0.4]])
     level = car([0], (0.0, 0.0, 0.0))
-    assert held([level], (1.5, 0, 0.35), (1.5, 0, 0.9), (-1.5, 0, 0.4), ground=Ground(heights, (-2.0, -2.0), 4.0)) == [False, True, True]
+    assert held([level], (1.5, 0, 0.45), (1.5, 0, 0.9), (-1.5, 0, 0.4), ground=Ground(heights, (-2.0, -2.0), 4.0)) == [False, True, True]
 
 
 def test_a_parked_car_stays_where_another_passed_through_its_box():
@@ -109,5 +109,7 @@ def test_what_lidar_saw_standing_there_at_another_time_stays():
     asked = [(0, -0.7, 0.6), (0, -0.7, 1.2), (0, -0.7 + CELL, 1), (0, 0.5, 1), (-8, -0.7, 1)]
     assert held([track], *asked, static=seen(STOOD)) == [False, False, False, True, True]
     assert held([track], *asked, static=seen(STOOD - 1)) == [True] * 5, "something passed"
+    points, sweeps = seen(3 * STOOD)
+    assert held([track], *asked, static=(points, 3 * sweeps)) == [True] * 5, "now and then"
     road = np.tile([[0.0, 0.0, 0.05]], (50, 1)), np.arange(50)
     assert held([track], (0, 0, 1), static=road) == [True]
