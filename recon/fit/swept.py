@@ -127,7 +127,7 @@ def _stood(swept: np.ndarray, static: np.ndarray, sweep: np.ndarray) -> np.ndarr
     if not len(swept):
         return swept
     keys = _keys(*np.floor(static / CELL).astype(np.int64).T)
-    there = swept[np.searchsorted(swept, keys).clip(max=len(swept) - 1)] == keys  # points are many: a tenth of the time of `isin`
+    there = swept[np.searchsorted(swept, keys).clip(max=len(swept) - 1)] == keys  # unlike `isin`, this sorts no points
     columns, sweeps = np.unique(np.stack([keys[there] // LAYERS, sweep[there]]), axis=1)
     last = np.arange(STOOD - 1, max(len(columns), STOOD - 1))
     first = last - (STOOD - 1)
