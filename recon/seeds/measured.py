@@ -73,43 +73,36 @@ def grid_of(camera: Camera) -> Camera:
 def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split, movers: list[Track]) -> Measured:
     """What the sweep nearest to each training view measured of what stands still, and no mover hides; split: the sweeps' points."""
     measured = {}
-    for sweep, views in _soon(frames, sweeps):
-        static = split.static[split.static_sweep == sweep.index]
-        for view, camera in _grids(log, frames, views):
-            measured[view.camera, view.index] = as_known(nearest_points(static, camera, nearest_box(camera, movers)))
+    for _, static, view, camera in _soon(log, frames, sweeps, split):
+        measured[view.camera, view.index] = as_known(nearest_points(static, camera, nearest_box(camera, movers)))
     return Measured(measured, LIDAR)
 
 
 def by_lidar_of_movers(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> Measured:
     """What the sweep nearest to each training view measured of what moves, where it is at the view's moment and nothing hides it."""
     measured = {}
-    for sweep, views in _soon(frames, sweeps):
-        static = split.static[split.static_sweep == sweep.index]
-        for view, camera in _grids(log, frames, views):
-            moving = split.moved(sweep.index, view.time_us)
-            if not len(moving):
-                continue
-            nothing = np.full((camera.height, camera.width), np.inf)
-            depth, first = (nearest_points(p, camera, nothing) for p in (moving, np.concatenate([moving, static])))
-            measured[view.camera, view.index] = as_known(np.where(depth < HIDING * first, depth, np.nan))
+    for sweep, static, view, camera in _soon(log, frames, sweeps, split):
+        moving = split.moved(sweep.index, view.time_us)
+        if not len(moving):
+            continue
+        nothing = np.full((camera.height, camera.width), np.inf)
+        depth, first = (nearest_points(p, camera, nothing) for p in (moving, np.concatenate([moving, static])))
+        measured[view.camera, view.index] = as_known(np.where(depth < HIDING * first, depth, np.nan))
     return Measured(measured, LIDAR)
 
 
-def _soon(frames: Frames, sweeps: Sequence[Sweep]) -> Iterator[tuple[Sweep, list[View]]]:
-    """Sweeps with the training views that none is nearer to."""
+def _soon(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> Iterator[tuple[Sweep, np.ndarray, View, Camera]]:
+    """Training views and their cameras on the grid, each with the sweep nearest to it, if soon enough, and that one's static points."""
     times = np.array([s.time_us for s in sweeps])
     near: dict[int, list[View]] = {}
     for view in frames.training() if len(times) else []:
         k = int(np.abs(times - view.time_us).argmin())
         if abs(int(times[k]) - view.time_us) <= SOON_US:
             near.setdefault(k, []).append(view)
-    yield from ((sweeps[k], views) for k, views in near.items())
-
-
-def _grids(log: Log, frames: Frames, views: list[View]) -> Iterator[tuple[View, Camera]]:
-    """Views and their cameras on the grid."""
-    for view in views:
-        yield view, grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
+    for k, views in near.items():
+        static = split.static[split.static_sweep == sweeps[k].index]
+        for view in views:
+            yield sweeps[k], static, view, grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
 
 
 def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np.ndarray:
