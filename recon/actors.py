@@ -62,56 +62,49 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     """Sort the points of `sweeps` into static ones and those of the moving `tracks`.
 
     A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the
-    points of that moment. So each box's time becomes the median time of the points inside it, where there are enough.
-    In sweeps between those that boxes were drawn in, an object is where it must have been when its points were taken.
+    points of that moment. So each box's time becomes the median time of the points inside it, where there are enough. By that path
+    each point is compared with where the object was when the point was taken: a second lidar passes it at another moment, and in
+    sweeps between those that boxes were drawn in there is no box.
     """
-    rest = []
-    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
+    points = []
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
-
-    def taken(sweep: Sweep, track: Track, which: np.ndarray, local: np.ndarray, keep: np.ndarray) -> np.ndarray:
-        """Which of the points `local` in a track's frame are its own; those around it, of the sweep's `which`, are no longer kept."""
-        keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
-        own = inside(local, track.size, MARGIN, below=-0.08)  # the floor is left out: those are points of the road
-        if own.any():
-            found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
-        return own
-
     for sweep in sweeps:
-        points = sweep.read()
-        keep = np.ones(len(points.xyz), dtype=bool)
-        near = _Near(points.xyz)
+        read = sweep.read()
+        near = _Near(read.xyz)
         for track in tracks:
             at = stamps[track.name].get(sweep.time_us)
             if at is None:
                 continue
-            which, local = near.box(track, track.world_from_box[at])
-            own = taken(sweep, track, which, local, keep)
-            sensor = points.sensor[which] == track.sensor[at]
-            timed = own & sensor if (own & sensor).sum() >= FEW else own
-            if timed.sum() >= FEW:
-                scanned[track.name][at] = np.median(points.times_us[which][timed])
+            which = near.of(track, track.world_from_box[at])
+            own = which[_own(_local(near.xyz[which], track.world_from_box[at]), track)]
+            sensor = own[read.sensor[own] == track.sensor[at]]
+            timed = sensor if len(sensor) >= FEW else own
+            if len(timed) >= FEW:
+                scanned[track.name][at] = np.median(read.times_us[timed])
                 offsets.append(scanned[track.name][at] - sweep.time_us)
-        rest.append((points.xyz[keep], points.times_us[keep]))
+        points.append((near, read.times_us))
     usual = float(np.median(offsets)) if offsets else 0.0
     corrected = tuple(_retimed(t, scanned[t.name], usual) for t in tracks)
+
     static = []
-    for sweep, (xyz, times) in zip(sweeps, rest, strict=True):
-        between = [t for t in corrected if sweep.time_us not in stamps[t.name] and _between(t, sweep.time_us)]
-        if not between:
-            static.append(xyz)
-            continue
-        keep, near = np.ones(len(xyz), dtype=bool), _Near(xyz)
-        for track in between:
+    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
+    for sweep, (near, times) in zip(sweeps, points, strict=True):
+        keep = np.ones(len(times), dtype=bool)
+        for track in corrected:
+            if sweep.time_us not in stamps[track.name] and not _between(track, sweep.time_us):
+                continue
             path = track.trajectory()
-            which, local = near.box(track, path.at(sweep.time_us), REACH)
-            around = inside(local, track.size, REACH, below=-0.08)
-            if around.sum() >= FEW:  # it moved in the time from its points to the stamp
-                which, local = near.box(track, path.near(int(np.median(times[which][around]))))
-            taken(sweep, track, which, local, keep)
-        static.append(xyz[keep])
+            which = near.of(track, path.near(sweep.time_us), REACH)
+            if not len(which):
+                continue
+            taken = torch.from_numpy(times[which])
+            local = _local(near.xyz[which], path.near_each(taken))
+            keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
+            if (own := _own(local, track) & path.covers_each(taken).numpy()).any():
+                found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
+        static.append(near.xyz[keep])
     return Split(
         np.concatenate(static) if static else np.zeros((0, 3)),
         np.repeat([s.index for s in sweeps], [len(xyz) for xyz in static]) if static else np.zeros(0, np.int64),
@@ -126,12 +119,21 @@ class _Near:
     def __init__(self, xyz: np.ndarray):
         self.xyz, (self.x, self.y) = xyz, np.ascontiguousarray(xyz[:, :2].T)
 
-    def box(self, track: Track, pose: torch.Tensor, more: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the points that may be in a track's box at `pose`, or so many metres around it, and where they are in its frame."""
+    def of(self, track: Track, pose: torch.Tensor, more: float = 0.0) -> np.ndarray:
+        """Indices of the points that may be in a track's box at `pose`, or so many metres around it."""
         reach = track.size.max() + 1 + more
-        which = np.flatnonzero((np.abs(self.x - float(pose[0, 3])) < reach) & (np.abs(self.y - float(pose[1, 3])) < reach))
-        back = inverse(pose).numpy()
-        return which, self.xyz[which] @ back[:3, :3].T + back[:3, 3]
+        return np.flatnonzero((np.abs(self.x - float(pose[0, 3])) < reach) & (np.abs(self.y - float(pose[1, 3])) < reach))
+
+
+def _local(xyz: np.ndarray, world_from_box: torch.Tensor) -> np.ndarray:
+    """World points `[N, 3]` in the frame of a box at one pose, or each at its own `[N, 4, 4]`."""
+    back = inverse(world_from_box).numpy()
+    return (back[..., :3, :3] @ xyz[:, :, None])[..., 0] + back[..., :3, 3]
+
+
+def _own(local: np.ndarray, track: Track) -> np.ndarray:
+    """Mask of points in a track's frame that are its own: the floor is left out, those are points of the road."""
+    return inside(local, track.size, MARGIN, below=-0.08)
 
 
 def _between(track: Track, time_us: int) -> bool:

@@ -52,7 +52,7 @@ def write_drive(folder: Path, street, width=96, height=54) -> Path:
     cuboids = folder / "annotations" / "cuboids"
     cuboids.mkdir(parents=True)
     for i, stamp in enumerate(stamps.tolist()):
-        scanned = min(max(stamp + SCANNED_US, START_US), START_US + STEP_US * 8)
+        scanned = stamp + SCANNED_US
         pose = mover.trajectory.at(scanned)
         if i != ABSENT:
             _sweep(lidar / f"{i:02d}.pkl.gz", street, mover, pose, stamp, scanned, generator)

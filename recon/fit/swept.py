@@ -83,8 +83,11 @@ def _union(parts: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _poses(track: Track, span_us: tuple[int, int]) -> np.ndarray:
-    """World from box `[P, 4, 4]`, on its way through a span of time, less than a cell apart; not where it was not seen for long."""
-    steps = np.ceil(track.world_from_box[:, :2, 3].diff(dim=0).norm(dim=1).numpy() / CELL).astype(int)
+    """World from box `[P, 4, 4]`, on its way through a span of time, its ends a cell apart at most; not where it was not seen for long."""
+    base, ahead = track.world_from_box[:, :3, 3], track.world_from_box[:, :3, 0] * float(track.size[0]) / 2
+    # what turns on the spot moves its ends
+    moved = torch.stack([base - ahead, base + ahead]).diff(dim=1).norm(dim=2).amax(0)
+    steps = np.ceil(moved.numpy() / CELL).astype(int)
     gaps = np.diff(track.times_us)
     between = [
         np.linspace(time, time + gap, step, endpoint=False)[1:]
@@ -104,22 +107,23 @@ def _voxels(poses: np.ndarray, size: np.ndarray, more: float, above: float) -> n
         return np.zeros(0, np.int64)
     reach = np.arange(-(around := int(np.ceil(np.hypot(*half) / CELL))), around + 1)
     columns = np.stack(np.meshgrid(reach, reach, indexing="ij"), -1).reshape(-1, 2)
+    fewest = int((top - above) / CELL) - 1
     runs = []
     for some in np.split(poses, range(POSES, len(poses), POSES)):
         base, normal = some[:, :3, 3], some[:, :3, 2]
         cells = np.floor(base[:, None, :2] / CELL).astype(np.int64) + columns
         away = (cells + 0.5) * CELL - base[:, None, :2]
-        rise = -np.einsum("pcx,px->pc", away, normal[:, :2]) / normal[:, 2:]  # of the base's plane
-        local = np.einsum("pcx,pxl->pcl", away, some[:, :2, :2]) + rise[..., None] * some[:, None, 2, :2]
+        rise = -(away @ normal[:, :2, None])[..., 0] / normal[:, 2:]  # of the base's plane
+        local = away @ some[:, :2, :2] + rise[..., None] * some[:, None, 2, :2]
         inside = (np.abs(local) <= half).all(-1)
         floor = (rise + base[:, None, 2])[inside] / CELL - 0.5
-        first, last = np.ceil(floor + above / CELL), np.floor(floor + top / CELL)
-        # traffic passes through every column a hundred times: each run of voxels once
-        runs.append(np.unique(np.column_stack([cells[inside], first.astype(np.int64), last.astype(np.int64)]), axis=0))
-    x, y, first, last = np.unique(np.concatenate([np.zeros((0, 4), np.int64), *runs]), axis=0).T
-    layers = np.arange((last - first).max(initial=-1) + 1)
-    z = first[:, None] + layers
-    return np.unique(_keys(x[:, None], y[:, None], z)[z <= last[:, None]])
+        first, last = np.ceil(floor + above / CELL).astype(np.int64), np.floor(floor + top / CELL).astype(np.int64)
+        # traffic passes through every column a hundred times: each run of voxels once, by its lowest, and whether it has one more
+        x, y = cells[inside].T
+        runs.append(np.unique(2 * _keys(x, y, first) + (last - first - fewest).clip(0, 1)))
+    lowest, longer = np.divmod(_union(runs), 2)
+    layers = np.arange(fewest + 2)
+    return np.unique((lowest[:, None] + layers)[layers <= fewest + longer[:, None]])
 
 
 def _stood(swept: np.ndarray, static: np.ndarray, sweep: np.ndarray) -> np.ndarray:

@@ -85,8 +85,8 @@ def by_lidar_of_movers(log: Log, frames: Frames, sweeps: Sequence[Sweep], split:
         moving = split.moved(sweep.index, view.time_us)
         if not len(moving):
             continue
-        nothing = np.full((camera.height, camera.width), np.inf)
-        depth, first = (nearest_points(p, camera, nothing) for p in (moving, np.concatenate([moving, static])))
+        unseen = nearest_box(camera, [t for t in split.tracks if t.name not in split.actors])
+        depth, first = (nearest_points(p, camera, unseen) for p in (moving, np.concatenate([moving, static])))
         measured[view.camera, view.index] = as_known(np.where(depth < HIDING * first, depth, np.nan))
     return Measured(measured, LIDAR)
 

@@ -10,13 +10,15 @@ import torch
 from PIL import Image
 
 from recon import open_log, reconstruct, stopped_early
+from recon.actors import split_points
 from recon.build import _span, begin, choose
-from recon.checkpoint import checkpoint_path
+from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.fit.config import FitConfig
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
-from recon.seeds.measured import Measured, mistake
+from recon.fit.swept import Swept
+from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers, mistake
 from recon.skies import cells
 from render import render_frame
 from render.album import references_of
@@ -197,12 +199,40 @@ def test_nothing_is_left_standing_where_something_drove(drive):
     middle = track.world_from_box[len(track.world_from_box) // 2, :3, 3].float() + torch.tensor([0, 0, 0.6 * float(track.size[2])])
     fit.splats.fields["means"][:20] = middle
     assert fit.swept.holds(fit.splats)[:20].all()
+    split = split_points(log, log.sweeps_within(span), [t for t in log.tracks if t.moving])
+    tracks = [*split.tracks, *(t for t in log.tracks if not t.moving)]
+    assert torch.equal(start.swept.keys, Swept.by(tracks, span, start.ground, split.static, split.static_sweep).keys)
     fit._grow()
     assert not fit.swept.holds(fit.splats).any()
     fit.splats.fields["means"][:20] = middle
-    count = len(fit.splats)
+    count, tensors = len(fit.splats), fit.descent.tensors()
+    squares, last = tensors["moments"][:, 1].uniform_().clone(), tensors["last"].random_(90).clone()
     fit._guess()
+    tensors = fit.descent.tensors()
+    assert torch.equal(tensors["moments"][:, 1], squares[20:]) and torch.equal(tensors["last"], last[20:])
+    assert fit.guessed.shape == (count - 20,)
     assert not fit.swept.holds(fit.splats).any() and len(fit.splats) == count - 20, "what came later, too, and nothing is split"
+
+
+def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, tmp_path):
+    log = open_log(drive)
+    names, span = choose(log)
+    start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    sweeps, movers = log.sweeps_within(span), [t for t in log.tracks if t.moving]
+    split = split_points(log, sweeps, movers)
+    still = by_lidar(log, fit.frames, sweeps, split, movers).views
+    moving = by_lidar_of_movers(log, fit.frames, sweeps, split).views
+    depths = start.measured[0].views
+    for which, depth in still.items():
+        assert torch.equal(depths[which][depth.isfinite()], depth[depth.isfinite()])
+    more = {which: depth.isfinite() & still[which].isnan() for which, depth in moving.items()}
+    assert sum(int(m.sum()) for m in more.values()) > 30
+    assert all(torch.equal(depths[which][m], moving[which][m]) for which, m in more.items())
+
+    save_checkpoint(tmp_path / "scene.fit", {}, start, fit.tensors())
+    kept = load_checkpoint(tmp_path / "scene.fit", {})[0]
+    assert len(kept.swept.keys) and torch.equal(kept.swept.keys, start.swept.keys)
+    assert all(torch.equal(m.nan_to_num(), kept.measured[0].views[w].nan_to_num()) for w, m in depths.items())
 
 
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):

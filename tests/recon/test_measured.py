@@ -57,11 +57,11 @@ def test_lidar_measures_what_moves_where_it_is_when_the_picture_is_taken():
     frames = load_frames(log, ["front"], ALL, SIZE, 0)
     poses = torch.stack([translation(6.5 - 0.2, 0.0, 0.0), translation(6.5, 0.0, 0.0), translation(9.3, 0.0, 0.0)])
     car = Track("veh_1", "car", True, np.array([1.0, 2.0, 3.0]), np.array([0, 20_000, 300_000]), poses, np.zeros(3), ())
-    back, post = wall(6.0, -1, 1), wall(4.0, -0.2, 0.2)
+    back, post, cars = wall(6.0, -1, 1), wall(4.0, -0.2, 0.2), [car]
 
     def seen(*parts):
         sweep = sweep_of(20_000, *parts)
-        return by_lidar_of_movers(log, frames, [sweep], split_points(log, [sweep], [car])).views
+        return by_lidar_of_movers(log, frames, [sweep], split_points(log, [sweep], cars)).views
 
     measured = seen(back, wall(12.0, -3, 3))
     depth = measured[0, 0].float().numpy()  # at 10 m/s it was 20 cm nearer 20 ms before
@@ -72,6 +72,9 @@ def test_lidar_measures_what_moves_where_it_is_when_the_picture_is_taken():
     hidden = known & ~np.isfinite(seen(back, post)[0, 0].float().numpy())
     assert hidden.sum() > 20 and (np.nonzero(hidden.any(0))[0] - known.shape[1] / 2 < 20).all(), "behind the post"
     assert seen(wall(12.0, -3, 3)) == {}
+    cars.append(replace(car, name="veh_2", world_from_box=translation(3.0, 0.0, 0.0).expand(3, 4, 4)))
+    depth = seen(back, wall(12.0, -3, 3))[0, 0]
+    assert not depth.isfinite().any(), "behind a car that no lidar struck"
 
 
 def test_depths_are_completed_where_there_are_none():

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from recon.fit.model import Splats
-from recon.fit.swept import ABOVE, CELL, CLOSE, STOOD, Swept
+from recon.fit.swept import ABOVE, CELL, CLOSE, POSES, STOOD, Swept
 from recon.log import Track
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
@@ -55,6 +55,22 @@ def test_as_much_as_the_box_holds_however_it_stands():
     corner = CELL * 3**0.5 / 2
     assert found[within > corner].all() and not found[within < -corner].any()
     assert abs(found.mean() / (within > 0).mean() - 1) < 0.1
+
+
+def test_a_box_that_leans_or_turns_on_the_spot():
+    lean = 0.2
+    up = torch.tensor([[np.cos(lean), 0, -np.sin(lean), 0], [0, 1, 0, 0], [np.sin(lean), 0, np.cos(lean), 0], [0, 0, 0, 1.0]])
+    rises = replace(car([0], (0.0, 0.0, 0.0)), world_from_box=up[None].double())
+    assert held([rises], (1.4, 0, 0.45), (1.4, 0, 0.9), (-1.4, 0, 0.45), (-1.4, 0, 1.3)) == [False, True, True, False]
+    turns = replace(car([0, 500_000], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), world_from_box=torch.stack([yaw(0.0), yaw(1.4)]))
+    around = [(1.6 * np.cos(a), 1.6 * np.sin(a), 0.8) for a in np.linspace(0, 1.4, 40)]
+    assert all(held([turns], *around)) and held([turns], (1.6 * np.cos(-0.9), 1.6 * np.sin(-0.9), 0.8)) == [False]
+
+
+def test_a_long_way_is_swept_as_its_parts_are():
+    long_way = [(0.15 * i, 3 * np.sin(i / 99), 0.001 * i) for i in range(3 * POSES)]
+    found = held([car((np.arange(len(long_way)) * 10_000).tolist(), *long_way)], *((x, y, z + 0.8) for x, y, z in long_way))
+    assert len(found) == 3 * POSES and all(found)
 
 
 def test_where_it_was_not_seen_for_long_nobody_knows():
