@@ -254,10 +254,8 @@ def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) ->
 
 
 def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
-    actors = [Knots(t.trajectory()) for t in start.tracks]
-    boxes = [t.size for t in start.tracks]
     trained = torch.tensor([v.time_us for v in frames.of(0)])
-    motion = Motion(frames, start.rig, Knots(start.ego, trained), actors, boxes)
+    motion = Motion(frames, start.rig, Knots(start.ego, trained), start.tracks)
     limbed = [(i + 1, t) for i, t in enumerate(start.tracks) if t.label in LIMBED and "limbs" in config.refine]
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]

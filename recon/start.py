@@ -10,8 +10,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.actors import split_points
-from recon.fit.densify import LARGEST
 from recon.fit.model import Splats, draw
+from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.frames import Frames
 from recon.ground import estimate_ground
@@ -19,11 +19,10 @@ from recon.log import Log, Track
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
-from recon.seeds.fill import unexplained
+from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
-from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, splats_from, thin
 from recon.seeds.standing import by_all_sweeps
-from recon.seeds.sweep import companions
 from recon.seeds.triangulate import triangulated
 from recon.skies import SkyPicture, like_sky
 from recon.view import View
@@ -44,13 +43,6 @@ ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
 SKY_HEIGHT = 256
-FILL_EVERY, FILL_VIEWS = 5, (6, 30)
-"""Every how many views of a camera one is searched for what lidar does not explain, and how many at least and at most: where the sky stands
-in for a sign that no seed is near, no splat is blamed, and none grows. Six views of drive 002's front left camera missed one on a roof."""
-
-NEAREST = 3.0
-"""Metres from the path within which nothing is seen sharper: the long lens looks ahead, and only wide ones see what is beside the car."""
-
 WIDEST_SEED = 0.012
 """Of its reach: a seed's width at most, 12 pixels."""
 
@@ -115,9 +107,7 @@ def prepare(
         measured = [everything, by_all_sweeps(log, frames, split, movers).without(agreed), agreed]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
-    sharpest = 1000 / max(r.lens.focal()[0] for r in rig.values())
-    reach = sharpest * np.maximum(path.query(cloud.xyz)[0], NEAREST)
-    background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach)
+    background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values()))
     background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
 
     groups, reaches, tracks = [], [], []
@@ -130,20 +120,27 @@ def prepare(
             tracks.append(track)
             middle = track.world_from_box[:, :3, 3].numpy()
             near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)
-            reaches.append(torch.full((len(made),), sharpest * near))
+            reaches.append(torch.full((len(made),), spanned(rig.values()) * near))
 
     standing = [t for t in log.tracks if not t.moving]
     swept = Swept.by([*split.tracks, *standing], span_us, ground, split.static, split.static_sweep)
 
     report("filling what lidar missed")
     filled, sky = _fill(log, frames, background, groups, tracks, gains, sh_count, ground)
-    reach = torch.from_numpy(sharpest * np.maximum(path.query(filled.means.numpy())[0], NEAREST)).float()
-    # what is seeded wider than the cameras can tell (ground that none of them saw) must not be cut down to leave gaps
-    reach = torch.maximum(reach, filled.log_scales.exp().amax(1) / LARGEST)
     if exposures is None:
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    return Start(Splats.of([filled, *groups], [reach, *reaches]), tracks, sky, exposures, ego, ground, rig, tuple(measured), swept)
+    return Start(
+        Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *reaches]),
+        tracks,
+        sky,
+        exposures,
+        ego,
+        ground,
+        rig,
+        tuple(measured),
+        swept,
+    )
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:
@@ -223,15 +220,9 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
     world = torch.eye(4, dtype=torch.float64)
     for c, name in enumerate(frames.names):
         views = frames.of(c)
-        cameras = {v.index: log.camera(name).camera(v.index, frames.width, frames.height) for v in views}
-        path = torch.stack([cameras[v.index].world_from_cam[:3, 3] for v in views])
-        places = np.concatenate([[0.0], path.diff(dim=0).norm(dim=1).cumsum(0).numpy()])
-        for view in spread(views, int(np.clip(len(views) // FILL_EVERY, *FILL_VIEWS))):
-            camera = cameras[view.index]
+        search = Search(views, [log.camera(name).camera(v.index, frames.width, frames.height) for v in views], gains[c], ground, tracks)
+        for view, camera, hidden in search:
             placed = [Placed(background, world)]
-            hidden = np.isfinite(nearest_box(camera, tracks))
-            if view.ego is not None:
-                hidden |= view.ego.numpy()
             for track, splats in zip(tracks, actors, strict=True):
                 trajectory = track.trajectory()
                 if trajectory.covers(view.time_us):
@@ -243,11 +234,5 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
             weight = 1.0 if view.gain is None else float(view.gain.mean()) ** -4
             picture.add(view.evenly(), sky, camera, gains[c], weight)
             sky = like_sky(view.image.numpy(), sky) & ~covered
-            floor = float(ground.height(camera.world_from_cam[:2, 3]))
-            depth = np.where(hidden & (alpha < 0.5), np.inf, depth)
-            others = [(v, cameras[v.index]) for v in companions(view, views, places)]
-            cloud, width = unexplained(view, camera, np.where(hidden, 1.0, alpha), depth, sky, gains[c], floor, others)
-            if len(cloud.xyz):
-                more = splats_from(cloud, 3 * width, sh_count, width)  # as wide as their blocks, to close the holes
-                background = Gaussians.cat([background, more])
+            background = Gaussians.cat([background, search.found(view, camera, hidden, alpha, depth, sky, sh_count)])
     return background, picture.picture()

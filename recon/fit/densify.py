@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from recon.fit.model import FIELDS, Splats
+from scenes.gaussians import Gaussians
 
 FAINT = 0.02
 """Opacity under which a splat is dropped."""
@@ -109,6 +110,21 @@ def kept(splats: Splats, carried: dict[str, torch.Tensor], which: torch.Tensor) 
     fields = {k: v.detach()[which] for k, v in splats.fields.items()}
     sizes = torch.bincount(splats.group_of()[which], minlength=len(splats.sizes)).tolist()
     return Splats(fields, sizes, splats.reach[which]), {k: t[which] for k, t in carried.items()}
+
+
+def joined(
+    splats: Splats, carried: dict[str, torch.Tensor], more: Gaussians, reach: torch.Tensor
+) -> tuple[Splats, dict[str, torch.Tensor]]:
+    """The splats and `more` of the background, of `reach` `[M]`, behind those that it has; what the new ones carry with them is zeros."""
+    end, fields = splats.sizes[0], Splats.of([more], [reach]).fields
+
+    def inserted(old: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
+        return torch.cat([old[:end], new.to(old), old[end:]])
+
+    after = {k: inserted(v.detach(), fields[k]) for k, v in splats.fields.items()}
+    sizes = [end + len(more), *splats.sizes[1:]]
+    carried = {k: inserted(t, t.new_zeros(len(more), *t.shape[1:])) for k, t in carried.items()}
+    return Splats(after, sizes, inserted(splats.reach, reach)), carried
 
 
 def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -> torch.Tensor:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy import ndimage
 
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, grow, kept
+from recon.fit.densify import Growth, grow, joined, kept
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
@@ -20,13 +22,17 @@ from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
 from recon.fit.motion import Moment, Motion
 from recon.fit.openings import Openings
+from recon.fit.reach import reach_of
 from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
+from recon.seeds.fill import STEP as BLOCK
+from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
+from recon.skies import like_sky
 from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
@@ -48,6 +54,10 @@ BLAME_EVERY = 3
 
 GUESSED_FROM = 0.8
 """Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
+
+REFILLED_AT, WRONG = (0.2, 0.4), 0.08
+"""Parts of the fit at which it is looked where the sky stands in for what pictures show, and by how much its colours are wrong there at
+least."""
 
 CLIPPED = 0.99
 """Colours of pictures from which on they may be clipped."""
@@ -97,7 +107,8 @@ class Fit:
         # draws that each view is behind: from anywhere, or views of equal weight would come all at once
         self.due = torch.rand(len(self.training), generator=self.generator)
         self.openings = Openings(frames, motion, self.device)
-        self.flat_ground, self.swept = FlatGround(ground, self.device), swept.to(self.device)
+        self.ground, self.swept = ground, swept.to(self.device)
+        self.flat_ground = FlatGround(ground, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self.guessed: torch.Tensor | None = None
@@ -133,6 +144,8 @@ class Fit:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
             self._grow()
+        if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
+            self._refill()
         if self.guessed is None and self.progress >= GUESSED_FROM:
             self._guess()
         view = self._next()
@@ -201,10 +214,14 @@ class Fit:
     @torch.no_grad()
     def picture(self, view: View) -> torch.Tensor:
         """A view `[H, W, 3]`, held out or not, as the splats show it by now; the fit goes on as if nobody had looked."""
+        return self._drawn(view, "rgb", "alpha")["rgb"]
+
+    def _drawn(self, view: View, *outputs: str) -> dict[str, torch.Tensor]:
+        """Outputs of a view at full size."""
         camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
-        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky))["rgb"]
+        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), outputs=outputs)
 
     def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
         """Indices of the splats that a picture of a view, and one from aside, may show."""
@@ -330,6 +347,24 @@ class Fit:
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
         self._renew(*grow(self.splats, carried, self.growth, self.config.budget, left, self.motion.boxes, astray))
+
+    @torch.no_grad()
+    def _refill(self) -> None:
+        """Add splats where the sky stands in for what pictures show: errors there blame no splat, so that none would grow."""
+        for c in range(len(self.frames.names)):
+            views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
+            cameras = [self.motion.camera(v).resized(self.frames.width, self.frames.height) for v in views]
+            search = Search(views, cameras, gain, self.ground, self.motion.tracks)
+            for view, camera, hidden in search:
+                drawn = self._drawn(view.to(self.device), "rgb", "alpha", "depth")
+                rgb, alpha, depth = (drawn[name].cpu().numpy() for name in ("rgb", "alpha", "depth"))
+                off = np.abs(rgb - view.image.numpy() / np.float32(255)).mean(-1)
+                right = ndimage.uniform_filter(off, BLOCK) < WRONG
+                right |= like_sky(view.image.numpy(), self.frames.sky_of(view))
+                more = search.found(view, camera, hidden, alpha, depth, right, self.splats.fields["sh"].shape[1])
+                if len(more):
+                    reach = reach_of(more, self.motion.path(), self.motion.rig).to(self.device)
+                    self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
 
     def _renew(self, splats: Splats, carried: dict[str, torch.Tensor]) -> None:
         """Go on with other splats, and what each carries with it."""

@@ -11,6 +11,7 @@ import torch
 from recon.fit.model import Knots, scaled, small_poses
 from recon.fit.shutter import shifts_of
 from recon.frames import Frames
+from recon.log import Track
 from recon.view import View
 from scenes.camera import Camera, RigCamera
 from scenes.gaussians import Placed
@@ -47,8 +48,10 @@ class Motion:
     than recorded it took its pictures.
     """
 
-    def __init__(self, frames: Frames, rig: dict[str, RigCamera], ego: Knots, actors: list[Knots], boxes: list[np.ndarray]):
-        self.rig, self.ego, self.actors, self.boxes = [rig[name] for name in frames.names], ego, actors, boxes
+    def __init__(self, frames: Frames, rig: dict[str, RigCamera], ego: Knots, tracks: Sequence[Track]):
+        self.rig, self.ego, self.tracks = [rig[name] for name in frames.names], ego, list(tracks)
+        self.actors, self.boxes = [Knots(t.trajectory()) for t in tracks], [t.size for t in tracks]
+        actors, boxes = self.actors, self.boxes
         self.extrinsics = torch.zeros(len(frames.names), 6)
         self.clocks = torch.zeros(len(frames.names))
         views = frames.views

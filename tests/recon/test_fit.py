@@ -14,6 +14,7 @@ from recon.actors import split_points
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.fit.config import FitConfig
+from recon.fit.densify import kept
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
@@ -233,6 +234,34 @@ def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, t
     kept = load_checkpoint(tmp_path / "scene.fit", {})[0]
     assert len(kept.swept.keys) and torch.equal(kept.swept.keys, start.swept.keys)
     assert all(torch.equal(m.nan_to_num(), kept.measured[0].views[w].nan_to_num()) for w, m in depths.items())
+
+
+def test_what_the_sky_stands_in_for_comes_back(drive):
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    for _ in range(12):
+        fit.step()
+    view = fit.training[3]
+    whole = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
+    above = (fit.splats.fields["means"][:, 2] > 1.0) & (fit.splats.group_of() == 0)
+    fit._renew(*kept(fit.splats, fit.descent.tensors(), ~above))
+    count, end = len(fit.splats), fit.splats.sizes[0]
+    rest = {k: t.clone() for k, t in (fit.splats.fields | fit.descent.tensors()).items()}
+    torn = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
+    lost = (whole > 0.9) & (torn < 0.1)
+    assert lost.sum() > 40
+    fit._refill()
+    new = len(fit.splats) - count
+    assert new > 5 and fit.splats.sizes[0] == end + new and len(fit.growth.errors) == len(fit.splats)
+    after = fit.splats.fields | fit.descent.tensors()
+    assert all(torch.equal(torch.cat([t[:end], t[end + new :]]), rest[k]) for k, t in after.items())
+    assert not fit.descent.moments[end : end + new].any()
+    found = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
+    assert (found[lost] > 0.5).float().mean() > 0.6
+    fit._refill()
+    assert len(fit.splats) < count + 1.5 * new, "what is there does not come again"
+    fit.step()
 
 
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):

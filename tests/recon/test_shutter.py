@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from randomized import gaussians
@@ -10,6 +11,7 @@ from recon.fit.model import Knots
 from recon.fit.motion import EGO, Motion
 from recon.fit.shutter import as_read
 from recon.frames import Frames
+from recon.log import Track
 from recon.report import read_out
 from recon.view import View
 from render import render_frame
@@ -65,8 +67,11 @@ def motion(readout_us=0):
     views = [View(0, i, t, torch.zeros(1, 1, 3), False, torch.zeros(1, 1, dtype=torch.bool)) for i, t in enumerate(times)]
     frames = Frames(["front_camera"], 96, 54, views)
     cameras = {"front_camera": replace(rig()["front_camera"], shutter="rows", readout_us=readout_us)}
-    actors = [Knots(a.trajectory) for a in scene.actors]
-    return scene, views, Motion(frames, cameras, Knots(scene.ego), actors, [scene.actors[0].asset.size.numpy()])
+    tracks = [
+        Track(a.track, "car", True, a.asset.size.numpy(), a.trajectory.times_us.numpy(), a.trajectory.world_from_body, np.zeros(0), ())
+        for a in scene.actors
+    ]
+    return scene, views, Motion(frames, cameras, Knots(scene.ego), tracks)
 
 
 def test_a_late_clock_stands_farther_along_the_path_and_so_do_the_actors_it_sees():

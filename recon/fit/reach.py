@@ -1,0 +1,35 @@
+"""How finely cameras see what is somewhere: what 1000 pixels of the sharpest span there, by which steps and limits of splats scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from recon.fit.densify import LARGEST
+from scenes.camera import RigCamera
+from scenes.gaussians import Gaussians
+from scenes.trajectory import Trajectory
+
+NEAREST = 3.0
+"""Metres from the path within which nothing is seen sharper: the long lens looks ahead, and only wide ones see what is beside the car."""
+
+
+def spanned(rig: Iterable[RigCamera]) -> float:
+    """Metres that 1000 pixels of the sharpest camera span a metre away."""
+    return 1000 / max(camera.lens.focal()[0] for camera in rig)
+
+
+def reach_at(xyz: np.ndarray, ego: Trajectory, rig: Iterable[RigCamera]) -> np.ndarray:
+    """Metres `[N]` that they span at world points `[N, 3]`, where the path comes nearest to each."""
+    away, _ = cKDTree(ego.world_from_body[:, :3, 3].numpy()).query(xyz)
+    return spanned(rig) * np.maximum(away, NEAREST)
+
+
+def reach_of(splats: Gaussians, ego: Trajectory, rig: Iterable[RigCamera]) -> torch.Tensor:
+    """The same float32 `[N]` of splats of the background, or as much more as suits those that are wider than cameras can tell: ground that
+    none of them saw must not be cut down to leave gaps."""
+    reach = torch.from_numpy(reach_at(splats.means.numpy(), ego, rig)).float()
+    return torch.maximum(reach, splats.log_scales.exp().amax(1) / LARGEST)
