@@ -64,9 +64,9 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     A lidar scans an object at some moment within the 100 ms of a sweep, not at the sweep's stamp; the annotated box fits the
     points of that moment. So each box's time becomes the median time of the points inside it, where there are enough. By that path
     each point is compared with where the object was when the point was taken: a second lidar passes it at another moment, and in
-    sweeps between those that boxes were drawn in there is no box.
+    sweeps between those that boxes were drawn in there is no box. Where there is one, it is the measure of its own moment.
     """
-    points = []
+    points: list[tuple[np.ndarray, np.ndarray]] = []
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
@@ -84,27 +84,33 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
             if len(timed) >= FEW:
                 scanned[track.name][at] = np.median(read.times_us[timed])
                 offsets.append(scanned[track.name][at] - sweep.time_us)
-        points.append((near, read.times_us))
+        points.append((read.xyz, read.times_us))
     usual = float(np.median(offsets)) if offsets else 0.0
-    corrected = tuple(_retimed(t, scanned[t.name], usual) for t in tracks)
+    retimed = [_retimed(t, scanned[t.name], usual) for t in tracks]
+    corrected = tuple(track for track, _ in retimed)
 
     static = []
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
-    for sweep, (near, times) in zip(sweeps, points, strict=True):
-        keep = np.ones(len(times), dtype=bool)
-        for track in corrected:
-            if sweep.time_us not in stamps[track.name] and not _between(track, sweep.time_us):
+    for sweep, (xyz, times) in zip(sweeps, points, strict=True):
+        keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
+        for track, smooth in retimed:
+            at = stamps[track.name].get(sweep.time_us)
+            if at is None and not _between(track, sweep.time_us):
                 continue
             path = track.trajectory()
             which = near.of(track, path.near(sweep.time_us), REACH)
             if not len(which):
                 continue
-            taken = torch.from_numpy(times[which])
-            local = _local(near.xyz[which], path.near_each(taken))
+            taken, of = np.unique(times[which], return_inverse=True)
+            if at is not None and scanned[track.name][at] != sweep.time_us:
+                # the path has this box at a smoother date than that of its points, which it was drawn around
+                taken = taken + round(smooth[at] - scanned[track.name][at])
+            moments = torch.from_numpy(taken)
+            local = _local(xyz[which], path.near_each(moments)[of])
             keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
-            if (own := _own(local, track) & path.covers_each(taken).numpy()).any():
+            if (own := _own(local, track) & path.covers_each(moments).numpy()[of]).any():
                 found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
-        static.append(near.xyz[keep])
+        static.append(xyz[keep])
     return Split(
         np.concatenate(static) if static else np.zeros((0, 3)),
         np.repeat([s.index for s in sweeps], [len(xyz) for xyz in static]) if static else np.zeros(0, np.int64),
@@ -142,8 +148,9 @@ def _between(track: Track, time_us: int) -> bool:
     return 0 < later < len(track.times_us) and track.times_us[later] - track.times_us[later - 1] <= APART_US
 
 
-def _retimed(track: Track, scanned: np.ndarray, usual: float) -> Track:
-    """The track at the times its boxes were scanned; boxes without points take the offset of their neighbours in time."""
+def _retimed(track: Track, scanned: np.ndarray, usual: float) -> tuple[Track, np.ndarray]:
+    """The track at the times its boxes were scanned, and these, int64 `[T]`, of all its boxes: those that would not come later than the
+    one before are left out. Boxes without points take the offset of their neighbours in time."""
     offset = scanned - track.times_us
     known = offset != 0
     places = np.arange(len(offset))
@@ -153,4 +160,4 @@ def _retimed(track: Track, scanned: np.ndarray, usual: float) -> Track:
     times = np.round(track.times_us + smooth).astype(np.int64)
     rising = np.concatenate([[True], np.diff(times) > 1000])
     poses = track.world_from_box[torch.from_numpy(rising)]
-    return replace(track, times_us=times[rising], world_from_box=poses, sensor=track.sensor[rising])
+    return replace(track, times_us=times[rising], world_from_box=poses, sensor=track.sensor[rising]), times

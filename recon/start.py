@@ -43,6 +43,7 @@ ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
 SKY_HEIGHT = 256
+
 WIDEST_SEED = 0.012
 """Of its reach: a seed's width at most, 12 pixels."""
 
@@ -130,17 +131,8 @@ def prepare(
     if exposures is None:
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    return Start(
-        Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *reaches]),
-        tracks,
-        sky,
-        exposures,
-        ego,
-        ground,
-        rig,
-        tuple(measured),
-        swept,
-    )
+    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *reaches])
+    return Start(splats, tracks, sky, exposures, ego, ground, rig, tuple(measured), swept)
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:

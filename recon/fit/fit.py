@@ -7,10 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy import ndimage
 
 from recon.fit.config import FitConfig
 from recon.fit.densify import Growth, grow, joined, kept
@@ -23,16 +21,15 @@ from recon.fit.model import Splats, draw, placed_groups
 from recon.fit.motion import Moment, Motion
 from recon.fit.openings import Openings
 from recon.fit.reach import reach_of
+from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
-from recon.seeds.fill import STEP as BLOCK
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
-from recon.skies import like_sky
 from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
@@ -54,10 +51,6 @@ BLAME_EVERY = 3
 
 GUESSED_FROM = 0.8
 """Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
-
-REFILLED_AT, WRONG = (0.2, 0.4), 0.08
-"""Parts of the fit at which it is looked where the sky stands in for what pictures show, and by how much its colours are wrong there at
-least."""
 
 CLIPPED = 0.99
 """Colours of pictures from which on they may be clipped."""
@@ -350,21 +343,15 @@ class Fit:
 
     @torch.no_grad()
     def _refill(self) -> None:
-        """Add splats where the sky stands in for what pictures show: errors there blame no splat, so that none would grow."""
+        """Add splats where the sky stands in for what pictures show."""
+        path, sh_count = self.motion.path(), self.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
             cameras = [self.motion.camera(v).resized(self.frames.width, self.frames.height) for v in views]
             search = Search(views, cameras, gain, self.ground, self.motion.tracks)
-            for view, camera, hidden in search:
-                drawn = self._drawn(view.to(self.device), "rgb", "alpha", "depth")
-                rgb, alpha, depth = (drawn[name].cpu().numpy() for name in ("rgb", "alpha", "depth"))
-                off = np.abs(rgb - view.image.numpy() / np.float32(255)).mean(-1)
-                right = ndimage.uniform_filter(off, BLOCK) < WRONG
-                right |= like_sky(view.image.numpy(), self.frames.sky_of(view))
-                more = search.found(view, camera, hidden, alpha, depth, right, self.splats.fields["sh"].shape[1])
-                if len(more):
-                    reach = reach_of(more, self.motion.path(), self.motion.rig).to(self.device)
-                    self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
+            for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
+                reach = reach_of(more, path, self.motion.rig).to(self.device)
+                self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
 
     def _renew(self, splats: Splats, carried: dict[str, torch.Tensor]) -> None:
         """Go on with other splats, and what each carries with it."""

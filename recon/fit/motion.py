@@ -50,8 +50,8 @@ class Motion:
 
     def __init__(self, frames: Frames, rig: dict[str, RigCamera], ego: Knots, tracks: Sequence[Track]):
         self.rig, self.ego, self.tracks = [rig[name] for name in frames.names], ego, list(tracks)
-        self.actors, self.boxes = [Knots(t.trajectory()) for t in tracks], [t.size for t in tracks]
-        actors, boxes = self.actors, self.boxes
+        self.actors = actors = [Knots(t.trajectory()) for t in tracks]
+        self.boxes = boxes = [t.size for t in tracks]
         self.extrinsics = torch.zeros(len(frames.names), 6)
         self.clocks = torch.zeros(len(frames.names))
         views = frames.views

@@ -85,7 +85,8 @@ def by_lidar_of_movers(log: Log, frames: Frames, sweeps: Sequence[Sweep], split:
         moving = split.moved(sweep.index, view.time_us)
         if not len(moving):
             continue
-        unseen = nearest_box(camera, [t for t in split.tracks if t.name not in split.actors])
+        struck = {name for name, (_, of) in split.actors.items() if (of == sweep.index).any()}
+        unseen = nearest_box(camera, [t for t in split.tracks if t.name not in struck])
         depth, first = (nearest_points(p, camera, unseen) for p in (moving, np.concatenate([moving, static])))
         measured[view.camera, view.index] = as_known(np.where(depth < HIDING * first, depth, np.nan))
     return Measured(measured, LIDAR)

@@ -123,3 +123,22 @@ def test_points_of_a_second_lidar_are_where_the_car_was_when_it_passed_over_it()
     local, sweep = sorted_points.actors["veh_1"]
     assert (np.bincount(sweep) == 2 * len(rear)).all() and np.abs(local - np.tile(rear, (12, 1))).max() < 1e-6
     assert len(sorted_points.static) == len(wall) * len(sweeps)
+
+
+@pytest.mark.parametrize("offsets", [[-49, 49] * 4, [20 * i - 50 for i in range(6)], [30, -40, 35, 32, 33, 31]])
+def test_a_box_is_the_measure_of_its_own_points_whenever_the_lidar_passed_over_it(offsets):
+    speed, stamps, late = 15.0, np.arange(len(offsets)) * 100_000, np.array(offsets) * 1000
+    size = np.array([4.0, 2.0, 1.5])
+    poses = torch.stack([translation(speed * t / 1e6, 0.0, 0.0) for t in stamps + late])
+    track = Track("veh_1", "car", True, size, stamps, poses, np.full(len(stamps), -1), ())
+    skin = np.stack(np.meshgrid([-2.0, 2.0], np.linspace(-0.9, 0.9, 9), np.linspace(0.3, 1.4, 9), indexing="ij"), -1).reshape(-1, 3)
+
+    def read(i: int) -> LidarPoints:
+        times = np.full(len(skin), stamps[i] + late[i])
+        return LidarPoints(skin + poses[i, :3, 3].numpy(), times, np.zeros(len(skin), np.int64))
+
+    sweeps = tuple(Sweep(i, int(t), partial(read, i)) for i, t in enumerate(stamps))
+    log = Log("one", Path("one"), {}, sweeps, (track,), Trajectory(track.times_us, poses), {}, ())
+    sorted_points = split_points(log, sweeps, [track])
+    local, _ = sorted_points.actors["veh_1"]
+    assert len(sorted_points.static) == 0 and np.abs(local - np.tile(skin, (len(offsets), 1))).max() < 1e-6

@@ -224,6 +224,7 @@ def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, t
     still = by_lidar(log, fit.frames, sweeps, split, movers).views
     moving = by_lidar_of_movers(log, fit.frames, sweeps, split).views
     depths = start.measured[0].views
+    assert sum(int(depth.isfinite().sum()) for depth in still.values()) > 100
     for which, depth in still.items():
         assert torch.equal(depths[which][depth.isfinite()], depth[depth.isfinite()])
     more = {which: depth.isfinite() & still[which].isnan() for which, depth in moving.items()}

@@ -73,8 +73,10 @@ def test_lidar_measures_what_moves_where_it_is_when_the_picture_is_taken():
     assert hidden.sum() > 20 and (np.nonzero(hidden.any(0))[0] - known.shape[1] / 2 < 20).all(), "behind the post"
     assert seen(wall(12.0, -3, 3)) == {}
     cars.append(replace(car, name="veh_2", world_from_box=translation(3.0, 0.0, 0.0).expand(3, 4, 4)))
-    depth = seen(back, wall(12.0, -3, 3))[0, 0]
-    assert not depth.isfinite().any(), "behind a car that no lidar struck"
+    now, later = sweep_of(20_000, back, wall(12.0, -3, 3)), replace(sweep_of(300_000, wall(3.0, -1, 1)), index=1)
+    for sweeps in ([now], [now, later]):
+        depth = by_lidar_of_movers(log, frames, sweeps, split_points(log, sweeps, cars)).views[0, 0]
+        assert not depth.isfinite().any(), "behind a car that this sweep did not strike"
 
 
 def test_depths_are_completed_where_there_are_none():
