@@ -16,7 +16,7 @@ STEADY = 8
 SLIGHT = 4 / 255
 """Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong."""
 FILLS = 0.8
-"""Share of the frame from which an object keeps its colours: objects that large were never seen in training."""
+"""Share of the frame from which an object keeps its colours: what little is around one that large tells nothing for sure on new places."""
 DEEP = 0.3
 """Optical depth that a missing shadow has somewhere; an object that lacks less has its shadow."""
 
