@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from enhance.isp import Isp, alter
 from render import rasterize, render_frame
 from render.frame import expose
 from render.frame_types import Frame
+from render.references import READS, References, Shot
 from render.shadow import cast, shadow_casters
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera
@@ -128,23 +129,40 @@ def light_left(frame: Frame, scene: Scene) -> torch.Tensor:
     return linear_from_srgb(cast(replace(frame, rgb=white), casters)[..., 0]).clamp(0, 1)
 
 
-def put_back(clip: Clip, scene: Scene, instances: Sequence[int], isp: Isp) -> tuple[torch.Tensor, torch.Tensor]:
-    """The photos `[T, H, W, 3]` with a rendering of `scene` where `instances` and their shadows are, without the shadows, and the
-    instances in other colours; and that region `[T, H, W]` in 0..1."""
-    damaged, regions = [], []
-    wanted = torch.tensor(instances, dtype=torch.int32)
-    for t, frame in enumerate(clip.render(scene, "rgb", "depth", "instance", shadows=False)):
-        assert frame.rgb is not None and frame.instance is not None
+@dataclass(frozen=True)
+class PutBack:
+    """Frames with assets put back: `[T, H, W, 3]` in 0..1 as they look, what photos say of them, and `[T, H, W]` in 0..1 how far that is to
+    be trusted, and where they differ from the photos that they should be."""
+
+    frames: torch.Tensor
+    reference: torch.Tensor
+    trust: torch.Tensor
+    region: torch.Tensor
+
+
+def put_back(clip: Clip, scene: Scene, instances: Sequence[int], isp: Isp, shots: Sequence[Shot] = ()) -> PutBack:
+    """The photos with a rendering of `scene` where `instances` and their shadows are, without the shadows, and the instances in other
+    colours; with what `shots`, and the photos of the instances' assets, say of it, but never those that the clip's frames are."""
+    found, wanted = [], torch.tensor(instances, dtype=torch.int32)
+    here = scene.to(clip.device)
+    references = References(shots, clip.scene.to(clip.device), here)
+    for t, drawn in enumerate(references.along(clip.draw(here, *READS, shadows=False), clip.cameras)):
+        frame = drawn.to("cpu")
+        assert frame.rgb is not None and frame.instance is not None and frame.reference is not None and frame.trust is not None
         mine = torch.isin(frame.instance, wanted).float()
         was = torch.isin(clip.geometry()["instance"][t].int(), wanted).float()
         around = _grown(torch.maximum(mine, was), HEM)
         shade = ((1 - light_left(frame, scene)) / (4 * DARKENED)).clamp(0, 1)
         region = torch.maximum(around, shade)
-        rgb = alter(frame.rgb.clamp(0, 1).permute(2, 0, 1), _soft(mine)[None], isp).permute(1, 2, 0)
-        photo = clip.photo(t)
-        damaged.append(torch.where(region[..., None] > 0, photo + region[..., None] * (rgb - photo), photo))
-        regions.append(region)
-    return torch.stack(damaged), torch.stack(regions)
+        pictures = [_over(clip.photo(t), rgb, region, _soft(mine), isp) for rgb in (frame.rgb.clamp(0, 1), frame.reference)]
+        found.append((*pictures, frame.trust * (region > 0), region))
+    return PutBack(*(torch.stack(part) for part in zip(*found, strict=True)))
+
+
+def _over(photo: torch.Tensor, rgb: torch.Tensor, region: torch.Tensor, mask: torch.Tensor, isp: Isp) -> torch.Tensor:
+    """A picture `[H, W, 3]`, in other colours where `mask` says, in the place of the `region` of a photo."""
+    altered = alter(rgb.permute(2, 0, 1), mask[None], isp).permute(1, 2, 0)
+    return torch.where(region[..., None] > 0, photo + region[..., None] * (altered - photo), photo)
 
 
 def _soft(mask: torch.Tensor) -> torch.Tensor:

@@ -28,11 +28,11 @@ class Sources:
     """What damage is made from beside the scene and its photos.
 
     early   the scene stopped early, for underfit (without any, splats are spoilt by rule instead)
-    shots   the recording's photos, which underfit's views may be compared with
+    shots   the recording's photos, which underfit's and reinsert's views may be compared with
     refits  by kind the reconstructions from less (`enhance.refits`)
     skies   HDR skies, for relight and shadow, beside made-up ones
     relit   the recording's photos under other skies, by which relight lights objects anew (without, by their splats' normals)
-    own     assets cut out of the scene, by track, for reinsert
+    own     assets cut out of the scene with their photos, by track, for reinsert
     assets  those that may be put anywhere, for shadow
     """
 
@@ -179,9 +179,9 @@ def _reinsert(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
         own = sources.own[actors[i - 1].track]
         actors[i - 1] = replace(actors[i - 1], asset=replace(own, meta={**own.meta, "edited": True}))
     isp = random_isp(rng, 0.6)
-    damaged, region = put_back(clip, replace(clip.scene, actors=tuple(actors)), chosen, isp)
-    tracks = [actors[i - 1].track for i in chosen]
-    return Damage(to_bytes(damaged), clip.photos, region, {"instances": chosen, "tracks": tracks, "isp": vars(isp)})
+    back = put_back(clip, replace(clip.scene, actors=tuple(actors)), chosen, isp, sources.shots)
+    what = {"instances": chosen, "tracks": [actors[i - 1].track for i in chosen], "isp": vars(isp)}
+    return Damage(to_bytes(back.frames), clip.photos, back.region, what, reference=to_bytes(back.reference), trust=back.trust)
 
 
 def _some(clip: Clip, rng: np.random.Generator) -> tuple[torch.Tensor, list[int]]:

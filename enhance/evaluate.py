@@ -38,8 +38,9 @@ SMALLEST = 200
 TOLD, PUT_IN = "ours + instances", "ours + what was put in"
 METHODS = ("identity", "ours", TOLD)
 """TOLD is told all actors; PUT_IN, of kinds that change some, those alone, as `render --enhance` does with what was inserted."""
-PHOTOS = ("references alone", "ours + instances + references")
-"""Where a rendered scene has photos: what those say of the frame, and that enhanced."""
+ALONE, ALL_TOLD, PUT_IN_TOLD = "references alone", "ours + instances + references", "ours + what was put in + references"
+PHOTOS = (ALONE, ALL_TOLD, PUT_IN_TOLD)
+"""Where a rendered scene, or an asset put back, has photos: what those say of the frame, and that enhanced."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def evaluate(
     beside: Mapping[str, Steps] | None = None,
 ) -> list[Row]:
     """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of those
-    that change some instances for the enhancer told these alone; of rendered kinds for what photos say, and the enhancer told that and the
+    that change some instances for the enhancer told these alone; where photos say something, for that, and the enhancer told that and the
     instances; then for those `beside` it by name, told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
@@ -93,9 +94,10 @@ def evaluate(
     of_photos = enhancer.for_photos() if isinstance(enhancer, Enhancer) else enhancer
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
-        some = (PUT_IN,) if shards and all("instances" in s.meta for s in shards) else ()
+        put_in = any("instances" in s.meta for s in shards)
+        photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if any(s.referenced for s in shards) else ()
         mine = enhancer if kind in RENDERED else of_photos
-        for method in (*METHODS, *some, *(PHOTOS if kind in RENDERED else ()), *others) if shards else ():
+        for method in (*METHODS, *((PUT_IN,) if put_in else ()), *photos, *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
             rows.append(measured(kind, method, shards, others.get(method, mine), features))
@@ -131,12 +133,12 @@ def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, f
         memory = None
         for t in range(shard.frames):
             frame = _frame(window, t, told=method not in METHODS or method == TOLD, referenced=method in PHOTOS)
-            if method == PUT_IN:
-                frame = telling(frame, shard.meta["instances"])
+            if method in (PUT_IN, PUT_IN_TOLD):
+                frame = telling(frame, shard.meta.get("instances", ()))
             start = time.perf_counter()
             if method == "identity":
                 better = window.input[t].permute(1, 2, 0)
-            elif method == PHOTOS[0]:
+            elif method == ALONE:
                 better = torch.lerp(window.input[t], window.reference[t], window.trust[t]).permute(1, 2, 0)
             else:
                 better, memory = enhancer.step(frame, memory)

@@ -122,11 +122,12 @@ def prepare_sources(
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
     there, half_done = as_aligned(log, scene.meta), exposed_as(scene, half_done)
     early = stopped_early(there, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []
-    shots = shots_of(as_reconstructed(log, scene), scene) if "underfit" in kinds else []
+    shots = shots_of(as_reconstructed(log, scene), scene) if {"underfit", "reinsert"} & set(kinds) else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
     made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
     found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
-    own = {c.track: c.asset for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS}
+    moved = [c for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS and "reinsert" in kinds]
+    own = {c.track: replace(c.asset, photos=c.photos(scene, shots)) for c in moved}
     bank = Databank(databank) if databank is not None else None
     stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
     anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored

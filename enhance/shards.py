@@ -10,7 +10,7 @@ flow      float16 `[T, H, W, 2]`  exact flow to the previous frame, pixels; NaN 
 visible   uint8 `[T, H, W]`       1 where the previous frame shows the same point
 depth     float16 `[T, H, W]`     z in metres, inf where nothing is (clips made before it was kept lack it)
 
-and, of rendered frames whose scene has photos,
+and, of rendered frames whose scene has photos, and of assets put back that have some,
 
 reference uint8 `[T, H, W, 3]`    what those say of the view (`render.references`), never the target itself
 trust     uint8 `[T, H, W]`       how far to go there from the input, 0..255
@@ -104,6 +104,14 @@ class Shard:
             visible=visible,
             trust=part["trust"][:, None].float() / 255,
         )
+
+    @property
+    def referenced(self) -> bool:
+        """Whether photos say something of its frames."""
+        from safetensors import safe_open
+
+        with safe_open(self.path, "pt") as file:
+            return "trust" in file.keys()  # noqa: SIM118 - not a dict
 
     def changed(self, index: int) -> torch.Tensor:
         """Where a frame was damaged, bool `[H, W]`."""

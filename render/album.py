@@ -32,18 +32,24 @@ def keep_photos(folder: Path, photos: Iterable[tuple[str, int, torch.Tensor]]) -
 
 
 def references_of(folder: Path, scene: Scene) -> References | None:
-    """The references of a `scene` that was loaded from a folder, and perhaps changed since; None where no photos were kept."""
-    shots = [
+    """The references of a `scene` that was loaded from a folder, and perhaps changed since; None where neither it nor an asset in it has
+    photos."""
+    shots = shots_in(folder, scene)
+    if not shots and not any(actor.asset.photos for actor in scene.actors):
+        return None
+    device = scene.background.gaussians.means.device
+    recorded = load_recorded(folder, Dropping()).to(device) if shots else scene
+    return References(shots, recorded, scene)
+
+
+def shots_in(folder: Path, scene: Scene) -> list[Shot]:
+    """The photos that the folder of a `scene` keeps."""
+    return [
         Shot(scene.camera(name, int(file.stem)), partial(_read, file))
         for name in scene.rig
         for file in sorted((folder / FOLDER / name).glob("*.jpg"))
         if file.stem.isdecimal()
     ]
-    if not shots:
-        return None
-    device = scene.background.gaussians.means.device
-    recorded = load_recorded(folder, Dropping()).to(device)
-    return References(shots, recorded, scene)
 
 
 def _read(file: Path, width: int, height: int) -> np.ndarray:

@@ -4,7 +4,8 @@ A photo and the render at its place differ by what the splats do not explain. Th
 itself: it has hardly any low frequencies, so nothing jumps where a photo ends, and exposures, edits and shadows of inserted objects stay
 as they were rendered. An actor's difference moves with the actor; where another instance, or nothing that a photo shows, is drawn, there is
 none. Photos are chosen and faded in and out as views of an unstructured lumigraph (Buehler et al. 2001) and summed as a Wiener filter sums
-estimates of known noise, which grows with parallax: it was measured on drive 002's side cameras, on frames that no fit had seen.
+estimates of known noise, which grows with parallax: it was measured on drive 002's side cameras, on frames that no fit had seen. Of what
+was put in, the photos that its asset was cut out of say as much (`render/portraits.py`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import torch
 import warp as wp
 from torch.nn import functional as F
 
-from render.flow import HIDES, correspond
 from render.frame import render_frame
 from render.frame_types import Frame
-from render.kernels.detail import Here, Other, add_photo, carry_over
-from render.launch import run, stage, view
+from render.kernels.detail import add_photo, carry_over
+from render.portraits import portraits_of
 from render.rays import camera_rays
+from render.seen import GONE, NOISE, PARALLAX, Seen, faded, run_over
 from scenes.asset import Asset
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -32,15 +33,6 @@ from scenes.scene import Scene
 
 READS = ("rgb", "alpha", "depth", "instance")
 """Outputs of the frames that references are found for."""
-
-PHOTOS = 2
-"""Photos that a view is given; a further one's score is where they fade to nothing."""
-
-NOISE = 0.2
-"""Error of a moved difference at no parallax, against its size: of 1 / (1 + NOISE) of it one is sure."""
-
-PARALLAX = 0.15
-"""Way from eye to eye, in distances to what is seen, that adds as much error again as the difference is large."""
 
 NEAR, SPEED = 0.5, 2.0
 """Metres that are near, and metres a second: a photo of another moment counts as farther by what may have moved since."""
@@ -63,9 +55,6 @@ APART = 0.06
 BORDER = 0.1
 """Part of a photo's side over which a point counts as leaving it: a step of GRID."""
 
-GONE = -2
-"""Instance of a photo's actor that the frames do not show."""
-
 CARRIED = 0.5
 """Of the detail of the frame before, moved along: it calms what photos that are faded in and out make flicker."""
 
@@ -83,27 +72,8 @@ class Shot:
     ego: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """A view from which detail is moved: its camera, the detail `[H, W, 4]` before any exposure, depth `[H, W]`, inf at the sky, instances
-    `[H, W]` by the frames' ids, and what was placed there by those ids."""
-
-    camera: Camera
-    detail: torch.Tensor
-    depth: torch.Tensor
-    instance: torch.Tensor
-    placed: list[Placed]
-
-    @classmethod
-    def of(cls, frame: Frame, detail: torch.Tensor, instance: torch.Tensor, placed: list[Placed]) -> _Seen:
-        """Of a frame with its detail `[H, W, 4]`."""
-        assert frame.depth is not None and frame.instance is not None
-        depth = torch.where(frame.instance < 0, torch.inf, frame.depth)
-        return cls(frame.camera, detail.contiguous(), depth, instance.to(torch.int32), placed)
-
-
 class References:
-    """The shots of a scene, for the frames of clips of it."""
+    """The shots of a scene, and the photos of assets that stand in it, for the frames of clips of it."""
 
     def __init__(self, shots: Sequence[Shot], recorded: Scene, shown: Scene | None = None):
         """recorded: the scene as it was when the photos were taken; shown: as the frames show it, with edits; the same where None."""
@@ -123,7 +93,8 @@ class References:
             for i in indices[1:]:
                 self.spare[i] = self._off(shots[i].camera)[last] < SPACING
                 last = last if self.spare[i] else i
-        self.kept: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
+        self.kept: OrderedDict[tuple[int, int], Seen] = OrderedDict()
+        self.portraits = portraits_of(self.shown.actors, self.shown.model)
 
     @torch.no_grad()
     def along(self, frames: Iterable[Frame], predicted: Sequence[Camera] = ()) -> Iterator[Frame]:
@@ -132,14 +103,14 @@ class References:
         predicted: the clip's cameras, where its photos are to be predicted: then neither a frame's own photo is looked at nor those of the
         frames to come, whose detail would be carried over to them.
         """
-        last: _Seen | None = None
+        last: Seen | None = None
         for i, frame in enumerate(frames):
             assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
             placed, clear = self.shown.placed(frame.camera.time_us), ~_mixed(frame)
             detail = self._detail(frame, placed, clear, predicted[i:])
             if last is not None:
-                _run_over(carry_over, frame, placed, clear, last, [CARRIED, (detail, wp.vec4)])
-            last = _Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
+                run_over(carry_over, frame, placed, clear, last, [CARRIED, (detail, wp.vec4)])
+            last = Seen.of(frame, detail, torch.where(clear, frame.instance, GONE), placed)
             trust = detail[..., 3].clamp(0, 1)  # where it was carried, a cubic may overshoot
             difference = detail[..., :3] * _gain(self.shown, frame)
             reference = torch.addcdiv(frame.rgb, difference, trust.clamp_min(1e-9)[..., None])
@@ -153,7 +124,10 @@ class References:
         for index, share in self.chosen(frame, predicted):
             baseline = float((self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm())
             told = [share, NOISE, baseline / PARALLAX, (rays, wp.vec3), (frame.depth, float), (sums, wp.vec4), (squares, float)]
-            _run_over(add_photo, frame, placed, clear, self._seen(index, frame.camera.width, frame.rgb.device), told)
+            run_over(add_photo, frame, placed, clear, self._seen(index, frame.camera.width, frame.rgb.device), told)
+        moments = {camera.time_us for camera in predicted}
+        for portraits in self.portraits:
+            portraits.add(frame, placed, clear, rays, sums, squares, moments)
         weight = sums[..., 3]
         some = weight.clamp_min(1e-9)
         spread = squares / some - (sums[..., :3] / some[..., None]).square().mean(-1)
@@ -165,11 +139,7 @@ class References:
         that was taken as one of `predicted`."""
         if not self.shots:
             return []
-        score = self._scores(frame, predicted)
-        best = score.argsort(descending=True)[: PHOTOS + 1]
-        floor = float(score[best[PHOTOS]]) if len(best) > PHOTOS else 0.0
-        room = max(float(score[best[0]]) - floor, 1e-12)
-        return [(int(i), s) for i in best[:PHOTOS] if (s := (float(score[i]) - floor) / room) > 0]
+        return faded(self._scores(frame, predicted))
 
     def _scores(self, frame: Frame, predicted: Sequence[Camera]) -> torch.Tensor:
         """float64 `[S]`: the share of a frame that each shot shows, as sharply, by how far off it was taken."""
@@ -203,7 +173,7 @@ class References:
         """float64 `[S]`: metres from a camera to each shot, and what may have moved in the time between them."""
         return (self.eyes - camera.world_from_cam[:3, 3]).norm(dim=-1) + SPEED * 1e-6 * (self.times - camera.time_us).abs()
 
-    def _seen(self, index: int, width: int, device: torch.device) -> _Seen:
+    def _seen(self, index: int, width: int, device: torch.device) -> Seen:
         """What a shot adds to the splats, at most as wide as the frames, so that nothing is skipped between its pixels."""
         key = (index, width)
         if key not in self.kept:
@@ -219,24 +189,11 @@ class References:
                 ego = torch.from_numpy(shot.ego).to(device)[None, None].float()
                 instance = torch.where(F.interpolate(ego, instance.shape)[0, 0] > 0, GONE, instance)
             differs = (photo - frame.rgb.clamp(0, 1)) / _gain(self.recorded, frame)
-            self.kept[key] = _Seen.of(frame, F.pad(differs, (0, 1)), instance, placed)
+            self.kept[key] = Seen.of(frame, F.pad(differs, (0, 1)), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:
             self.kept.popitem(last=False)
         return self.kept[key]
-
-
-def _run_over(kernel: wp.Kernel, frame: Frame, placed: list[Placed], clear: torch.Tensor, seen: _Seen, told: list) -> None:
-    """Launch a kernel of `kernels/detail.py` over the pixels of a frame: from the view `seen` to those that are `clear`."""
-    assert frame.depth is not None and frame.instance is not None
-    found = correspond(placed, frame.camera, frame.depth, frame.instance, seen.placed, seen.camera)
-    other, here, instance = Other(), Here(), frame.instance.to(torch.int32).contiguous()
-    with stage(clear.device):
-        other.detail, other.depth = wp.from_torch(seen.detail, wp.vec4), wp.from_torch(seen.depth)
-        other.instance = wp.from_torch(seen.instance)
-        here.pixels, here.depths = wp.from_torch(found.pixels, wp.vec2d), wp.from_torch(found.depth)
-        here.instance, here.clear = wp.from_torch(instance), wp.from_torch(clear, wp.bool)
-        run(kernel, clear.numel(), [other, here, HIDES, *(view(*t) if isinstance(t, tuple) else t for t in told)], clear.device)
 
 
 def _gain(scene: Scene, frame: Frame) -> torch.Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
+from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.deformation import Deformation
 from scenes.gaussians import Gaussians, SplatModel
@@ -13,14 +16,25 @@ from scenes.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
+class AssetPhoto:
+    """A photo of an object, cut out: a camera in the object's frame, at the moment of the photo, and `read()`, which gives its pixels,
+    uint8 `[H, W, 4]` of the camera's size: display-referred colour, and 255 where it shows the object, else 0."""
+
+    camera: Camera
+    read: Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
 class Asset:
-    """Splats of one object: origin at the base centre of its box, x forward, z up; `size` `[3]` length, width, height in metres."""
+    """Splats of one object: origin at the base centre of its box, x forward, z up; `size` `[3]` length, width, height in metres. photos:
+    those that it was cut out of, which show what its splats blur."""
 
     gaussians: Gaussians
     size: torch.Tensor
     label: str
     model: SplatModel = field(default_factory=SplatModel)
     meta: dict = field(default_factory=dict)
+    photos: tuple[AssetPhoto, ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "size", torch.as_tensor(self.size, dtype=torch.float64))

@@ -71,6 +71,8 @@ def validate(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     else:
         for name, gaussians in splats_of(thing):
             problems += _splat_problems(gaussians, f"{path}, {name}" if isinstance(thing, Scene) else str(path))
+        for asset in [thing] if isinstance(thing, Asset) else [a.asset for a in thing.actors] if isinstance(thing, Scene) else []:
+            problems += _photo_problems(asset, str(path))
         if isinstance(thing, Scene):
             problems += _scene_problems(thing, str(path))
     for file in _usd_files(path):
@@ -240,12 +242,21 @@ def _databank_problems(path: Path, clean: Callable[[Gaussians, str], Gaussians])
             yield str(error)
             continue
         yield from _splat_problems(asset.gaussians, entry.id)
+        yield from _photo_problems(asset, entry.id)
         counted = clean is not as_is or len(asset.gaussians) == entry.splats
         if not counted or asset.label != entry.label or asset.size.tolist() != list(entry.size):
             yield f"{entry.id} differs from what index.json says of it: {len(asset.gaussians)} splats, {asset.label}, {asset.size.tolist()}"
         yield from _usd_problems(file)
     known = {path / Path(e.asset).parent for e in entries}
     yield from (f"{p.parent} is not in index.json" for p in sorted(path.glob("assets/*/*/asset.usdc")) if p.parent not in known)
+
+
+def _photo_problems(asset: Asset, where: str) -> Iterator[str]:
+    for photo in asset.photos:
+        try:
+            photo.read()
+        except (ValueError, OSError) as error:
+            yield f"{where}: {error}"
 
 
 def _missing(bank: Path, entry: Entry) -> list[Path]:

@@ -17,6 +17,7 @@ import torch
 from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
 from scenes.asset import Asset
+from scenes.asset_photos import load_photos, save_photos
 from scenes.formats.packing import logits_from, opacities_from, unit
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
@@ -52,7 +53,8 @@ def stage_axes(path: Path) -> tuple[str, float]:
 
 
 def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
-    """Write an asset as one USD file: its splats under an Xform that carries size, label and metadata."""
+    """Write an asset as one USD file: its splats under an Xform that carries size, label and metadata; its photos beside it."""
+    save_photos(path, asset.photos)
     with new_stage(path, "Asset") as stage:
         root = UsdGeom.Xform.Define(stage, "/Asset").GetPrim()
         size = Vt.DoubleArray(asset.size.tolist())
@@ -76,7 +78,14 @@ def read_asset(root: Usd.Prim, path: Path, clean: Clean) -> Asset:
         meta, size, label = json.loads(data["meta"]), torch.tensor(list(data["size"]), dtype=torch.float64), data["label"]
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: {root.GetPath()} is not an asset: it lacks {error}") from error
-    return Asset(clean(read_splats(prim), f"{path}, {root.GetPath()}"), size, label, read_model(prim), meta)
+    splats = clean(read_splats(prim), f"{path}, {root.GetPath()}")
+    return Asset(splats, size, label, read_model(prim), meta, load_photos(_asset_file(root, path)))
+
+
+def _asset_file(root: Usd.Prim, path: Path) -> Path:
+    """The file that an asset's label and size stand in, whoever refers to it."""
+    files = [spec.layer.realPath for spec in root.GetPrimStack() if "label" in spec.customData.get("sidestep", {})]
+    return Path(files[-1]) if files and files[-1] else path
 
 
 def author_splats(stage: Usd.Stage, where: str, gaussians: Gaussians, model: SplatModel | None, half: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,14 +14,16 @@ import torch
 
 from recon.assets.cleaning import cleaned
 from recon.assets.closing import closed
+from recon.assets.looking import looking_at
+from recon.assets.photos import photos_of
 from render import Frame, rasterize
-from scenes.asset import Actor, Asset
-from scenes.camera import Camera
+from render.album import shots_in
+from render.references import Shot
+from scenes.asset import Actor, Asset, AssetPhoto
 from scenes.databank import Databank
 from scenes.files import load
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, turned
-from scenes.lenses import Pinhole
 from scenes.match import ground_linear
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene, dimmed
@@ -52,37 +54,47 @@ CORNERS = {3: 145, 1: 35, 5: 215, 7: 325}
 class Candidate:
     """A cut object before it is judged: its asset as its scene holds it, its track, and why it is not good enough, or ''.
 
+    box     where its frame was on the drive
+    instance  what its scene shows it as, 0 of what is parked; None where it bends on its way, so that no posture is its photos'
     gain `[3]`: of a mover, how much more the cameras were exposed half way than in the mean; None where that does not vary.
     """
 
     asset: Asset
     track: str
     flaw: str
+    box: Trajectory
+    instance: int | None
     gain: torch.Tensor | None = None
 
     def evenly_lit(self) -> Asset:
         """The asset as bright as what stands: a scene's own movers are as bright as exposures say that their light is."""
         return replace(self.asset, gaussians=dimmed(self.asset.gaussians, self.gain))
 
+    def photos(self, scene: Scene, shots: Sequence[Shot]) -> tuple[AssetPhoto, ...]:
+        """Its photos among those that its scene was made from."""
+        return () if self.instance is None else photos_of(self.asset, scene, shots, self.box, self.instance)
+
 
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
     """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first: those of which
-    the fewest sides are unseen, and of these those of the most splats.
+    the fewest sides are unseen, and of these those of the most splats. Where a scene folder keeps its photos, each asset keeps those that
+    show it.
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
+    shots: list[Shot] = []
     if not isinstance(scene, Scene):
         loaded = load(scene)
         if not isinstance(loaded, Scene):
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
-        scene = loaded
+        shots, scene = shots_in(Path(scene), loaded), loaded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids = Databank(databank), []
     for candidate in found:
         if candidate.flaw:
             print(f"left out {candidate.track} ({candidate.asset.label}): {candidate.flaw}", file=sys.stderr)
         else:
-            asset = closed(candidate.evenly_lit())
+            asset = closed(replace(candidate.evenly_lit(), photos=candidate.photos(scene, shots)))
             ids.append(bank.add(asset, thumbnail(asset)))
     if not ids:
         raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")
@@ -93,14 +105,15 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     """Every mover and every parked vehicle of a scene as an asset in its own frame."""
     share = {k: scene.meta[k] for k in ("licence", "attribution") if k in scene.meta}
     share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
-    for actor in scene.actors:
+    for instance, actor in enumerate(scene.actors, 1):
         if actor.asset.meta.get("inserted"):
             continue  # it came from a databank
         sight = seen(scene, actor.trajectory, actor.asset.size)
         half = len(actor.trajectory) // 2
         middle, gain = actor.trajectory.world_from_body[half], scene.followed(int(actor.trajectory.times_us[half]))
         cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
-        yield _judged(cut, actor.asset, share | {"track": actor.track, "moved": True} | _ground(scene, middle), sight, gain)
+        meta = share | {"track": actor.track, "moved": True} | _ground(scene, middle)
+        yield _judged(cut, actor.asset, meta, sight, actor.trajectory, None if actor.deformation else instance, gain)
     for entry in scene.meta.get("parked", []):
         world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
         size = torch.tensor(entry["size"], dtype=torch.float64)
@@ -108,9 +121,10 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
             continue
         near = moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size)
         cut = cleaned(within_box(near, size), size)
-        sight = seen(scene, Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None]), size)
+        stands = Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None])
+        sight = seen(scene, stands, size)
         asset = Asset(cut, size, entry["label"], scene.model)
-        yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight)
+        yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight, stands, 0)
 
 
 def at_rest(actor: Actor) -> Gaussians:
@@ -174,7 +188,9 @@ def shown_colours(splats: Gaussians) -> dict[str, list[float]]:
     return {name: [round(v, 4) for v in row.tolist()] for name, row in rows.items()}
 
 
-def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight, gain: torch.Tensor | None = None) -> Candidate:
+def _judged(
+    cut: Gaussians, asset: Asset, meta: dict, sight: Sight, box: Trajectory, instance: int | None, gain: torch.Tensor | None = None
+) -> Candidate:
     flaw = ""
     if sight.views < FEWEST_VIEWS:
         flaw = f"{sight.views} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
@@ -186,7 +202,7 @@ def _judged(cut: Gaussians, asset: Asset, meta: dict, sight: Sight, gain: torch.
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
     meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
     meta["exposure"] = shown_colours(dimmed(whole, gain))
-    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, gain)
+    return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, box, instance, gain)
 
 
 def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:
@@ -264,14 +280,3 @@ def thumbnail(asset: Asset) -> bytes:
     out = io.BytesIO()
     Image.fromarray(pixels).save(out, "png")
     return out.getvalue()
-
-
-def looking_at(target: torch.Tensor, eye: torch.Tensor, width: int, height: int) -> Camera:
-    """A camera at `eye` that looks at `target` with the world's z up in the picture."""
-    forward = (target - eye) / (target - eye).norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], 1)
-    pose[:3, 3] = eye
-    return Camera(Pinhole(1.75 * width, 1.75 * width, width / 2, height / 2), width, height, pose)

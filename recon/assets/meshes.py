@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from recon.assets.extract import looking_at
+from recon.assets.looking import looking_at
 from render import Frame, rasterize
 from render.tracer import SKY, Blockers, Mesh, TracedMesh, fibonacci, lit
 from scenes.asset import Asset

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from recon.assets.closing import ENDS, hull_of_end
-from recon.assets.extract import looking_at
+from recon.assets.looking import looking_at
 from recon.assets.meshes import MODEL, read_mesh, splats_of_mesh
 from render import Frame, rasterize
 from scenes.camera import Camera

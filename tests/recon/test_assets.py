@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from recon import extract_assets
-from recon.assets.extract import completed, looking_at, moved, silhouette, thumbnail, turned, within_box
+from recon.assets.extract import completed, moved, silhouette, thumbnail, turned, within_box
+from recon.assets.looking import looking_at
 from scenes import Asset, Databank, Gaussians, Placed
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw

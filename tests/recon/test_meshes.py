@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from recon.assets.extract import looking_at
+from recon.assets.looking import looking_at
 from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, read_mesh, splats_of_mesh, turn_to_asset, views_around
 from render.rays import camera_rays
 from render.tracer import Blockers, TracedMesh, fibonacci, lit
