@@ -155,7 +155,7 @@ def put_back(clip: Clip, scene: Scene, instances: Sequence[int], isp: Isp, shots
         shade = ((1 - light_left(frame, scene)) / (4 * DARKENED)).clamp(0, 1)
         region = torch.maximum(around, shade)
         pictures = [_over(clip.photo(t), rgb, region, _soft(mine), isp) for rgb in (frame.rgb.clamp(0, 1), frame.reference)]
-        found.append((*pictures, frame.trust * (region > 0), region))
+        found.append((*pictures, frame.trust * (region > 1 / 512), region))  # a byte's least
     return PutBack(*(torch.stack(part) for part in zip(*found, strict=True)))
 
 

@@ -83,6 +83,14 @@ def test_what_is_put_back_leaves_the_photo_as_the_target(folder):
         assert (w.region[torch.isin(w.instance, torch.tensor(shard.meta["instances"], dtype=torch.int16))] > 0.6).all()
 
 
+def test_what_photos_say_of_what_is_put_back_lies_where_it_is_and_is_nearer_to_the_target(folder):
+    shards = [s for s in PairSet(folder).of("reinsert") if s.window().region.max() > 0]
+    for shard in shards:
+        w = shard.window()
+        assert shard.referenced and not w.trust[w.region == 0].any() and w.trust.max() > 0.3
+    assert not any(s.referenced for s in PairSet(folder).of("isp"))
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
 def test_pairs_made_on_a_gpu_are_alike(street, recording, sources, folder, tmp_path):
     refits = {

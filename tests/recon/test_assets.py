@@ -1,15 +1,25 @@
 import math
+from collections import Counter
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
+from street import box, rig
 
 from recon import extract_assets
-from recon.assets.extract import completed, moved, silhouette, thumbnail, turned, within_box
+from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned, within_box
 from recon.assets.looking import looking_at
-from scenes import Asset, Databank, Gaussians, Placed
+from render import rasterize, render_frame
+from render.album import keep_photos
+from render.references import Shot
+from render.video import from_bytes, to_bytes
+from scenes import Asset, Databank, Gaussians, Placed, save
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw
+from scenes.report import validate
+
+CAMERA = "front_camera"
 
 SIZE = torch.tensor([4.2, 1.8, 1.5], dtype=torch.float64)
 
@@ -111,6 +121,70 @@ def test_parked_cars_and_movers_become_assets_and_the_rest_is_said(parked_street
     asset = bank.load(tracks["veh_7"].id)
     assert asset.gaussians.means[:, 2].min() > 0 and (asset.gaussians.means.abs() < torch.tensor([2.3, 1.1, 1.8])).all()
     assert "left out veh_8 (pickup): 0 views" in capsys.readouterr().err
+
+
+def _shots(scene):
+    """What the scene's cameras see, twice as bright as it is: its photos, in other light."""
+
+    def taken(camera, width, height):
+        return to_bytes((2 * render_frame(scene, camera.resized(width, height)).rgb).clamp(0, 1))
+
+    cameras = [scene.camera(name, int(t)).resized(384, 216) for name in scene.rig for t in scene.frame_times(name)]
+    return [Shot(c, partial(taken, c)) for c in cameras]
+
+
+def test_assets_keep_photos_of_themselves_alone(parked_street):
+    """Of the mover and of the parked car: each photo shows the asset where its own splats are, and nothing where they are not."""
+    shots, found = _shots(parked_street), {c.track: c for c in candidates(parked_street)}
+    for track in ("veh_1", "veh_7"):
+        photos = found[track].photos(parked_street, shots)
+        assert photos, track
+        asset = found[track].asset
+        for photo in photos:
+            pixels = torch.from_numpy(photo.read())
+            assert pixels.shape == (photo.camera.height, photo.camera.width, 4)
+            alone = rasterize(asset.gaussians, photo.camera, ("rgb", "alpha"))
+            solid, shows = alone.alpha > 0.9, pixels[..., 3] == 255
+            assert (shows & solid).sum() > 0.45 * solid.sum() and (shows & (alone.alpha < 0.01)).sum() < 0.15 * shows.sum()
+            both = shows & solid
+            lit = (2 * alone.rgb).clamp(0, 1)[both] - pixels[..., :3][both].float() / 255
+            assert lit.abs().mean() < 0.06, track
+            assert (pixels[..., :3][~shows] == 0).all()
+
+
+def test_photos_of_one_direction_are_few_and_apart(parked_street):
+    (mover,) = [c for c in candidates(parked_street) if c.track == "veh_1"]
+    photos = mover.photos(parked_street, _shots(parked_street))
+    sectors = Counter(round(math.degrees(math.atan2(*p.camera.world_from_cam[:2, 3].flip(0).tolist())) / 12) for p in photos)
+    assert max(sectors.values()) == 1  # all were taken within a second
+
+
+def test_what_hides_an_object_is_no_photo_of_it(parked_street):
+    (parked,) = [c for c in candidates(parked_street) if c.track == "veh_7"]
+    wall = box((0.3, 6.0, 4.0), (0.9, 0.9, 0.2))
+    wall = replace(wall, means=wall.means + torch.tensor([5.5, 3.5, 0.0]))
+    background = replace(parked_street.background, gaussians=Gaussians.cat([parked_street.background.gaussians, wall]))
+    hidden = replace(parked_street, background=background)
+    front = [s for s in _shots(hidden) if s.camera.world_from_cam[0, 3] < 5]
+    photos = parked.photos(hidden, front)
+    for photo in photos:  # from beside the wall some of it may be seen, but never the wall
+        pixels = torch.from_numpy(photo.read())
+        yellow = (pixels[..., 0] > 200) & (pixels[..., 1] > 200) & (pixels[..., 2] < 150)
+        assert yellow.sum() < 0.02 * (pixels[..., 3] == 255).sum()
+    assert len(photos) < len(parked.photos(parked_street, front))
+
+
+def test_what_bends_on_its_way_has_no_photos(parked_street):
+    (mover,) = [c for c in candidates(parked_street) if c.track == "veh_1"]
+    assert replace(mover, instance=None).photos(parked_street, _shots(parked_street)) == ()
+
+
+def test_a_scene_folder_with_photos_gives_its_assets_theirs(parked_street, tmp_path):
+    scene, bank = replace(parked_street, rig=rig(384, 216)), Databank(tmp_path / "bank")
+    save(scene, tmp_path / "s1")
+    keep_photos(tmp_path / "s1", [(CAMERA, s.camera.time_us, from_bytes(s.read(384, 216))) for s in _shots(scene)[:8]])
+    loaded = [bank.load(id) for id in extract_assets(tmp_path / "s1", tmp_path / "bank")]
+    assert all(asset.photos for asset in loaded) and not validate(tmp_path / "bank")
 
 
 def test_a_scene_without_objects_says_so(street, tmp_path):
