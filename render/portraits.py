@@ -2,7 +2,8 @@
 
 As for the photos of a drive (`render/references.py`), it is the difference to the splats that is moved, here to the asset's own, in the
 light in which it is shown: colours of the photo are first brought to theirs in the mean, and what changes slowly is taken away, so that
-neither exposure nor the light of the street where it was taken goes along. What was mirrored or closed by guess has no photo and stays as it is.
+neither exposure nor the light of the street where it was taken goes along. What was mirrored or closed by guess has no photo and stays as
+it is.
 """
 
 from __future__ import annotations
