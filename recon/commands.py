@@ -69,7 +69,7 @@ class Recon:
 
 @dataclass
 class Extract:
-    """Cut the moving and parked vehicles of a scene into the databank."""
+    """Cut the moving and parked vehicles of a scene into the databank, with the scene's photos of them."""
 
     scene: ScenePath
     """Scene folder."""
@@ -118,6 +118,7 @@ class Show:
         told = {
             "asset": e.id, "class": e.label, "size": "{:.2f} m long, {:.2f} m wide, {:.2f} m high".format(*e.size), "splats": e.splats,
             "views": "unknown" if e.views is None else e.views, **_seen_from(asset),
+            "photos": f"{len(asset.photos)}, whose detail render --enhance lays over its splats" if asset.photos else "none",
             "licence": e.licence, "attribution": e.attribution, "source": e.source,
             "file": self.databank / e.asset, "thumbnail": thumb,
         }  # fmt: skip

@@ -125,7 +125,7 @@ def _detail(differs: torch.Tensor, shows: torch.Tensor) -> torch.Tensor:
 
     def spread(x: torch.Tensor) -> torch.Tensor:
         for _ in range(2):
-            x = F.avg_pool2d(x, 2 * half + 1, 1, half)
+            x = F.avg_pool2d(F.avg_pool2d(x, (2 * half + 1, 1), 1, (half, 0)), (1, 2 * half + 1), 1, (0, half))
         return x
 
     given = differs.permute(2, 0, 1)[None] * mask

@@ -1,6 +1,6 @@
 """The databank: a folder of assets with an index.
 
-databank/index.json  assets/<class>/<number>/{asset.usdc,asset.json,thumb.png}
+databank/index.json  assets/<class>/<number>/{asset.usdc,asset.json,thumb.png,asset.photos/}
 
 An asset's id is "<class>/<number>", as car/0003. index.json lists every entry; asset.json holds the same entry beside the asset.
 """
