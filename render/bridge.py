@@ -100,6 +100,7 @@ class Rasterize(torch.autograd.Function):
         rows = upload(rows, fields[0].device)
         scene, picture = paint(settings, todo, told, rows, features, frames, rays)
         ctx.settings, ctx.work, ctx.told, ctx.rows, ctx.scene, ctx.parts = settings, todo, told, rows, scene, picture.parts
+        ctx.save_for_backward(*fields)  # only so that backward refuses fields that were written to meanwhile, as torch's own do
         ctx.like_poses, ctx.like_lens = poses.new_empty(poses.shape), lens.new_empty(lens.shape)
         *sums, median, instance = pictures(settings, picture)
         ctx.mark_non_differentiable(*(t for t in (median, instance) if t is not None))
@@ -107,6 +108,7 @@ class Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):
+        assert ctx.saved_tensors is not None
         settings, device, groups = ctx.settings, ctx.scene.records.device, ctx.work.groups
         threads, instances = _threads(device), len(ctx.like_poses)
         outs, shared, jobs = [], [], []

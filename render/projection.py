@@ -63,8 +63,8 @@ def _along(start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:
     return interpolate(start.expand(4, 4, 4), end.expand(4, 4, 4), _NODES.to(start.device))
 
 
-def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel) -> None:
-    """ValueError naming what this camera cannot draw, and the way out."""
+def check_ends(camera: Camera, placed: Sequence[Placed]) -> None:
+    """ValueError where something has an end pose that this camera's shutter cannot have."""
     ends = [("the camera", camera.world_from_cam, camera.world_from_cam_end)]
     ends += [(f"instance {p.instance}", p.world_from_local, p.world_from_local_end) for p in placed]
     for name, start, end in ends:
@@ -77,6 +77,11 @@ def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel
         turn = math.acos(min(1.0, max(-1.0, (float((start[:3, :3] * end[:3, :3]).detach().sum()) - 1) / 2)))
         if turn > LARGEST_TURN:
             raise ValueError(f"{name} turns by {math.degrees(turn):.0f} degrees while the image is read out; at most 60 can be drawn")
+
+
+def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel) -> None:
+    """ValueError naming what this camera cannot draw, and the way out."""
+    check_ends(camera, placed)
     if not moves(camera, placed):
         return
     if model.projection != "ut":

@@ -18,7 +18,7 @@ from render.frame_types import Frame, RenderConfig
 from render.kernels.types import Wanted
 from render.launch import stage
 from render.outputs import check_outputs
-from render.projection import check_projection, moves, poses
+from render.projection import check_ends, check_projection, moves, poses
 from render.rays import exact_rays, on_device
 from render.room import Room
 from render.settings import Settings
@@ -73,23 +73,27 @@ def rasterize(
 
     splats: in the world, or placed in it; quaternions of any length; nothing is changed. outputs: names of the fields of `Frame`; what is
     not asked for is None and costs nothing. background: `[3]` or `[H, W, 3]`; black otherwise, with rgb premultiplied. flow_to: the
-    placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose. features: a further
+    placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose, and what moves
+    needs an instance id of its own. features: a further
     field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
     the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
     nothing stands. room: what earlier frames needed, so that the host does not wait for this one (`render/room.py`, `one_ahead`).
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
-    instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. ValueError for what
-    cannot be drawn.
+    instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. What is found out about
+    a tensor of splats is kept until it is written to; torch does not count writes through numpy or `.data`, so make a new one for these.
+    ValueError for what cannot be drawn.
     """
     if not isinstance(camera, Camera):
         return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
     outputs = check_outputs(outputs)
     placed = as_placed(splats)
+    flow_to = {way: (as_placed(there), other) for way, (there, other) in (flow_to or {}).items()}
     _check(placed, camera, outputs, flow_to, model, config)
+    background = None if background is None else torch.as_tensor(background)
     _check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
-        return _draw(placed, camera, outputs, background, flow_to or {}, model, config, features, crop, mask, room)
+        return _draw(placed, camera, outputs, background, flow_to, model, config, features, crop, mask, room)
 
 
 def _draw(
@@ -142,7 +146,7 @@ def _draw(
         same = correspond(placed, camera, frame["depth"].detach(), frame["instance"], there, other, settings.part[:2])
         frame[f"flow_{way}"] = same.flow
         if f"visible_{way}" in outputs:
-            shown = _draw(as_placed(there), other, ("depth",), None, {}, model, config, room=room).depth
+            shown = _draw(there, other, ("depth",), None, {}, model, config, room=room).depth
             assert shown is not None
             frame[f"visible_{way}"] = same.visible(shown.detach())
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
@@ -196,16 +200,35 @@ def _check(placed, camera, outputs, flow_to, model, config) -> None:
         raise ValueError('output "need" depends on where a scene\'s photos were taken; ask render_frame for it')
     for name in outputs:
         what, _, way = name.partition("_")
-        if what in ("flow", "visible") and way not in (flow_to or {}):
+        if what in ("flow", "visible") and way not in flow_to:
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
     check_projection(camera, placed, model)
+    for there, other in flow_to.values():
+        check_ends(other, there)
+        _check_shared(placed, there)
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")
+    _check_poses(placed, camera)
+    for there, other in flow_to.values():
+        _check_poses(there, other)
+    if max(p.instance for p in placed) >= 2**24 or min(p.instance for p in placed) < 0:
+        raise ValueError("instance ids must lie between 0 and 2^24 - 1")
+
+
+def _check_poses(placed: list[Placed], camera: Camera) -> None:
     given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
     if not torch.isfinite(torch.stack(given).sum()):  # one value that is not finite makes the sum so
         for name, pose in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, strict=True):
             if not torch.isfinite(pose).all():
                 raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
-    if max(p.instance for p in placed) >= 2**24 or min(p.instance for p in placed) < 0:
-        raise ValueError("instance ids must lie between 0 and 2^24 - 1")
+
+
+def _check_shared(placed: list[Placed], there: list[Placed]) -> None:
+    """ValueError where instances of one id go different ways: flow is told by the ids that pixels have."""
+    ids = [p.instance for p in placed]
+    for id in {i for i in ids if ids.count(i) > 1}:
+        now, then = ([p.world_from_local for p in some if p.instance == id] for some in (placed, there))
+        ways = [b @ inverse(a) for a, b in zip(now, then or now, strict=False)]
+        if len(then) not in (0, len(now)) or any((way - ways[0]).abs().max() > 1e-9 * (1 + ways[0].abs().max()) for way in ways):
+            raise ValueError(f"{len(now)} of the placed have the instance id {id} and move differently; flow needs an id for each")

@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from scenes.asset import Asset
 from scenes.atomic import atomic_file, atomic_folder
 from scenes.gaussians import Gaussians
-from scenes.names import unknown
+from scenes.names import slug, unknown
 
 FORMAT = "sidestep databank"
 VERSION = 1
@@ -116,11 +116,6 @@ class Databank:
         with atomic_file(self.path / "index.json") as partial:
             partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
-
-
-def slug(label: str) -> str:
-    """The class folder of a label: "Car" -> car, "Pedestrian with Object" -> pedestrian-with-object."""
-    return re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "thing"
 
 
 def _metres(size: Sequence[float]) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
@@ -20,6 +21,7 @@ from scenes.scene import Scene
 from scenes.trajectory import Trajectory
 
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
+LONGEST_US = 3_600_000_000  # from the clip's first frame: no drive lasts longer, and each pose takes a look at the ground
 ASIDE = 5.0  # metres off the recorded path from which an asset is still drawn in full: half of itself, and a shift to the next lane
 NEAREST = 1.0  # metres from which it is, wherever it stands
 
@@ -48,13 +50,18 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         raise ValueError(f"{placement.asset} cannot be placed {after:g}s after the drive's first moment; the drive lasts {lasts:.3g}s")
     body = scene.ego.at(start_us)
     if placement.trajectory is not None:
-        times, xy, headings = _along(read_waypoints(placement.trajectory), body, start_us)
+        points = read_waypoints(placement.trajectory)
+        _check_times(placement.trajectory, points)
+        times, xy, headings = _along(points, body, start_us)
     elif placement.path == "lane":
         times, xy, headings = _in_lane(scene, placement, body, start_us)
     else:
         times, xy, headings = _straight(scene, placement, body, start_us)
 
     poses, warnings = [], []
+    if len(times) > 1 and (times[-1] < scene.ego.times_us[0] or times[0] > scene.ego.times_us[-1]):
+        first, last = ((int(t) - start_us) / 1e6 for t in (times[0], times[-1]))
+        warnings.append(f"{placement.asset} is there from {first:g}s to {last:g}s only, and never during the drive")
     for point, heading in zip(xy, headings, strict=True):
         poses.append(standing_pose(scene, point, float(heading), asset.size))
     beyond = max(outside_ground(scene, point) for point in xy)
@@ -153,6 +160,14 @@ def _drive_times(scene: Scene) -> torch.Tensor:
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     count = max(2, -(-(last - first) // STEP_US) + 1)
     return torch.linspace(first, max(last, first + STEP_US), count, dtype=torch.float64).round().long()
+
+
+def _check_times(path: Path, points: list[Waypoint]) -> None:
+    """ValueError where a trajectory's times are no seconds of a drive."""
+    far = max(points, key=lambda p: abs(p.time_us))
+    if abs(far.time_us) > LONGEST_US:
+        told = f"{path} has the time_s {far.time_us / 1e6:g}, which is more than an hour from the clip's first frame"
+        raise ValueError(f"{told}; time_s counts seconds from there, no milliseconds, and not since 1970")
 
 
 def _along(points: list[Waypoint], body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

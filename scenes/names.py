@@ -1,4 +1,4 @@
-"""Names that do not exist: the sentence that says so, and the nearest one that does. Pure Python."""
+"""Names: the sentence that says that one does not exist, with the nearest that does; and a class's as a folder's. Pure Python."""
 
 import difflib
 import re
@@ -22,3 +22,8 @@ def unknown(kind: str, name: str, where: str, options: Iterable[str]) -> str:
     options = list(options)
     have = ", ".join(options) or "nothing"
     return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'
+
+
+def slug(label: str) -> str:
+    """The class folder of a label: "Car" -> car, "Pedestrian with Object" -> pedestrian-with-object."""
+    return re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") or "thing"

@@ -17,6 +17,7 @@ from scenes.gaussians import Gaussians
 from scenes.lenses import Lens
 from scenes.scene import Scene
 
+LONGEST = 300  # letters of a list or dict on a line with others
 SCALE_RANGE = 1e-6, 1e4  # metres: beyond, a splat is an accident of training or of units
 
 
@@ -163,9 +164,10 @@ def _lines(key: str, value) -> Iterator[str]:
 
 
 def _brief(value) -> str:
-    """A value of a dict on one line with others: of a list of records only how many; --json has them all."""
+    """A value of a dict on one line with others: of what is long, or a list of records, only how many; --json has them all."""
     records = isinstance(value, list) and any(isinstance(v, dict) for v in value)
-    return f"({len(value)} entries, see --json)" if records else str(value)
+    long = isinstance(value, list | dict) and len(str(value)) > LONGEST
+    return f"({len(value)} entries, see --json)" if records or long else str(value)
 
 
 def _cell(key: str, value) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from scenes.names import slug
+
 SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "car": ((2.5, 6.0), (1.3, 2.6), (1.0, 2.3)),
     "pickup": ((4.0, 7.5), (1.5, 2.8), (1.3, 2.6)),
@@ -26,7 +28,7 @@ AXES = ("length", "width", "height")
 def odd_size(label: str, size: Sequence[float]) -> str:
     """What is odd about the size `[length, width, height]` in metres of a thing of a class, with the likely cause; '' where nothing is."""
     told = " x ".join(f"{v:.3g}" for v in size)
-    ranges = SIZES.get(label, (ANYTHING,) * 3)
+    ranges = SIZES.get(slug(label), (ANYTHING,) * 3)
     wrong = [axis for axis, v, r in zip(AXES, size, ranges, strict=True) if not r[0] <= v <= r[1]]
     if not wrong:
         return ""

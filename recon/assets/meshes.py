@@ -20,6 +20,7 @@ from scenes.gaussians import Gaussians, SplatModel
 from scenes.harmonics import sh_from_rgb
 from scenes.match import ASPHALT
 from scenes.poses import matrix_from_quat, quat_from_matrix
+from scenes.sky import linear_from_srgb, srgb_from_linear
 
 AXES = {name: np.eye(3)[i] * sign for i, letter in enumerate("xyz") for name, sign in ((letter, 1.0), (f"-{letter}", -1.0))}
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
@@ -92,23 +93,39 @@ def turn_to_asset(up: str, forward: str) -> np.ndarray:
 def _look(part) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates `[F, 3, 2]` of a part's corners, v down, and its texture uint8 `[H, W, 4]`; one texel where it has one colour."""
     visual = part.visual
-    if visual.kind == "texture" and visual.uv is not None:
-        material = visual.material
-        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        factor = getattr(material, "baseColorFactor", None)
-        factor = np.full(4, 255) if factor is None else np.asarray(factor)
-        texture = np.asarray(image.convert("RGBA")) if image is not None else np.full((1, 1, 4), 255, np.uint8)
-        texture = (texture * (factor / 255)).round().astype(np.uint8)
-        if getattr(material, "alphaMode", None) in (None, "OPAQUE"):
-            texture[..., 3] = 255
-        uv = np.asarray(visual.uv)[part.faces]
-        return np.stack([uv[..., 0], 1 - uv[..., 1]], -1), texture
-    if visual.kind == "vertex":  # a texel a face corner
-        colours = np.asarray(visual.vertex_colors)[part.faces].reshape(1, -1, 4)
-        u = (np.arange(colours.shape[1]) + 0.5) / colours.shape[1]
-        return np.stack([u, np.full_like(u, 0.5)], -1).reshape(-1, 3, 2), colours.astype(np.uint8)
-    colour = np.asarray(visual.main_color if visual.kind == "face" else (180, 180, 180, 255), np.uint8)
-    return np.full((len(part.faces), 3, 2), 0.5), colour.reshape(1, 1, 4)
+    if visual.kind == "texture":
+        uv = np.full((len(part.faces), 3, 2), 0.5) if visual.uv is None else np.asarray(visual.uv)[part.faces]
+        return np.stack([uv[..., 0], 1 - uv[..., 1]], -1), _texture(visual.material)
+    if visual.kind == "vertex":
+        return _by_corners(np.asarray(visual.vertex_colors)[part.faces])
+    if visual.kind == "face":
+        return _by_corners(np.repeat(np.asarray(visual.face_colors)[:, None], 3, 1))
+    return np.full((len(part.faces), 3, 2), 0.5), np.array([[[180, 180, 180, 255]]], np.uint8)
+
+
+def _by_corners(colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates and texture of colours `[F, 3, 4]` of face corners: a texel each."""
+    texture = colours.reshape(1, -1, 4).astype(np.uint8)
+    u = (np.arange(texture.shape[1]) + 0.5) / texture.shape[1]
+    return np.stack([u, np.full_like(u, 0.5)], -1).reshape(-1, 3, 2), texture
+
+
+def _texture(material) -> np.ndarray:
+    """The texture uint8 `[H, W, 4]` of a trimesh material: its picture times its factor, which glTF has in linear light; of the simple
+    materials of other formats the picture, or else their colour."""
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if image is None and factor is None:
+        return np.asarray(material.main_color, np.uint8).reshape(1, 1, 4)
+    texture = np.full((1, 1, 4), 255, np.uint8) if image is None else np.asarray(image.convert("RGBA")).copy()
+    if factor is not None and (np.asarray(factor) != 255).any():
+        share = torch.from_numpy(np.asarray(factor, np.float32) / 255)
+        rgba = torch.from_numpy(texture).float() / 255
+        lit = srgb_from_linear(linear_from_srgb(rgba[..., :3]) * share[:3])
+        texture = (torch.cat([lit, rgba[..., 3:] * share[3]], -1) * 255).round().to(torch.uint8).numpy()
+    if getattr(material, "alphaMode", None) in (None, "OPAQUE"):
+        texture[..., 3] = 255
+    return texture
 
 
 def splats_of_mesh(mesh: Mesh, count: int) -> Gaussians:

@@ -83,6 +83,10 @@ def test_things_in_the_middle_of_their_class_are_not_odd(label):
     assert odd_size(label, [(a * b) ** 0.5 for a, b in SIZES[label]]) == ""
 
 
+def test_a_class_is_known_however_it_is_written():
+    assert "a Car has" in odd_size("Car", [24, 11, 8.6]) and odd_size("CAR", [4.5, 1.8, 1.5]) == ""
+
+
 def test_check_finds_what_is_broken_misplaced_or_turned(tmp_path):
     bank = Databank(tmp_path / "bank")
     good = car()

@@ -136,3 +136,44 @@ def test_a_file_that_is_no_mesh_says_so(tmp_path):
         read_mesh(tmp_path / "a.glb")
     with pytest.raises(FileNotFoundError):
         read_mesh(tmp_path / "b.glb")
+
+
+def _textures(path: Path) -> np.ndarray:
+    """Every colour that the mesh of a file has at a corner of a face, uint8 `[F, 4]` a face: at its first one."""
+    mesh = read_mesh(path, up="z", forward="x")
+    colours = []
+    for uv, which in zip(np.asarray(mesh.uvs), mesh.texture, strict=True):
+        texture = mesh.textures[int(which)]
+        u, v = (uv[0] * (texture.shape[1], texture.shape[0])).astype(int)
+        colours.append(texture[min(v, texture.shape[0] - 1), min(u, texture.shape[1] - 1)])
+    return np.array(colours)
+
+
+@pytest.mark.parametrize("textured", [False, True], ids=["no coordinates", "coordinates"])
+def test_a_plain_colour_of_gltf_is_linear(tmp_path, textured):
+    box = trimesh.creation.box((4, 1.8, 1.5))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=np.array([204, 26, 26, 255], np.uint8))
+    uv = np.full((len(box.vertices), 2), 0.5) if textured else None
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    trimesh.Scene([box]).export(tmp_path / "plain.glb")
+    assert np.abs(_textures(tmp_path / "plain.glb").astype(int) - [231, 90, 90, 255]).max() <= 1
+
+
+def test_a_picture_is_darkened_by_its_factor_in_linear_light(tmp_path):
+    from PIL import Image
+
+    box = trimesh.creation.box((4, 1.8, 1.5))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.new("RGB", (4, 4), (188, 188, 188)), baseColorFactor=np.array([128, 128, 128, 255], np.uint8)
+    )
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), material=material)
+    trimesh.Scene([box]).export(tmp_path / "half.glb")
+    assert np.abs(_textures(tmp_path / "half.glb")[:, :3].astype(int) - 137).max() <= 1  # half of linear 0.5 is 0.25
+
+
+def test_every_face_has_its_own_colour(tmp_path):
+    box = trimesh.creation.box((4, 1.8, 1.5))
+    box.visual.face_colors = np.array([[200, 30, 30, 255], [30, 30, 200, 255]] * (len(box.faces) // 2), np.uint8)
+    box.export(tmp_path / "faces.ply")
+    found = {tuple(c) for c in _textures(tmp_path / "faces.ply")[:, :3].tolist()}
+    assert found == {(200, 30, 30), (30, 30, 200)}

@@ -5,7 +5,7 @@ import torch
 from randomized import asset
 
 from scenes import Databank, load
-from scenes.databank import slug
+from scenes.names import slug
 from scenes.usd import usd_problems
 
 

@@ -102,3 +102,16 @@ def test_yaw_goes_the_shorter_way_round(street, tmp_path):
 def test_a_start_off_the_drive_is_refused(street):
     with pytest.raises(ValueError, match="car cannot be placed 10s after the drive's first moment; the drive lasts 0.8s"):
         insert(street, car(), Placement("car", 10, 0), start_us=START_US + 10_000_000)
+
+
+def test_times_that_are_no_seconds_of_a_drive_are_refused(street, tmp_path):
+    for last in (8000, 1557539956):  # milliseconds, and since 1970
+        (tmp_path / "t.csv").write_text(f"time_s,x_m,y_m\n0,10,0\n{last},20,0\n")
+        with pytest.raises(ValueError, match=r"t.csv.*no milliseconds, and not since 1970"):
+            insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))
+
+
+def test_what_is_never_there_during_the_drive_is_said(street, tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n-9,10,0\n-5,20,0\n")
+    result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))
+    assert "car is there from -9s to -5s only, and never during the drive" in result.warnings

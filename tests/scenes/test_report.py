@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -129,3 +130,10 @@ def test_impossible_scenes_are_problems(tmp_path):
     problems = validate(tmp_path / "s1")
     assert any("camera left took 1 frames" in p for p in problems)
     assert any("the ground has heights that are not finite" in p for p in problems)
+
+
+def test_a_path_among_the_meta_does_not_fill_the_terminal(street, tmp_path):
+    poses = street.ego.world_from_body.tolist()
+    save(replace(street, meta={**street.meta, "path_correction": {"times_us": [1, 2], "poses": poses}}), tmp_path / "s1")
+    lines = summary(describe(tmp_path / "s1"))
+    assert max(map(len, lines)) < 600 and any("path_correction (2 entries, see --json)" in line for line in lines)

@@ -1,0 +1,60 @@
+"""What the rasterizer is given wrongly, or in another form: refused, or drawn alike."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from render import rasterize
+from scenes import Camera, Gaussians, Pinhole, Placed
+from scenes.poses import translation
+from tests.bench.presets import random_splats
+
+CAMERA = Camera(Pinhole(60.0, 62.0, 34.0, 22.0), 70, 50, torch.eye(4, dtype=torch.float64))
+
+
+def ahead() -> Gaussians:
+    """Splats 6 m before the camera."""
+    splats = random_splats(40, 0)
+    return replace(splats, means=splats.means + torch.tensor([0.0, 0.0, 6.0]))
+
+
+def test_splats_written_to_between_forward_and_backward_are_refused():
+    splats = Gaussians(*(t.clone().requires_grad_() for t in ahead().tensors().values()))
+    frame = rasterize(splats, CAMERA)
+    with torch.no_grad():
+        splats.log_scales.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        frame.rgb.sum().backward()
+
+
+def test_splats_made_in_inference_mode_are_drawn_alike():
+    with torch.inference_mode():
+        made = Gaussians(*(t.clone() for t in ahead().tensors().values()))
+    assert torch.equal(rasterize(made, CAMERA).rgb, rasterize(ahead(), CAMERA).rgb)
+
+
+def test_a_background_may_be_a_list_and_flow_may_go_to_splats_alone():
+    splats = ahead()
+    assert torch.equal(rasterize(splats, CAMERA, background=[1, 0, 0]).rgb, rasterize(splats, CAMERA, background=torch.eye(3)[0]).rgb)
+    frame = rasterize(splats, CAMERA, ("flow_next",), flow_to={"next": (splats, CAMERA)})
+    assert frame.flow_next.abs().max() < 1e-4
+
+
+def test_instances_that_share_an_id_and_move_differently_have_no_flow():
+    splats, still = ahead(), torch.eye(4, dtype=torch.float64)
+    now = [Placed(splats, still), Placed(splats, still)]
+    apart = [Placed(splats, translation(-0.5, 0.0, 0.0)), Placed(splats, still)]
+    with pytest.raises(ValueError, match="instance id 0 and move differently"):
+        rasterize(now, CAMERA, ("flow_next",), flow_to={"next": (apart, CAMERA)})
+    together = [apart[0], apart[0]]
+    rasterize(now, CAMERA, ("flow_next",), flow_to={"next": (together, CAMERA)})
+    own = [replace(p, instance=i) for i, p in enumerate(apart)]
+    rasterize([replace(p, instance=i) for i, p in enumerate(now)], CAMERA, ("flow_next",), flow_to={"next": (own, CAMERA)})
+
+
+def test_where_flow_goes_is_checked_as_the_view_itself():
+    splats = ahead()
+    lost = replace(CAMERA, world_from_cam=torch.full((4, 4), torch.nan, dtype=torch.float64))
+    with pytest.raises(ValueError, match="pose of camera is not finite"):
+        rasterize(splats, CAMERA, ("flow_next",), flow_to={"next": (splats, lost)})
