@@ -21,7 +21,7 @@ from enhance.commands import Enhance, Pairs, Train
 from enhance.demo import Demo
 from enhance.doctor import Doctor
 from recon.commands import Assets, Recon
-from render.outputs import check_outputs
+from render.outputs import check_scene_outputs
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
 from scenes.opening import UsageError, check_device, fresh, open_scene, open_view, warn
@@ -49,7 +49,7 @@ from scenes.placement import Placement
 if TYPE_CHECKING:
     from render.record import Stages
 
-Outputs = Annotated[tuple[str, ...], written(lambda text: check_outputs(names(text)), "NAME,NAME", "none")]
+Outputs = Annotated[tuple[str, ...], written(lambda text: check_scene_outputs(names(text)), "NAME,NAME", "none")]
 
 
 @dataclass
@@ -124,7 +124,8 @@ class Render:
     size: Size = None
     """Size in pixels, as 640x360."""
     outputs: Outputs = ()
-    """Frames to keep in the folder out/: any of rgb, alpha, depth, instance, flow_prev, flow_next."""
+    """Frames to keep in the folder out/: any of rgb, alpha, depth, median_depth, normal, instance, instance_alpha, flow_prev, flow_next,
+    visible_prev, visible_next, need."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to render and enhance."""
     databank: Path = Path("databank")

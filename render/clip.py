@@ -8,7 +8,7 @@ import torch
 
 from render.frame import DEFAULT, render_frame
 from render.frame_types import Frame, RenderConfig
-from render.outputs import check_outputs
+from render.outputs import check_scene_outputs
 from render.room import Room, one_ahead
 from scenes.camera import Camera
 from scenes.metres import require_metres
@@ -36,7 +36,7 @@ def render_clip(
     that is not metric.
     """
     cameras = clip_cameras(scene, camera, shift, times_us, width, height)
-    outputs = check_outputs(outputs)
+    outputs = check_scene_outputs(outputs)
     return _frames(scene, cameras, outputs, shadows, config)
 
 

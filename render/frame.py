@@ -9,7 +9,7 @@ import torch
 from render.frame_types import Frame, RenderConfig
 from render.launch import upload
 from render.need import need_of, support_fields
-from render.outputs import check_outputs
+from render.outputs import check_scene_outputs
 from render.rasterize import rasterize
 from render.room import Room
 from render.shadow import cast, shadow_casters
@@ -38,14 +38,12 @@ def render_frame(
     Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky. room: as of `rasterize`.
     Raises ValueError for an output that does not exist and for a flow without its other camera.
     """
-    outputs = check_outputs(outputs)
+    outputs = check_scene_outputs(outputs)
     others = {"prev": previous, "next": following}
     ways = {way: [o for o in (f"flow_{way}", f"visible_{way}") if o in outputs] for way in others}
     for way, asked in ways.items():
         if asked and others[way] is None:
             raise ValueError(f"{asked[0]} needs the camera it leads to; pass {'previous' if way == 'prev' else 'following'}=")
-    if "features" in outputs:
-        raise ValueError('a scene has no "features"; pass them to rasterize with scene.placed(time)')
     flow_to: dict[str, tuple[Sequence[Placed], Camera]] = {
         way: (scene.placed(c.time_us, c.readout_us), c) for way, c in others.items() if c is not None and ways[way]
     }
@@ -80,7 +78,7 @@ def render_frame(
 
 def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     """rgb' = E[:, :3] rgb + E[:, 3] for an affine colour `[3, 4]`."""
-    if torch.equal(exposure, torch.eye(3, 4).to(exposure)):
+    if not exposure.requires_grad and torch.equal(exposure, torch.eye(3, 4).to(exposure)):
         return rgb
     exposure = upload(exposure, rgb.device).to(rgb.dtype)
     return rgb @ exposure[:, :3].T + exposure[:, 3]

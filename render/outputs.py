@@ -29,3 +29,11 @@ def check_outputs(outputs: Iterable[str]) -> tuple[str, ...]:
         if name not in OUTPUTS:
             raise ValueError(f'output "{name}" does not exist; there are {", ".join(OUTPUTS)}.{nearest(name, OUTPUTS)}')
     return tuple(outputs)
+
+
+def check_scene_outputs(outputs: Iterable[str]) -> tuple[str, ...]:
+    """`outputs` as a tuple of names that a scene's frame can have; ValueError otherwise."""
+    outputs = check_outputs(outputs)
+    if "features" in outputs:
+        raise ValueError('a scene has no "features"; pass them to rasterize with scene.placed(time)')
+    return outputs

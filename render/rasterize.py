@@ -157,7 +157,7 @@ def picture_of(settings: Settings, background, rgb, alpha, z, weights, sums, med
     frame = {"alpha": alpha, "rgb": rgb.permute(1, 2, 0), "instance": instance}
     if background is not None:
         behind = background if background.ndim == 1 else background[settings.of_image]
-        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind
+        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind.to(alpha.dtype)
     if settings.wanted.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
         drawn = weights > 0

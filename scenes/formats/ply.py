@@ -85,9 +85,9 @@ def read_header(path: Path) -> tuple[str, list[Element], int]:
         head = file.read(_MAX_HEADER)
     if not head.startswith((b"ply\n", b"ply\r\n")):
         raise ValueError(f"{path} is not a PLY file: it does not start with the line ply")
-    end = head.find(b"end_header")
+    end = head.find(b"\nend_header") + 1  # a line of its own: comments may hold the word
     stop = head.find(b"\n", end)
-    if end < 0 or stop < 0:
+    if end < 1 or stop < 0:
         raise ValueError(f"{path} is truncated or corrupt: its header has no end_header")
     order, elements = None, []
     for number, line in enumerate(head[:end].decode("latin-1").splitlines()[1:], 2):

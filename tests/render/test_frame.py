@@ -111,3 +111,9 @@ def test_a_contact_shadow_darkens_the_ground_below_an_inserted_asset_only(street
 
 def test_recorded_actors_keep_the_shadows_of_their_photos(street, camera):
     assert torch.equal(render_frame(street, camera).rgb, render_frame(street, camera, shadows=False).rgb)
+
+
+def test_an_exposure_that_changes_nothing_yet_has_a_gradient(street, camera):
+    exposure = torch.eye(3, 4).requires_grad_()
+    render_frame(street, replace(camera, exposure=exposure)).rgb.sum().backward()
+    assert (exposure.grad.abs() > 0).all()

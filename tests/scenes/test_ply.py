@@ -186,3 +186,10 @@ def test_damaged_files_never_do_worse_than_a_value_error(tmp_path_factory, noise
         assert len(load_ply(path)) <= 3
     except ValueError as error:
         assert str(path) in str(error)
+
+
+def test_a_comment_may_hold_the_word_that_ends_a_header(tmp_path):
+    save_ply(tmp_path / "a.ply", gaussians())
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(data.replace(b"element vertex", b"comment up to end_header it says\nelement vertex", 1))
+    assert same_bits(load_ply(tmp_path / "a.ply"), load_ply(tmp_path / "b.ply"))
