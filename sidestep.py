@@ -103,7 +103,9 @@ class Render:
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
     camera: str | None = None
-    """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file, whose z is up."""
+    """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file."""
+    up: str | None = None
+    """Of a file's splats, the axis that points up: x, -x, y, ...; z where left out, and -y of most that were trained from photos."""
     lateral_shift: Length = 0.0
     """Metres to the left of the recorded path, as 2m; -2m is to the right."""
     insert: UseAppendAction[tuple[Insertion, ...]] = ()
@@ -145,7 +147,7 @@ class Render:
         from scenes.seen import seeing, unseen_warning
 
         check_device(self.device)
-        scene, warnings = open_view(self.scene, self.drop_invalid)
+        scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)

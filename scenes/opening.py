@@ -45,15 +45,17 @@ def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]
     return replace(thing, meta={**thing.meta, "path": str(path)}), warnings  # errors name the folder that the user named
 
 
-def open_view(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:
-    """As `open_scene`; of splats or an asset a scene with the camera `orbit`, which circles them."""
+def open_view(path: Path, drop_invalid: bool = False, up: str | None = None) -> tuple[Scene, list[str]]:
+    """As `open_scene`; of splats or an asset a scene with the camera `orbit`, which circles them: their axis `up` points up, z if None."""
     from scenes.files import kind_of
     from scenes.orbit import around
 
     if kind_of(path) not in ("asset", "splats"):
+        if up is not None:
+            raise UsageError(f"--up is for files of splats; {path} is a scene, whose z is up")
         return open_scene(path, drop_invalid)
     thing, warnings = open_splats(path, drop_invalid)
-    return around(thing, str(path)), warnings
+    return around(thing, str(path), up or "z"), warnings
 
 
 def open_splats(path: Path, drop_invalid: bool = False) -> tuple[Asset | Gaussians, list[str]]:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from scenes.asset import Asset
+from scenes.axes import upright
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.lenses import Pinhole
@@ -26,15 +27,17 @@ STRAY = 2.0
 """Percent of the splats, at either end of each axis, that the box leaves out."""
 
 
-def around(thing: Asset | Gaussians, path: str) -> Scene:
-    """A scene of splats whose z is up, where a body goes once around them, to the left, in four seconds; its camera is `orbit`.
+def around(thing: Asset | Gaussians, path: str, up: str = "z") -> Scene:
+    """A scene of splats, whose axis `up` points up: a body goes once around them, to the left, in four seconds, with a camera `orbit`.
 
-    A lateral shift brings the camera nearer. ValueError where there are no splats; errors of the scene name `path`.
+    A lateral shift brings the camera nearer. ValueError where there are no splats, and for an axis that is none; errors of the scene name
+    `path`.
     """
+    turn = upright(up)
     gaussians, model = (thing.gaussians, thing.model) if isinstance(thing, Asset) else (thing, SplatModel())
     if not len(gaussians):
         raise ValueError(f"{path} is empty: it has no splats")
-    low, high = np.percentile(gaussians.means.numpy().astype(np.float64), [STRAY, 100 - STRAY], axis=0)
+    low, high = np.percentile(gaussians.means.numpy().astype(np.float64) @ turn.T, [STRAY, 100 - STRAY], axis=0)
     away = AWAY * max(float(np.linalg.norm(high - low)) / 2, 1e-3)
     turns = 2 * math.pi * np.arange(FRAMES + 1) / FRAMES
     level, height = away * math.cos(ELEVATION), away * math.sin(ELEVATION)
@@ -45,5 +48,7 @@ def around(thing: Asset | Gaussians, path: str) -> Scene:
     inward[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, -sine, cosine], [0.0, -cosine, -sine]])  # right is ahead, depth to the left
     times = FRAME_US * torch.arange(FRAMES + 1)
     camera = RigCamera(Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT, inward, times_us=times[:-1])
-    still = Placed(gaussians, torch.eye(4, dtype=torch.float64))
+    stands = torch.eye(4, dtype=torch.float64)
+    stands[:3, :3] = torch.from_numpy(turn)
+    still = Placed(gaussians, stands)
     return Scene(still, (), None, Trajectory(times, torch.stack(poses)), {CAMERA: camera}, model, meta={"name": path, "path": path})

@@ -15,6 +15,7 @@ from recon.assets.looking import looking_at
 from render import Frame, rasterize
 from render.tracer import SKY, Blockers, Mesh, TracedMesh, fibonacci, lit
 from scenes.asset import Asset
+from scenes.axes import axis
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, SplatModel
 from scenes.harmonics import sh_from_rgb
@@ -22,7 +23,6 @@ from scenes.match import ASPHALT
 from scenes.poses import matrix_from_quat, quat_from_matrix
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
-AXES = {name: np.eye(3)[i] * sign for i, letter in enumerate("xyz") for name, sign in ((letter, 1.0), (f"-{letter}", -1.0))}
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 MODEL = SplatModel(projection="ewa")
 
@@ -81,10 +81,7 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
 
 def turn_to_asset(up: str, forward: str) -> np.ndarray:
     """Rotation `[3, 3]` to x forward, z up from a frame whose own axes those are, as "y" and "-z". ValueError where they are not two."""
-    for name, axis in (("up", up), ("forward", forward)):
-        if axis not in AXES:
-            raise ValueError(f'--{name} "{axis}" is not an axis; it is one of {", ".join(AXES)}')
-    z, x = AXES[up], AXES[forward]
+    z, x = axis(up, "up"), axis(forward, "forward")
     if abs(x @ z) > 0.5:
         raise ValueError(f"--up {up} and --forward {forward} lie along one axis; give two different ones")
     return np.stack([x, np.cross(z, x), z])

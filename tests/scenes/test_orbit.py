@@ -3,6 +3,7 @@ import torch
 from randomized import asset, gaussians
 
 from scenes import Gaussians
+from scenes.axes import AXES
 from scenes.orbit import AWAY, CAMERA, around
 
 
@@ -35,3 +36,22 @@ def test_an_asset_keeps_its_model_and_nothing_is_refused():
     assert len(around(gaussians(1), "a.ply").background.gaussians) == 1
     with pytest.raises(ValueError, match="a.ply is empty"):
         around(Gaussians.empty(), "a.ply")
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_whichever_axis_points_up_stands_upright_in_the_picture(up):
+    head = torch.from_numpy(AXES[up]) * 3
+    g = gaussians(400)
+    g.means[:200] = head.float() + 0.05 * g.means[:200]
+    scene = around(g, "a.ply", up)
+    above = scene.background.world_from_local[:3, :3] @ head
+    assert torch.allclose(above, torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)) and above @ above == pytest.approx(9)
+    assert torch.linalg.det(scene.background.world_from_local[:3, :3]) == pytest.approx(1)
+    camera = scene.camera(CAMERA, int(scene.frame_times(CAMERA)[7]))
+    local = (camera.world_from_cam.inverse() @ torch.cat([above, torch.ones(1, dtype=torch.float64)]))[:3]
+    assert camera.lens.project(local)[1] < camera.height / 2
+
+
+def test_an_axis_that_is_none_is_refused():
+    with pytest.raises(ValueError, match='--up "w" is not an axis'):
+        around(gaussians(10), "a.ply", "w")
