@@ -78,7 +78,7 @@ class Candidate:
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
     """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first: those of which
     the fewest sides are unseen, and of these those of the most splats. Where a scene folder keeps its photos, each asset keeps those that
-    show it.
+    show it, and one that is half hidden in all of them is not good enough.
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
@@ -91,10 +91,12 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids = Databank(databank), []
     for candidate in found:
-        if candidate.flaw:
-            print(f"left out {candidate.track} ({candidate.asset.label}): {candidate.flaw}", file=sys.stderr)
+        photos = () if candidate.flaw else candidate.photos(scene, shots)
+        hidden = "no photo shows most of it" if shots and candidate.instance is not None and not photos else ""
+        if flaw := candidate.flaw or hidden:
+            print(f"left out {candidate.track} ({candidate.asset.label}): {flaw}", file=sys.stderr)
         else:
-            asset = closed(replace(candidate.evenly_lit(), photos=candidate.photos(scene, shots)))
+            asset = closed(replace(candidate.evenly_lit(), photos=photos))
             ids.append(bank.add(asset, thumbnail(asset)))
     if not ids:
         raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")

@@ -187,6 +187,18 @@ def test_a_scene_folder_with_photos_gives_its_assets_theirs(parked_street, tmp_p
     assert all(asset.photos for asset in loaded) and not validate(tmp_path / "bank")
 
 
+def test_what_is_half_hidden_in_every_photo_is_no_asset(parked_street, tmp_path, capsys):
+    wall = box((9.0, 0.3, 3.0), (0.6, 0.6, 0.6))
+    wall = replace(wall, means=wall.means + torch.tensor([8.0, 2.3, 0.0]))
+    background = replace(parked_street.background, gaussians=Gaussians.cat([parked_street.background.gaussians, wall]))
+    scene = replace(parked_street, rig=rig(384, 216), background=background)
+    save(scene, tmp_path / "s1")
+    keep_photos(tmp_path / "s1", [(CAMERA, s.camera.time_us, from_bytes(s.read(384, 216))) for s in _shots(scene)[:8]])
+    with pytest.raises(ValueError, match="good enough"):
+        extract_assets(tmp_path / "s1", tmp_path / "bank")
+    assert "left out veh_7 (car): no photo shows most of it" in capsys.readouterr().err
+
+
 def test_a_scene_without_objects_says_so(street, tmp_path):
     with pytest.raises(ValueError, match="good enough"):
         extract_assets(replace(street, actors=()), tmp_path / "bank")
