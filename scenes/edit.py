@@ -92,12 +92,13 @@ def ghosts(scene: Scene, tracks: Iterable[str]) -> torch.Tensor:
     """Mask `[N]` of background splats inside a box that these actors moved through, or in which these vehicles are parked.
 
     Nothing else can have stood where an actor went: a fit paints into the background what the actor's box did not quite explain of it,
-    and that is seen once the actor has gone.
+    and that is seen once the actor has gone. An inserted actor went nowhere, and of one that was edited before, the edit hid what was
+    to hide: their boxes may well hold what is real.
     """
     splats, world_from_local = scene.background.gaussians, scene.background.world_from_local
     found, standing = torch.zeros(len(splats), dtype=torch.bool), parked(scene)
     tracks = set(tracks)
-    for actor in (a for a in scene.actors if a.track in tracks):
+    for actor in (a for a in scene.actors if a.track in tracks and not a.anew):
         for pose in _dense(actor.trajectory, float(actor.asset.size[0]) / 2):
             _mark(found, splats, inverse(pose) @ world_from_local, actor.asset.size, GHOST_FLOOR, GHOST_MARGIN)
     for pose, size in (box for track, box in standing.items() if track in tracks):

@@ -1,16 +1,16 @@
 """Edits of a scene folder: layers that add, change and remove actors, and leave the files of everything else as they were.
 
-edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings. Deleting the layer undoes it; `undo` tidies up too.
+edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings, and says which ones of the background it hides. Deleting
+the layer undoes it; `undo` tidies up too.
 """
 
 from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
@@ -21,7 +21,7 @@ from scenes.scene import Scene
 from scenes.usd import new_stage, open_stage, own_data, set_own_data, valid_names
 from scenes.usd_deformation import author_weights, block_deformation
 from scenes.usd_root import add_sublayer, drop_sublayer
-from scenes.usd_scene import author_actor, author_path, read_edits, read_metadata
+from scenes.usd_scene import author_actor, author_path, load_recorded, read_edits, read_metadata
 from scenes.usd_splats import only_splats, save_asset, to_json
 
 
@@ -65,13 +65,14 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     check_edit(edit, scene)
     origin, prims = int(read_metadata(path)["origin_us"]), _prims(path)
     changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
-    hidden = ghosts(scene, edit.tracks()).numpy()
+    # of what was recorded, whatever other edits say: any of them may be undone
+    hidden = ghosts(load_recorded(path), edit.tracks()).nonzero()[:, 0].tolist()
 
     def files(folder: Path) -> None:
         for track, asset in edit.replace.items():
             save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
-        if hidden.any():
-            _save_hidden(path, folder / "hidden.usdc", hidden)
+        if hidden:
+            _save_hidden(path, folder / "hidden.usda", hidden)
 
     def author(layer: Usd.Stage) -> None:
         layer.OverridePrim("/World")
@@ -87,8 +88,8 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
             if actor.track in edit.replace:
                 block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
-        if hidden.any():
-            layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usdc"]
+        if hidden:
+            layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
     _write(path, name, meta, files, author)
 
@@ -150,16 +151,16 @@ def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], au
         raise
 
 
-def _save_hidden(scene: Path, file: Path, hidden: np.ndarray) -> None:
-    """A layer in which the background's opacities `[N]` are 0 where `hidden`, in the precision that the background has."""
+def _save_hidden(scene: Path, file: Path, hidden: Iterable[int]) -> None:
+    """A layer that edits the background's opacities, 0 for these splats and no word of the rest: so each edit hides its own."""
     with open_stage(scene / "scene.usda") as stage:
         splats = UsdVol.ParticleField3DGaussianSplat(only_splats(stage.GetPrimAtPath("/World/Background"), scene))
         full = splats.GetOpacitiesAttr()
         attribute = full if full.HasAuthoredValue() else splats.GetOpacitieshAttr()
-        values = np.array(attribute.Get(Usd.TimeCode.EarliestTime()))
         where, name, kind = splats.GetPath(), attribute.GetName(), attribute.GetTypeName()
-    values[hidden] = 0
-    make = Vt.FloatArray if values.dtype == np.float32 else Vt.HalfArray
+    builder = Vt.FloatArrayEditBuilder() if kind == Sdf.ValueTypeNames.FloatArray else Vt.HalfArrayEditBuilder()
+    for splat in hidden:
+        builder.Write(0.0, splat)
     with new_stage(file, "World") as layer:
         layer.OverridePrim("/World")
-        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(make.FromNumpy(values))
+        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(builder.FinalizeAndReset())

@@ -5,15 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from pxr import Usd, UsdGeom, UsdVol
+from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
 from scenes.edit import HIDDEN, Edit, edited
+from scenes.insert import insert
+from scenes.placement import Placement
 from scenes.poses import translation
-from scenes.usd import usd_problems
+from scenes.usd import new_stage, usd_problems
 from scenes.usd_edit import add_change, add_edit, undo
-from scenes.usd_root import RECORDED
+from scenes.usd_root import RECORDED, add_sublayer
 
 
 def busy() -> Scene:
@@ -100,6 +102,15 @@ def test_removing_an_actor_leaves_no_ghost_and_harms_nothing_else():
     assert (means[hidden][:, 2] > 0.2).all()
 
 
+@pytest.mark.parametrize("edit", [Edit(remove=("veh_1",)), Edit(shift={"inserted_car_0001": (0.0, 3.0)})], ids=["shifted", "inserted"])
+def test_where_an_actor_only_virtually_stood_nothing_is_hidden(edit):
+    """Both stand where veh_2 left its ghost, which is as real as a wall to them."""
+    scene = edited(busy(), Edit(shift={"veh_1": (8.0, 5.5)}))
+    scene = insert(scene, car(), Placement("car/0001", 10.0, -3.0)).scene
+    before, after = (s.background.gaussians.logit_opacities for s in (scene, edited(scene, edit)))
+    assert torch.equal(after, before)
+
+
 def parking() -> Scene:
     """The street with a car of splats that the background holds, as a log's boxes tell."""
     scene, place = busy(), translation(20.0, -7.0, 0.0)
@@ -137,6 +148,60 @@ def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
     assert place() == pytest.approx(-2.0)
     undo(saved, "first")
     assert place() == pytest.approx(-3.0)
+
+
+def shown(scene: Scene) -> torch.Tensor:
+    return scene.background.gaussians.logit_opacities > HIDDEN + 1e-3
+
+
+def test_an_edit_of_what_was_shifted_hides_what_the_recording_says(saved):
+    """And nothing of where the first edit put it, so that either can be undone alone."""
+    ghost_alone = shown(edited(busy(), Edit(remove=("veh_2",))))
+    onto_more = Edit(shift={"veh_2": (0.0, 5.5)}), Edit(remove=("veh_2",))  # veh_1 comes along there
+    for name, edit in zip(("shift", "gone"), onto_more, strict=True):
+        add_change(saved, name, load(saved), edit, {})
+    assert torch.equal(shown(load(saved)), ghost_alone)
+    undo(saved, "shift")
+    assert torch.equal(shown(load(saved)), ghost_alone)
+    undo(saved, "gone")
+    assert shown(load(saved)).all()
+
+
+@pytest.mark.parametrize("undone", [undo, lambda scene, name: (scene / "edits" / f"{name}.usda").unlink()], ids=["undo", "by hand"])
+@pytest.mark.parametrize("half", [False, True])
+def test_undoing_an_edit_shows_again_what_it_alone_hid(tmp_path, undone, half):
+    scene, edits = parking(), {"first": Edit(("veh_7",), shift={"veh_2": (0.0, 1.0)}), "second": Edit(remove=("veh_2",))}
+    alone = {name: shown(edited(scene, edit)) for name, edit in edits.items()}
+    save(scene, tmp_path / "s1", half=half)
+    for name, edit in edits.items():
+        add_change(tmp_path / "s1", name, load(tmp_path / "s1"), edit, {})
+    assert torch.equal(shown(load(tmp_path / "s1")), alone["first"] & alone["second"])
+    undone(tmp_path / "s1", "first")
+    assert torch.equal(shown(load(tmp_path / "s1")), alone["second"]) and not torch.equal(*alone.values())
+    stage = Usd.Stage.Open(str(tmp_path / "s1" / "scene.usda"))
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Background/Gaussians"))
+    seen = (splats.GetOpacitieshAttr() if half else splats.GetOpacitiesAttr()).Get()
+    assert [v > 0 for v in seen] == alone["second"].tolist()
+
+
+def test_a_scene_of_before_whose_edits_hold_all_opacities_still_loads(saved):
+    """As Sidestep wrote them before an edit held only what it hides."""
+    (saved / "edits" / "old").mkdir()
+    hidden = torch.arange(len(busy().background.gaussians)) % 3 == 0
+    with new_stage(saved / "edits" / "old" / "hidden.usdc", "World") as layer:
+        layer.OverridePrim("/World")
+        splats = layer.OverridePrim("/World/Background/Gaussians")
+        values = Vt.FloatArray.FromNumpy(torch.where(hidden, 0.0, 0.5).numpy())
+        splats.CreateAttribute("opacities", Sdf.ValueTypeNames.FloatArray, False).Set(values)
+    with new_stage(saved / "edits" / "old.usda", "World") as layer:
+        layer.OverridePrim("/World")
+        layer.GetRootLayer().subLayerPaths = ["./old/hidden.usdc"]
+    add_sublayer(saved, "./edits/old.usda")
+    assert torch.equal(shown(load(saved)), ~hidden)
+    add_change(saved, "new", load(saved), Edit(remove=("veh_2",)), {})
+    assert torch.equal(shown(load(saved)), ~hidden & shown(edited(busy(), Edit(remove=("veh_2",)))))
+    undo(saved, "old")
+    assert torch.equal(shown(load(saved)), shown(edited(busy(), Edit(remove=("veh_2",)))))
 
 
 def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
