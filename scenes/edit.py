@@ -54,13 +54,20 @@ class Edit:
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 
 
+def named(entry: Mapping) -> list[str]:
+    """The tracks that an edit changes, of its entry in a scene's `meta["edits"]` as `sidestep edit` writes it; of others none."""
+    return [track for key in ("remove", "shift_m", "replace", "retime_us") for track in entry.get(key, ())]
+
+
 def check_edit(edit: Edit, scene: Scene) -> None:
     """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing."""
     have, standing = {a.track: a for a in scene.actors}, parked(scene)
     for track in edit.tracks():
         if track not in have and track not in standing:
-            names = [*have, *standing]
-            raise ValueError(unknown("actor", track, str(scene.meta.get("path", scene.meta.get("name", "the scene"))), names))
+            where, names = str(scene.meta.get("path", scene.meta.get("name", "the scene"))), [*have, *standing]
+            if by := next((e["name"] for e in scene.meta.get("edits", []) if track in e.get("remove", ())), None):
+                raise ValueError(f"{track} is not in {where} any more: the edit {by} removed it; --undo {by} brings it back")
+            raise ValueError(unknown("actor", track, where, names))
         if track not in have and track not in edit.remove:
             raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):

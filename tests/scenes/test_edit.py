@@ -213,6 +213,58 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
 
 
+def put_in(scene, name="new"):
+    add_edit(scene, name, [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), name)], {"kind": "insert"})
+
+
+IDLE = {"gone": Edit(remove=("new",)), "other": Edit(replace={"new": car()}), "aside": Edit(shift={"new": (1.0, 0.0)})}
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+@pytest.mark.parametrize("name", IDLE)
+def test_undoing_what_brought_an_actor_takes_along_what_changed_only_that(saved, name, by_hand):
+    put_in(saved)
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file() and "new" not in p.name}
+    add_change(saved, name, load(saved), IDLE[name], {})
+    if by_hand:
+        (saved / "edits" / "new.usda").unlink()
+        same(load(saved), busy())
+    assert undo(saved, "new") == [name]
+    assert {p for p in saved.rglob("*") if p.is_file()} == {p for p in before if "new" not in p.parts}
+    same(load(saved), busy())
+    put_in(saved)
+    assert [a.track for a in load(saved).actors][-1] == "new"
+
+
+def test_an_edit_of_what_was_brought_and_of_more_is_undone_first(saved):
+    put_in(saved)
+    add_change(saved, "both", load(saved), Edit(remove=("new", "veh_1")), {})
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match="both changes more than new, which new brought; undo both, first both: --undo both --undo new"):
+        undo(saved, "new")
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+    assert undo(saved, "both") == [] and undo(saved, "new") == []
+    same(load(saved), busy())
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_an_edit_of_an_actor_that_went_by_hand_does_not_meet_the_next_one_of_its_name(saved, name):
+    put_in(saved)
+    add_change(saved, name, load(saved), IDLE[name], {})
+    (saved / "edits" / "new.usda").unlink()
+    put_in(saved)
+    after = load(saved)
+    assert [a.track for a in after.actors] == ["veh_1", "veh_2", "veh_3", "new"] and after.actors[-1].asset.label == "van"
+    assert after.actors[-1].trajectory.world_from_body[0, 0, 3] == 9.0
+
+
+def test_the_track_of_a_removed_actor_stays_its_own(saved):
+    put_in(saved)
+    add_change(saved, "gone", load(saved), Edit(remove=("new",)), {})
+    with pytest.raises(ValueError, match='already has an actor "new"'):
+        add_edit(saved, "again", [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), "new")], {})
+
+
 def test_a_shifted_actor_stays_on_the_ground():
     slope = Ground((0.1 * torch.arange(-20.0, 20.0))[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
     scene = replace(busy(), ground=slope)
@@ -244,6 +296,12 @@ def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
     with pytest.raises(ValueError, match=said):
         add_change(saved, "mine", load(saved), edit, {})
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+
+
+def test_editing_what_an_edit_removed_names_that_edit(saved):
+    add_change(saved, "mine", load(saved), Edit(remove=("veh_2",)), {"kind": "edit", "remove": ["veh_2"]})
+    with pytest.raises(ValueError, match="veh_2 is not in street any more: the edit mine removed it; --undo mine brings it back"):
+        add_change(saved, "more", load(saved), Edit(shift={"veh_2": (1.0, 0.0)}), {})
 
 
 def test_an_edited_scene_moved_elsewhere_keeps_its_edits(saved, tmp_path):
