@@ -86,7 +86,9 @@ class Insert:
         scene, _ = open_scene(self.scene)
         placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.path, self.trajectory)
         result = insert(scene, Databank(self.databank).load(self.asset), placement, int(scene.ego.times_us[0]) + self.start)
-        about = {"kind": "insert", "asset": self.asset, "at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}
+        straight = {"at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}
+        way = straight if self.trajectory is None else {"trajectory": self.trajectory.name}
+        about = {"kind": "insert", "asset": self.asset, **way}
         add_edit(self.scene, result.actor.track, [result.actor], about)
         recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
         warn([*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))])

@@ -111,9 +111,12 @@ class Edit:
         from scenes import edit as edits
         from scenes.usd_edit import add_change, free_name, undo
 
-        for name in self.undo:
-            undo(self.scene, name)
-            print(f"{self.scene} is again as it was without {name}")
+        went: list[str] = []
+        for name in (n for n in self.undo if n not in went):
+            idle = undo(self.scene, name)
+            also = f", and without {', '.join(idle)}, which changed only what {name} had brought" if idle else ""
+            print(f"{self.scene} is again as it was without {name}{also}")
+            went += idle
         if not asked:
             return
         scene, _ = open_scene(self.scene)

@@ -54,13 +54,20 @@ class Edit:
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 
 
+def named(entry: Mapping) -> list[str]:
+    """The tracks that an edit changes, of its entry in a scene's `meta["edits"]` as `sidestep edit` writes it; of others none."""
+    return [track for key in ("remove", "shift_m", "replace", "retime_us") for track in entry.get(key, ())]
+
+
 def check_edit(edit: Edit, scene: Scene) -> None:
     """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing."""
     have, standing = {a.track: a for a in scene.actors}, parked(scene)
     for track in edit.tracks():
         if track not in have and track not in standing:
-            names = [*have, *standing]
-            raise ValueError(unknown("actor", track, str(scene.meta.get("path", scene.meta.get("name", "the scene"))), names))
+            where, names = str(scene.meta.get("path", scene.meta.get("name", "the scene"))), [*have, *standing]
+            if by := next((e["name"] for e in scene.meta.get("edits", []) if track in e.get("remove", ())), None):
+                raise ValueError(f"{track} is not in {where} any more: the edit {by} removed it; --undo {by} brings it back")
+            raise ValueError(unknown("actor", track, where, names))
         if track not in have and track not in edit.remove:
             raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):
@@ -92,12 +99,13 @@ def ghosts(scene: Scene, tracks: Iterable[str]) -> torch.Tensor:
     """Mask `[N]` of background splats inside a box that these actors moved through, or in which these vehicles are parked.
 
     Nothing else can have stood where an actor went: a fit paints into the background what the actor's box did not quite explain of it,
-    and that is seen once the actor has gone.
+    and that is seen once the actor has gone. An inserted actor went nowhere, and of one that was edited before, the edit hid what was
+    to hide: their boxes may well hold what is real.
     """
     splats, world_from_local = scene.background.gaussians, scene.background.world_from_local
     found, standing = torch.zeros(len(splats), dtype=torch.bool), parked(scene)
     tracks = set(tracks)
-    for actor in (a for a in scene.actors if a.track in tracks):
+    for actor in (a for a in scene.actors if a.track in tracks and not a.anew):
         for pose in _dense(actor.trajectory, float(actor.asset.size[0]) / 2):
             _mark(found, splats, inverse(pose) @ world_from_local, actor.asset.size, GHOST_FLOOR, GHOST_MARGIN)
     for pose, size in (box for track, box in standing.items() if track in tracks):

@@ -12,6 +12,7 @@ import torch
 from scenes.asset import Actor, Asset
 from scenes.collide import collisions
 from scenes.detail import coarser
+from scenes.edit import named
 from scenes.lane import Lane
 from scenes.match import matched
 from scenes.metres import require_metres
@@ -215,9 +216,11 @@ def _world(body: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
 
 
 def _track(scene: Scene, asset: str) -> str:
-    """A track name that the scene does not have yet and that USD takes: car/0003 becomes car_0003, car_0003_2, ..."""
+    """A track name that neither the scene nor an edit of it has, and that USD takes: car/0003 becomes inserted_car_0003, ..._2, ..."""
     base = "inserted_" + re.sub(r"\W", "_", asset)
-    taken = {actor.track for actor in scene.actors}
+    edits = scene.meta.get("edits", [])
+    taken = {actor.track for actor in scene.actors} | {track for edit in edits for track in named(edit)}
+    taken |= {edit["name"] for edit in edits if not edit.get("missing")}  # of `sidestep insert` the name of what it brought
     number = 1
     while (name := base if number == 1 else f"{base}_{number}") in taken:
         number += 1

@@ -1,16 +1,16 @@
 """Edits of a scene folder: layers that add, change and remove actors, and leave the files of everything else as they were.
 
-edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings. Deleting the layer undoes it; `undo` tidies up too.
+edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings, and says which ones of the background it hides. Deleting
+the layer undoes it; `undo` tidies up too.
 """
 
 from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
@@ -20,8 +20,8 @@ from scenes.names import unknown
 from scenes.scene import Scene
 from scenes.usd import new_stage, open_stage, own_data, set_own_data, valid_names
 from scenes.usd_deformation import author_weights, block_deformation
-from scenes.usd_root import add_sublayer, drop_sublayer
-from scenes.usd_scene import author_actor, author_path, read_edits, read_metadata
+from scenes.usd_root import RECORDED, add_sublayer, drop_sublayer
+from scenes.usd_scene import author_actor, author_path, defines, load_recorded, read_edits, read_metadata
 from scenes.usd_splats import only_splats, save_asset, to_json
 
 
@@ -34,12 +34,12 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     """
     scene = Path(scene)
     origin = int(read_metadata(scene)["origin_us"])
-    standing = _prims(scene)
+    standing, taken = _prims(scene)
     for actor in actors:
         if actor.track in standing:
             raise ValueError(f'{scene} already has an actor "{actor.track}"; give the new one another track name')
         standing[actor.track] = ""
-    names = valid_names((a.track for a in actors), [Path(p).name for p in standing.values() if p])
+    names = valid_names((a.track for a in actors), taken)
 
     def files(folder: Path) -> None:
         for actor in actors:
@@ -63,15 +63,16 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     """
     path = Path(path)
     check_edit(edit, scene)
-    origin, prims = int(read_metadata(path)["origin_us"]), _prims(path)
+    origin, (prims, _) = int(read_metadata(path)["origin_us"]), _prims(path)
     changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
-    hidden = ghosts(scene, edit.tracks()).numpy()
+    # of what was recorded, whatever other edits say: any of them may be undone
+    hidden = ghosts(load_recorded(path), edit.tracks()).nonzero()[:, 0].tolist()
 
     def files(folder: Path) -> None:
         for track, asset in edit.replace.items():
             save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
-        if hidden.any():
-            _save_hidden(path, folder / "hidden.usdc", hidden)
+        if hidden:
+            _save_hidden(path, folder / "hidden.usda", hidden)
 
     def author(layer: Usd.Stage) -> None:
         layer.OverridePrim("/World")
@@ -87,24 +88,31 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
             if actor.track in edit.replace:
                 block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
-        if hidden.any():
-            layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usdc"]
+        if hidden:
+            layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
     _write(path, name, meta, files, author)
 
 
-def undo(scene: str | Path, name: str) -> None:
-    """Take an edit out of a scene folder, with all its files; also one whose layer was deleted by hand. ValueError for no such edit."""
+def undo(scene: str | Path, name: str) -> list[str]:
+    """Take an edit out of a scene folder, with all its files; also one whose layer was deleted by hand.
+
+    With it go the edits that changed only actors which it brought; returns their names. ValueError for no such edit, and where an edit
+    changes such an actor and something else.
+    """
     scene = Path(scene)
     read_metadata(scene)
+    layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
     with open_stage(scene / "scene.usda") as stage:
         have = [e["name"] for e in read_edits(stage)]
-    layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
-    if name not in have and not (_is_name(name) and (layer.exists() or folder.exists())):
-        raise ValueError(unknown("edit", name, str(scene), have))
-    drop_sublayer(scene, f"./edits/{name}.usda")
-    layer.unlink(missing_ok=True)
-    shutil.rmtree(folder, ignore_errors=True)
+        if name not in have and not (_is_name(name) and (layer.exists() or folder.exists())):
+            raise ValueError(unknown("edit", name, str(scene), have))
+        idle = _idle_without(stage, name)
+    for each in (*idle, name):
+        drop_sublayer(scene, f"./edits/{each}.usda")
+        (scene / "edits" / f"{each}.usda").unlink(missing_ok=True)
+        shutil.rmtree(scene / "edits" / each, ignore_errors=True)
+    return idle
 
 
 def free_name(scene: Path, wish: str) -> str:
@@ -120,11 +128,36 @@ def _is_name(name: str) -> bool:
     return re.fullmatch(r"[A-Za-z0-9][\w-]*", name, flags=re.ASCII) is not None
 
 
-def _prims(scene: Path) -> dict[str, str]:
-    """Prim path of every actor of a scene folder, by track."""
+def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
+    """Edits that change nothing but actors which the edit `name` alone defines, or defined before its layer was deleted."""
+    root, out = stage.GetRootLayer(), []
+    layers = {Path(sub).stem: Sdf.Layer.Find(root.ComputeAbsolutePath(sub)) for sub in root.subLayerPaths if sub != RECORDED}
+    own = layers.pop(name, None)
+    rest = [layer for layer in stage.GetLayerStack() if layer != own]
+    gone = {p.GetName() for p in _children(stage) if not defines(rest, p) and (own is None or defines([own], p))}
+    for edit, layer in layers.items():
+        actors = layer and layer.GetPrimAtPath("/World/Actors")
+        changed = set(actors.nameChildren.keys()) if actors else set()
+        if changed & gone and (changed - gone or layer.subLayerPaths):
+            lost = ", ".join(sorted(changed & gone))
+            raise ValueError(f"{edit} changes more than {lost}, which {name} brought; undo both, first {edit}: --undo {edit} --undo {name}")
+        if changed & gone:
+            out.append(edit)
+    return out
+
+
+def _children(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Every prim under /World/Actors: those too that are removed, or that only edits speak of."""
+    group = stage.GetPrimAtPath("/World/Actors")
+    return group.GetAllChildren() if group else []
+
+
+def _prims(scene: Path) -> tuple[dict[str, str], list[str]]:
+    """Prim path of every actor of a scene folder, removed ones too, by track; and the names that prims have there."""
     with open_stage(scene / "scene.usda") as stage:
-        group = stage.GetPrimAtPath("/World/Actors")
-        return {own_data(p).get("track", p.GetName()): str(p.GetPath()) for p in (group.GetChildren() if group else [])}
+        prims, layers = _children(stage), stage.GetLayerStack()
+        paths = {own_data(p).get("track", p.GetName()): str(p.GetPath()) for p in prims if defines(layers, p)}
+        return paths, [p.GetName() for p in prims]
 
 
 def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], author: Callable[[Usd.Stage], None]) -> None:
@@ -150,16 +183,16 @@ def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], au
         raise
 
 
-def _save_hidden(scene: Path, file: Path, hidden: np.ndarray) -> None:
-    """A layer in which the background's opacities `[N]` are 0 where `hidden`, in the precision that the background has."""
+def _save_hidden(scene: Path, file: Path, hidden: Iterable[int]) -> None:
+    """A layer that edits the background's opacities, 0 for these splats and no word of the rest: so each edit hides its own."""
     with open_stage(scene / "scene.usda") as stage:
         splats = UsdVol.ParticleField3DGaussianSplat(only_splats(stage.GetPrimAtPath("/World/Background"), scene))
         full = splats.GetOpacitiesAttr()
         attribute = full if full.HasAuthoredValue() else splats.GetOpacitieshAttr()
-        values = np.array(attribute.Get(Usd.TimeCode.EarliestTime()))
         where, name, kind = splats.GetPath(), attribute.GetName(), attribute.GetTypeName()
-    values[hidden] = 0
-    make = Vt.FloatArray if values.dtype == np.float32 else Vt.HalfArray
+    builder = Vt.FloatArrayEditBuilder() if kind == Sdf.ValueTypeNames.FloatArray else Vt.HalfArrayEditBuilder()
+    for splat in hidden:
+        builder.Write(0.0, splat)
     with new_stage(file, "World") as layer:
         layer.OverridePrim("/World")
-        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(make.FromNumpy(values))
+        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(builder.FinalizeAndReset())

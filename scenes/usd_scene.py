@@ -17,6 +17,7 @@ metadata.json     what USD cannot carry exactly: lenses, image sizes, exposures,
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -146,6 +147,12 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
     return out
 
 
+def defines(layers: Iterable[Sdf.Layer], prim: Usd.Prim) -> bool:
+    """Whether one of these layers defines a prim itself: what an edit gives another asset still seems defined once its actor is gone."""
+    specs = (layer.GetPrimAtPath(prim.GetPath()) for layer in layers)
+    return any(spec and spec.specifier == Sdf.SpecifierDef for spec in specs)
+
+
 def author_actor(stage: Usd.Stage, name: str, actor: Actor, asset_file: str, origin: int, **data) -> None:
     """Define /World/Actors/<name>: a reference to an asset file, moving along the actor's trajectory while it covers the time, and
     deforming as it does."""
@@ -251,7 +258,8 @@ def _actor_prims(stage: Usd.Stage, edits: list[str]) -> list[Usd.Prim]:
     """The scene's own actors, then those each edit adds, the oldest first: so no insertion changes an earlier actor's instance id."""
     group = stage.GetPrimAtPath("/World/Actors")
     order = {name: i for i, name in enumerate(edits)}
-    return sorted(group.GetChildren() if group else [], key=lambda p: order.get(own_data(p).get("edit", ""), -1))
+    prims = [p for p in (group.GetChildren() if group else []) if defines(stage.GetLayerStack(), p)]
+    return sorted(prims, key=lambda p: order.get(own_data(p).get("edit", ""), -1))
 
 
 def _load_actor(prim: Usd.Prim, path: Path, origin: int, clean: Clean) -> Actor:

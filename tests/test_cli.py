@@ -121,6 +121,22 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
     assert load(street).actors[0].asset.label == "car"
 
 
+def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    street, bank = str(tmp_path / "street"), ["--databank", "bank"]
+    put_in = ["insert", street, "--asset", "car/0001", "--at", "20m,-3.5m", *bank]
+    door(put_in)
+    door(["edit", street, "--replace", "inserted_car_0001=van/0001", *bank])
+    out, _ = door(["edit", street, "--undo", "inserted_car_0001", "--undo", "edit"])
+    assert "without inserted_car_0001, and without edit, which changed only what inserted_car_0001 had brought" in out
+    door(put_in)
+    door(["edit", street, "--remove", "inserted_car_0001"])
+    assert "inserted_car_0001_2" in door(put_in)[0]
+    assert [a.track for a in load(street).actors] == ["veh_1", "inserted_car_0001_2"]
+    _, errors = door(["edit", street, "--shift", "inserted_car_0001=1m,0m"], 1)
+    assert "the edit edit removed it; --undo edit brings it back" in errors
+
+
 def test_an_asset_can_follow_a_csv(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.5,15,0\n")
@@ -128,6 +144,8 @@ def test_an_asset_can_follow_a_csv(door, tmp_path):
     door(["insert", str(tmp_path / "street"), "--asset", "car/0001", *path, "--databank", "bank"])
     actor = load(tmp_path / "street").actors[-1]
     assert actor.trajectory.at(made.START_US + 250_000)[:2, 3].tolist() == pytest.approx([12.5, 0])
+    (line,) = [line for line in door(["info", str(tmp_path / "street")])[0].splitlines() if line.startswith("edits")]
+    assert "trajectory t.csv" in line and "yaw_rad" not in line
 
 
 def test_the_databank_is_listed_and_shown(door):

@@ -5,15 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from pxr import Usd, UsdGeom, UsdVol
+from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
 from scenes.edit import HIDDEN, Edit, edited
+from scenes.insert import insert
+from scenes.placement import Placement
 from scenes.poses import translation
-from scenes.usd import usd_problems
+from scenes.usd import new_stage, usd_problems
 from scenes.usd_edit import add_change, add_edit, undo
-from scenes.usd_root import RECORDED
+from scenes.usd_root import RECORDED, add_sublayer
 
 
 def busy() -> Scene:
@@ -100,6 +102,15 @@ def test_removing_an_actor_leaves_no_ghost_and_harms_nothing_else():
     assert (means[hidden][:, 2] > 0.2).all()
 
 
+@pytest.mark.parametrize("edit", [Edit(remove=("veh_1",)), Edit(shift={"inserted_car_0001": (0.0, 3.0)})], ids=["shifted", "inserted"])
+def test_where_an_actor_only_virtually_stood_nothing_is_hidden(edit):
+    """Both stand where veh_2 left its ghost, which is as real as a wall to them."""
+    scene = edited(busy(), Edit(shift={"veh_1": (8.0, 5.5)}))
+    scene = insert(scene, car(), Placement("car/0001", 10.0, -3.0)).scene
+    before, after = (s.background.gaussians.logit_opacities for s in (scene, edited(scene, edit)))
+    assert torch.equal(after, before)
+
+
 def parking() -> Scene:
     """The street with a car of splats that the background holds, as a log's boxes tell."""
     scene, place = busy(), translation(20.0, -7.0, 0.0)
@@ -139,6 +150,60 @@ def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
     assert place() == pytest.approx(-3.0)
 
 
+def shown(scene: Scene) -> torch.Tensor:
+    return scene.background.gaussians.logit_opacities > HIDDEN + 1e-3
+
+
+def test_an_edit_of_what_was_shifted_hides_what_the_recording_says(saved):
+    """And nothing of where the first edit put it, so that either can be undone alone."""
+    ghost_alone = shown(edited(busy(), Edit(remove=("veh_2",))))
+    onto_more = Edit(shift={"veh_2": (0.0, 5.5)}), Edit(remove=("veh_2",))  # veh_1 comes along there
+    for name, edit in zip(("shift", "gone"), onto_more, strict=True):
+        add_change(saved, name, load(saved), edit, {})
+    assert torch.equal(shown(load(saved)), ghost_alone)
+    undo(saved, "shift")
+    assert torch.equal(shown(load(saved)), ghost_alone)
+    undo(saved, "gone")
+    assert shown(load(saved)).all()
+
+
+@pytest.mark.parametrize("undone", [undo, lambda scene, name: (scene / "edits" / f"{name}.usda").unlink()], ids=["undo", "by hand"])
+@pytest.mark.parametrize("half", [False, True])
+def test_undoing_an_edit_shows_again_what_it_alone_hid(tmp_path, undone, half):
+    scene, edits = parking(), {"first": Edit(("veh_7",), shift={"veh_2": (0.0, 1.0)}), "second": Edit(remove=("veh_2",))}
+    alone = {name: shown(edited(scene, edit)) for name, edit in edits.items()}
+    save(scene, tmp_path / "s1", half=half)
+    for name, edit in edits.items():
+        add_change(tmp_path / "s1", name, load(tmp_path / "s1"), edit, {})
+    assert torch.equal(shown(load(tmp_path / "s1")), alone["first"] & alone["second"])
+    undone(tmp_path / "s1", "first")
+    assert torch.equal(shown(load(tmp_path / "s1")), alone["second"]) and not torch.equal(*alone.values())
+    stage = Usd.Stage.Open(str(tmp_path / "s1" / "scene.usda"))
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Background/Gaussians"))
+    seen = (splats.GetOpacitieshAttr() if half else splats.GetOpacitiesAttr()).Get()
+    assert [v > 0 for v in seen] == alone["second"].tolist()
+
+
+def test_a_scene_of_before_whose_edits_hold_all_opacities_still_loads(saved):
+    """As Sidestep wrote them before an edit held only what it hides."""
+    (saved / "edits" / "old").mkdir()
+    hidden = torch.arange(len(busy().background.gaussians)) % 3 == 0
+    with new_stage(saved / "edits" / "old" / "hidden.usdc", "World") as layer:
+        layer.OverridePrim("/World")
+        splats = layer.OverridePrim("/World/Background/Gaussians")
+        values = Vt.FloatArray.FromNumpy(torch.where(hidden, 0.0, 0.5).numpy())
+        splats.CreateAttribute("opacities", Sdf.ValueTypeNames.FloatArray, False).Set(values)
+    with new_stage(saved / "edits" / "old.usda", "World") as layer:
+        layer.OverridePrim("/World")
+        layer.GetRootLayer().subLayerPaths = ["./old/hidden.usdc"]
+    add_sublayer(saved, "./edits/old.usda")
+    assert torch.equal(shown(load(saved)), ~hidden)
+    add_change(saved, "new", load(saved), Edit(remove=("veh_2",)), {})
+    assert torch.equal(shown(load(saved)), ~hidden & shown(edited(busy(), Edit(remove=("veh_2",)))))
+    undo(saved, "old")
+    assert torch.equal(shown(load(saved)), shown(edited(busy(), Edit(remove=("veh_2",)))))
+
+
 def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     for track in ("a", "b"):
         add_edit(saved, track, [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), track)], {})
@@ -146,6 +211,58 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     after = load(saved)
     assert [a.track for a in after.actors][-2:] == ["a", "b"]
     assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
+
+
+def put_in(scene, name="new"):
+    add_edit(scene, name, [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), name)], {"kind": "insert"})
+
+
+IDLE = {"gone": Edit(remove=("new",)), "other": Edit(replace={"new": car()}), "aside": Edit(shift={"new": (1.0, 0.0)})}
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+@pytest.mark.parametrize("name", IDLE)
+def test_undoing_what_brought_an_actor_takes_along_what_changed_only_that(saved, name, by_hand):
+    put_in(saved)
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file() and "new" not in p.name}
+    add_change(saved, name, load(saved), IDLE[name], {})
+    if by_hand:
+        (saved / "edits" / "new.usda").unlink()
+        same(load(saved), busy())
+    assert undo(saved, "new") == [name]
+    assert {p for p in saved.rglob("*") if p.is_file()} == {p for p in before if "new" not in p.parts}
+    same(load(saved), busy())
+    put_in(saved)
+    assert [a.track for a in load(saved).actors][-1] == "new"
+
+
+def test_an_edit_of_what_was_brought_and_of_more_is_undone_first(saved):
+    put_in(saved)
+    add_change(saved, "both", load(saved), Edit(remove=("new", "veh_1")), {})
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match="both changes more than new, which new brought; undo both, first both: --undo both --undo new"):
+        undo(saved, "new")
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+    assert undo(saved, "both") == [] and undo(saved, "new") == []
+    same(load(saved), busy())
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_an_edit_of_an_actor_that_went_by_hand_does_not_meet_the_next_one_of_its_name(saved, name):
+    put_in(saved)
+    add_change(saved, name, load(saved), IDLE[name], {})
+    (saved / "edits" / "new.usda").unlink()
+    put_in(saved)
+    after = load(saved)
+    assert [a.track for a in after.actors] == ["veh_1", "veh_2", "veh_3", "new"] and after.actors[-1].asset.label == "van"
+    assert after.actors[-1].trajectory.world_from_body[0, 0, 3] == 9.0
+
+
+def test_the_track_of_a_removed_actor_stays_its_own(saved):
+    put_in(saved)
+    add_change(saved, "gone", load(saved), Edit(remove=("new",)), {})
+    with pytest.raises(ValueError, match='already has an actor "new"'):
+        add_edit(saved, "again", [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), "new")], {})
 
 
 def test_a_shifted_actor_stays_on_the_ground():
@@ -179,6 +296,12 @@ def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
     with pytest.raises(ValueError, match=said):
         add_change(saved, "mine", load(saved), edit, {})
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+
+
+def test_editing_what_an_edit_removed_names_that_edit(saved):
+    add_change(saved, "mine", load(saved), Edit(remove=("veh_2",)), {"kind": "edit", "remove": ["veh_2"]})
+    with pytest.raises(ValueError, match="veh_2 is not in street any more: the edit mine removed it; --undo mine brings it back"):
+        add_change(saved, "more", load(saved), Edit(shift={"veh_2": (1.0, 0.0)}), {})
 
 
 def test_an_edited_scene_moved_elsewhere_keeps_its_edits(saved, tmp_path):

@@ -82,6 +82,16 @@ def test_one_asset_can_be_inserted_many_times(street):
     assert [a.track for a in scene.actors[1:]] == ["inserted_car_0001", "inserted_car_0001_2", "inserted_car_0001_3"]
 
 
+def test_an_inserted_track_is_none_that_an_edit_speaks_of(street):
+    edits = [
+        {"name": "inserted_car_0001", "kind": "insert"},
+        {"name": "edit", "kind": "edit", "remove": ["inserted_car_0001_2"], "shift_m": {"inserted_car_0001_3": [0.0, 1.0]}},
+        {"name": "inserted_car_0001_4", "missing": True},
+    ]
+    edited = replace(street, meta={**street.meta, "edits": edits})
+    assert insert(edited, car(), Placement("car/0001", 12, 3)).actor.track == "inserted_car_0001_4"
+
+
 def test_a_trajectory_file_is_followed(street, tmp_path):
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.3,13,0\n0.6,13,3\n")
     result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"), start_us=START_US)
