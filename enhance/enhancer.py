@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from enhance.corrections import Corrections, correct
 from enhance.net import MULTIPLE, Net, photos_of
-from enhance.past import Past
+from enhance.past import Past, alike, thin
 from enhance.precision import channels_last, has_bfloat16
 from enhance.step import Steps, checked
 from enhance.tiles import Tiles
@@ -30,6 +30,7 @@ class Memory:
     flow   whether they had flow
     since  `[1, 2, H, W]` each: flows of the frames since then, that needed nothing and cost nothing
     objects  by told object the correction of its colours so far
+    look   `[1, 3, h, w]`: the last frame that was told objects, as it came, thinned; None where none was
     """
 
     past: Past | None
@@ -37,6 +38,7 @@ class Memory:
     flow: bool
     since: tuple[torch.Tensor, ...] = ()
     objects: Corrections = field(default_factory=dict)
+    look: torch.Tensor | None = None
 
 
 class Enhancer:
@@ -108,9 +110,14 @@ class Enhancer:
         flow = None
         if given.flow is not None and memory is not None:
             flow = _pad(given.flow.to(self.device, torch.float32).permute(2, 0, 1)[None], value=torch.nan)
+        objects, look = (memory.objects, memory.look) if memory is not None else ({}, None)
+        if given.instance is not None:
+            now = thin(rgb.permute(2, 0, 1)[None])
+            # after a cut an object of the same id is another
+            objects, look = objects if look is None or bool(alike(now, look)[0]) else {}, now
         tiles = Tiles.of(torch.ones(height, width) if given.need is None else given.need)
         if tiles.nothing():
-            return rgb, self._skipped(memory, (height, width), flow)
+            return rgb, replace(self._skipped(memory, (height, width), flow), objects=objects, look=look)
         photos = None
         if given.reference is not None:
             reference, trust = (x.to(rgb) for x in given.reference)
@@ -120,10 +127,10 @@ class Enhancer:
         corrections: Corrections = {}
         if given.instance is not None:
             instance = given.instance.to(self.device)
-            planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), instance, memory.objects if memory else {})
+            planes, corrections = correct(self.net.objects, rgb.permute(2, 0, 1), instance, objects)
             rgb = torch.where(tiles.pixels().to(self.device)[..., None], planes.permute(1, 2, 0), rgb)
         if not self.repairs[photos is not None]:
-            return rgb.contiguous(), Memory(None, (height, width), given.flow is not None, objects=corrections)
+            return rgb.contiguous(), Memory(None, (height, width), given.flow is not None, objects=corrections, look=look)
         padded = _pad(rgb.permute(2, 0, 1)[None], mode="replicate")
         mask = None if given.instance is None else _pad(given.instance.to(self.device, torch.float32)[None, None], value=0)
         photos = None if photos is None else _pad(photos, value=0)
@@ -135,7 +142,7 @@ class Enhancer:
             else:
                 better, after = self.net.parts(padded, mask, past, photos, tiles)
         better = better[0, :, :height, :width].permute(1, 2, 0).clamp(0, 1).contiguous()
-        return better, Memory(after, (height, width), given.flow is not None, objects=corrections)
+        return better, Memory(after, (height, width), given.flow is not None, objects=corrections, look=look)
 
     def _brought(self, memory: Memory, flow: torch.Tensor | None, rgb: torch.Tensor) -> Past | None:
         """The past of a memory as it would look in the frame `rgb`."""
@@ -154,8 +161,8 @@ class Enhancer:
         since = memory.since if flow is None else (*memory.since, flow)
         flowing = memory.flow or flow is not None
         if memory.past is None or len(since) > LONGEST:
-            return Memory(None, size, flowing, objects=memory.objects)
-        return Memory(memory.past, size, flowing, since, memory.objects)
+            return Memory(None, size, flowing)
+        return Memory(memory.past, size, flowing, since)
 
 
 def _pad(image: torch.Tensor, **how) -> torch.Tensor:

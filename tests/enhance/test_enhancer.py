@@ -216,3 +216,32 @@ def test_what_photos_say_is_followed_as_far_as_it_is_trusted_where_there_is_need
     assert torch.equal(part[:32], rgb[:32]) and torch.equal(part[32:], better[32:])
     with pytest.raises(ValueError, match="trust"):
         plain.step(frame(rgb, reference=reference, trust=trust[:5]))
+
+
+def told(seed, hue=(1.0, 1.0, 1.0), shift=0):
+    """A smooth street with an object in other colours, told as 1, `shift` pixels to the right."""
+    coarse = torch.rand(1, 3, 6, 9, generator=torch.Generator().manual_seed(seed))
+    street = torch.nn.functional.interpolate(coarse, (96, 160), mode="bicubic", align_corners=False)[0].permute(1, 2, 0).clamp(0, 1)
+    street = street.roll(shift, 1)
+    instance = torch.zeros(96, 160, dtype=torch.int32)
+    instance[30:70, 60 + shift : 110 + shift] = 1
+    rgb = torch.where(instance[..., None] == 1, (street * torch.tensor(hue)).clamp(0, 1), street)
+    return frame(rgb, instance=instance)
+
+
+def test_after_a_cut_objects_begin_anew():
+    """The shipped weights: an object told 12 times in wrong colours, then one of the same id elsewhere."""
+    shipped, memory = Enhancer.load(), None
+    for _ in range(12):
+        better, memory = shipped.step(told(1, (0.5, 1.4, 0.5)), memory)
+    assert memory.objects[1][1] == 12
+    after, memory = shipped.step(told(2), memory)
+    alone, fresh = shipped.step(told(2))
+    assert torch.equal(after, alone) and memory.objects[1][1] == fresh.objects[1][1] == 1
+
+
+def test_what_moves_on_is_no_cut():
+    shipped, memory = Enhancer.load(), None
+    for i in range(4):
+        _, memory = shipped.step(told(1, shift=6 * i), memory)
+    assert memory.objects[1][1] == 4
