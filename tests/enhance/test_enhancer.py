@@ -243,5 +243,5 @@ def test_after_a_cut_objects_begin_anew():
 def test_what_moves_on_is_no_cut():
     shipped, memory = Enhancer.load(), None
     for i in range(4):
-        _, memory = shipped.step(told(1, shift=6 * i), memory)
+        _, memory = shipped.step(told(1, shift=2 * i), memory)
     assert memory.objects[1][1] == 4
