@@ -140,7 +140,7 @@ def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
         changed = set(actors.nameChildren.keys()) if actors else set()
         if changed & gone and (changed - gone or layer.subLayerPaths):
             lost = ", ".join(sorted(changed & gone))
-            raise ValueError(f"{edit} changes more than {lost}, which {name} brought; undo both, first {edit}: --undo {edit} --undo {name}")
+            raise ValueError(f"the edit {edit} changes more than {lost}, which {name} brought; undo both: --undo {edit} --undo {name}")
         if changed & gone:
             out.append(edit)
     return out

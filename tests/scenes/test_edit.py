@@ -240,7 +240,7 @@ def test_an_edit_of_what_was_brought_and_of_more_is_undone_first(saved):
     put_in(saved)
     add_change(saved, "both", load(saved), Edit(remove=("new", "veh_1")), {})
     before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    with pytest.raises(ValueError, match="both changes more than new, which new brought; undo both, first both: --undo both --undo new"):
+    with pytest.raises(ValueError, match="the edit both changes more than new, which new brought; undo both: --undo both --undo new"):
         undo(saved, "new")
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
     assert undo(saved, "both") == [] and undo(saved, "new") == []
