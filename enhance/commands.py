@@ -46,7 +46,7 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.clips import PairConfig
-        from enhance.pairs import check_kinds, kinds_for, make_pairs, open_reconstruction, prepare_sources
+        from enhance.pairs import check_cameras, check_kinds, kinds_for, make_pairs, open_reconstruction, prepare_sources
         from enhance.photo_pairs import make_photo_pairs
         from recon import open_log
         from render.progress import Progress
@@ -54,12 +54,18 @@ class Pairs:
         if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
+        if self.kinds == ():
+            raise UsageError("--kinds names none; leave it out for all that can be made")
+        names = [path.resolve().name for path in self.scenes]
+        if twice := sorted({n for n in names if names.count(n) > 1}):
+            raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
         check_kinds(self.kinds or ())
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
         for path, data in zip(self.scenes, self.data, strict=True):
             scene, log = open_reconstruction(path), open_log(data)
+            cameras = check_cameras(scene, log, self.cameras)
             kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
             relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / path.name
@@ -70,7 +76,7 @@ class Pairs:
                     steps.total = total
                     steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, kinds, self.cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
+                make_pairs(scene, log, out, kinds, cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
         make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 

@@ -159,7 +159,7 @@ def _relit(clip: Clip, rng: np.random.Generator, relit: Relit, region: torch.Ten
 def _shadow(clip: Clip, rng: np.random.Generator, sources: Sources) -> Damage:
     """An asset that stands in the photo without its shadow; the target has it, of the scene's own sky or of another."""
     if not sources.assets:
-        raise ValueError("shadow pairs need assets to put in; pass sources.assets, or a databank that has some")
+        raise ValueError("shadow pairs need assets to put in; give a databank that has some (--databank), or sources.assets")
     sky = random_sky(rng, sources.skies) if rng.random() < 0.5 else None
     try:
         bare, shaded, region, scene, what = put_in(clip, under(clip.scene, sky), sources.assets, rng)

@@ -95,7 +95,7 @@ def evaluate(
     for kind in KINDS:
         shards = spread(pairs.of(kind, split), limit)
         put_in = any("instances" in s.meta for s in shards)
-        photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if any(s.referenced for s in shards) else ()
+        photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if kind in RENDERED or any(s.referenced for s in shards) else ()
         mine = enhancer if kind in RENDERED else of_photos
         for method in (*METHODS, *((PUT_IN,) if put_in else ()), *photos, *others) if shards else ():
             if progress is not None:

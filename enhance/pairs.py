@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -61,15 +62,10 @@ def make_pairs(
     scene = open_reconstruction(scene_path)
     log = log_path if isinstance(log_path, Log) else open_log(log_path)
     kinds = check_kinds(kinds)
-    both = [name for name in log.cameras if name in scene.rig]
-    for name in cameras or ():
-        if name not in both:
-            raise ValueError(unknown("camera", name, "both the scene and its recording", both))
-    chosen = list(cameras or both)
-    if not chosen:
-        raise ValueError("the scene and the recording have no camera in common; make the pairs from the drive that the scene came from")
+    chosen = check_cameras(scene, log, cameras)
     out = Path(out)
-    _claim(out, {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every})
+    settings = {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every}
+    claim(out, settings, {"scene": _digest(scene), "recording": log.name})
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
     log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
@@ -150,6 +146,17 @@ def open_reconstruction(path: str | Path | Scene) -> Scene:
     return scene
 
 
+def check_cameras(scene: Scene, log: Log, cameras: Sequence[str] | None) -> list[str]:
+    """The cameras, all that scene and recording share where None. ValueError for one that they do not, and where they share none."""
+    both = [name for name in log.cameras if name in scene.rig]
+    for name in cameras or ():
+        if name not in both:
+            raise ValueError(unknown("camera", name, "both the scene and its recording", both))
+    if not both:
+        raise ValueError("the scene and the recording have no camera in common; make the pairs from the drive that the scene came from")
+    return list(cameras or both)
+
+
 def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
     """The kinds, with isp_frame beside isp: an image pipeline's doings on instances and on whole frames. ValueError for a kind that there
     is not."""
@@ -174,16 +181,27 @@ def _write(path: Path, kind: str, clip: Clip, damage: Damage) -> None:
     write_shard(path, tensors, {"kind": kind, **clip.meta, **damage.what})
 
 
-def _claim(out: Path, settings: dict) -> None:
-    """Note the settings in the folder, or refuse a folder made with others."""
+def claim(out: Path, settings: dict, made_of: dict) -> None:
+    """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
     note = out / "pairs.json"
     if note.exists():
-        if json.loads(note.read_text()) != settings:
+        before = json.loads(note.read_text())
+        if {k: v for k, v in before.items() if k in settings} != settings:
             raise ValueError(f"{out} holds pairs made with other settings ({note.read_text()}); choose another folder")
+        if any(before.get(k, v) != v for k, v in made_of.items()):
+            raise ValueError(f"{out} holds pairs of another scene, or of this one before it was changed; choose another folder")
         return
     out.mkdir(parents=True, exist_ok=True)
     with atomic_file(note) as half:
-        Path(half).write_text(json.dumps(settings))
+        Path(half).write_text(json.dumps(settings | made_of))
+
+
+def _digest(scene: Scene) -> str:
+    """Of what a scene shows: its splats, actors and edits."""
+    told = hashlib.sha256(json.dumps([scene.meta.get("name"), [e["name"] for e in scene.meta.get("edits", [])]]).encode())
+    for splats in (scene.background.gaussians, *(a.asset.gaussians for a in scene.actors)):
+        told.update(splats.means.cpu().numpy().tobytes())
+    return told.hexdigest()[:16]
 
 
 def _starts(frames: int, config: PairConfig) -> Iterator[int]:

@@ -10,6 +10,7 @@ import torch
 
 from enhance.isp import alter, random_pipeline
 from enhance.masks import random_mask
+from enhance.pairs import claim
 from enhance.samples import Photos
 from enhance.shards import to_bytes, write_shard
 
@@ -26,6 +27,11 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
     holds no photos.
     """
     out = Path(out)
+    stems = [Path(path).stem for path in paths]
+    if twice := sorted({s for s in stems if stems.count(s) > 1}):
+        raise ValueError(f"two of the photos' paths are called {twice[0]}, by which pairs are named; make one's in another folder")
+    if paths:
+        claim(out, {"seed": seed, "width": width}, {})
     for path in map(Path, paths):
         for i, photo in enumerate(Photos((path,), STRIDE, width).frames):
             rng = np.random.default_rng([seed, i])

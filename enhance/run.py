@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -87,8 +88,11 @@ class Run:
         seed: int,
         stages: Sequence[str],
         device: str | torch.device = "cpu",
+        told: dict | None = None,
     ):
+        """told: what it is trained on and from, json-like by name; a checkpoint of a training that was told otherwise is refused."""
         torch.manual_seed(seed)
+        self.told = told or {}
         self.device = torch.device(device)
         self.config, self.minutes, self.steps, self.seed, self.stages = config, minutes, steps, seed, stages
         self.autoencoder = channels_last(Autoencoder().to(self.device))
@@ -138,10 +142,11 @@ class Run:
         for stage in STAGES:  # weights that are spoilt must not take the place of good ones
             self.loss(stage)
         state = {name: part.state_dict() for name, part in self.parts().items()}
-        facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds}
-        # through Python's file, which says that the disk is full; torch's own writer says "unexpected pos"
-        with atomic_file(path) as half, open(half, "wb") as file:
-            torch.save({**facts, **state}, file)
+        facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds, "told": self.told}
+        whole = BytesIO()  # written by Python, which says that the disk is full; torch's own writer says "unexpected pos"
+        torch.save({**facts, **state}, whole)
+        with atomic_file(path) as half:
+            half.write_bytes(whole.getbuffer())
 
     def load(self, path: Path) -> None:
         try:
@@ -154,6 +159,12 @@ class Run:
             raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
         if state["seed"] != self.seed:
             raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
+        before = state.get("told", {})
+        for name in self.told:
+            if before.get(name, self.told[name]) != self.told[name]:
+                was, now = ("other ones", "these") if name == "pairs" else (before[name], self.told[name])
+                fix = "resume with the same command, or choose another folder"
+                raise ValueError(f"{path} was begun with the {name} {was}, not {now}; {fix}")
 
     def share(self, stage: str) -> float:
         """A stage's share of the budget, of which those that are left out take nothing."""

@@ -79,6 +79,7 @@ class Sampler:
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
         self.rendered = [kind for kind in RENDERED if self.shards[kind]]
         self._shade = ShadeSampler(self.shards["shadow"], seed)
+        self.has_objects = photos is not None or bool(self.shards["clean"] or self.shards["isp"])
         self._objects = ObjectSampler(self.shards, photos.frames if photos else [], "isp" in kinds)
         if pairs and not any(self.shards.values()) and photos is None:
             raise ValueError('the pairs hold no clip of split "train"; make pairs of more cameras than the held-out one')

@@ -20,9 +20,13 @@ and `<name>.json` says kind, split ("train" or "held out"), camera, times, seed 
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,11 +86,9 @@ class Shard:
         self, start: int = 0, frames: int | None = None, top: int = 0, left: int = 0, height: int | None = None, width: int | None = None
     ) -> Window:
         """A part of the clip; only what is asked for is read from disk."""
-        from safetensors import safe_open
-
         t = slice(start, start + (frames or self.frames - start))
         y, x = slice(top, top + (height or self.height - top)), slice(left, left + (width or self.width - left))
-        with safe_open(self.path, "pt") as file:
+        with self._open() as file:
             known = FIELDS | (REFERENCES if "trust" in file.keys() else {})  # noqa: SIM118 - not a dict
             part = {name: file.get_slice(name)[t, y, x] for name in known}
         part = {"reference": part["input"], "trust": torch.zeros_like(part["region"])} | part
@@ -108,24 +110,33 @@ class Shard:
     @property
     def referenced(self) -> bool:
         """Whether photos say something of its frames."""
-        from safetensors import safe_open
-
-        with safe_open(self.path, "pt") as file:
+        with self._open() as file:
             return "trust" in file.keys()  # noqa: SIM118 - not a dict
 
     def changed(self, index: int) -> torch.Tensor:
         """Where a frame was damaged, bool `[H, W]`."""
-        from safetensors import safe_open
-
-        with safe_open(self.path, "pt") as file:
+        with self._open() as file:
             return file.get_slice("region")[index] > 127
 
     def frame(self, which: str, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         """One "input" or "target" as stored, uint8 `[H, W, 3]`, and its instances `[H, W]`."""
-        from safetensors import safe_open
-
-        with safe_open(self.path, "pt") as file:
+        with self._open() as file:
             return file.get_slice(which)[index], file.get_slice("instance")[index]
+
+    @contextmanager
+    def _open(self) -> Iterator[Any]:
+        """The clip's file; ValueError where it is damaged, or another clip than its description says."""
+        from safetensors import SafetensorError, safe_open
+
+        fix = f"delete {self.path.with_suffix('.json').name} beside it and run sidestep pairs again"
+        try:
+            with safe_open(self.path, "pt") as file:
+                shape = tuple(file.get_slice("region").get_shape())
+                if shape != (self.frames, self.height, self.width):
+                    raise ValueError(f"{self.path} holds {shape} frames, rows and columns, not what its description says; {fix}")
+                yield file
+        except SafetensorError as error:
+            raise ValueError(f"{self.path} is not a whole clip ({error}); {fix}") from error
 
 
 def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:
@@ -159,6 +170,11 @@ class PairSet:
                 f"no pairs in {', '.join(map(str, folders))}; "
                 f"make some with: sidestep pairs SCENE --data DRIVE -o {folders[0] if folders else 'pairs'}"
             )
+
+    def digest(self) -> str:
+        """Which clips these are: the same for the same names, sizes and seeds."""
+        told = sorted((s.meta["kind"], s.path.stem, s.frames, s.height, s.width, s.meta.get("seed", 0)) for s in self.shards)
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
     def of(self, kind: str | None = None, split: str | None = None) -> list[Shard]:
         return [s for s in self.shards if (kind is None or s.meta["kind"] == kind) and (split is None or s.meta["split"] == split)]

@@ -52,16 +52,25 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         raise ValueError(f"rgb must hold pixels, got {width}x{height}")
     if not rgb.is_floating_point():
         raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
-    if not torch.isfinite(rgb.sum()) and not torch.isfinite(rgb).all():  # a sum is read once, and finite unless some value is not
-        bad = (~torch.isfinite(rgb)).any(-1).nonzero()[0].tolist()
-        raise ValueError(f"rgb holds a value that is not finite at row {bad[0]}, column {bad[1]}; enhance finite frames only")
+    _check_finite("rgb", rgb)
     if flow is not None:
         check_tensor("flow_prev", flow, (height, width, 2))
     if instance is not None:
         check_tensor("instance", instance, (height, width))
     if need is not None:
         check_tensor("need", need, (height, width))
+        need = torch.nan_to_num(need, nan=1.0)  # where nobody knows there may be need
     if reference is not None:
         check_tensor("reference", reference[0], (height, width, 3))
         check_tensor("trust", reference[1], (height, width))
+        _check_finite("reference", reference[0])
+        _check_finite("trust", reference[1])
+        reference = reference[0], reference[1].clamp(0, 1)
     return Given(rgb, flow, instance, need, reference)
+
+
+def _check_finite(name: str, image: torch.Tensor) -> None:
+    if torch.isfinite(image.sum()) or torch.isfinite(image).all():  # a sum is read once, and finite unless some value is not
+        return
+    row, column = (~torch.isfinite(image)).nonzero()[0, :2].tolist()
+    raise ValueError(f"{name} holds a value that is not finite at row {row}, column {column}; enhance finite frames only")

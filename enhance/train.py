@@ -7,6 +7,7 @@ their past, with any number of latents from 0 to K, so that it never sees a past
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -33,13 +34,15 @@ from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
 from enhance.shade_samples import Grounds
 from enhance.shards import RENDERED, PairSet
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
 from scenes.names import unknown
 
 NEAR_ENOUGH = 3e-4
 """Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
 USUAL = 1000
 """Objects by which it is told what changes are usual."""
+TAKES = {"objects": "isp or clean pairs, or --photos", "shade": "shadow pairs", "enhancer": f"pairs of {', '.join(RENDERED)}"}
+"""What a stage is trained on; all others take any right pictures."""
 SHADE_NEAR_ENOUGH = 1e-3
 """The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
 
@@ -74,7 +77,8 @@ def train(
     device    where to train; a run may be resumed on another
     config    `TrainConfig.of` the device where None
 
-    Raises FileExistsError where `out` holds a checkpoint and `resume` is off.
+    Raises FileExistsError where `out` holds a checkpoint and `resume` is off; ValueError where there is nothing to train a stage of `only`
+    on (others are left out then), and where the checkpoint is of a training of something else.
     """
     if (minutes is None) == (steps is None):
         raise ValueError("give the training budget either as minutes or as steps")
@@ -96,8 +100,9 @@ def train(
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
-    stages = [s for s in only or (STAGES if start is None else FURTHER) if s != "enhancer" or sampler.rendered]
-    run = Run(config, begun, minutes, steps, seed, stages, device)
+    stages = _stages(only, STAGES if start is None else FURTHER, sampler)
+    told = {"stages": stages, "start": str(start), "pairs": pair_set.digest() if pair_set else "", "photos": [Path(p).name for p in photos]}
+    run = Run(config, begun, minutes, steps, seed, stages, device, told)
     if resume and checkpoint.exists():
         run.load(checkpoint)
     out.mkdir(parents=True, exist_ok=True)
@@ -129,12 +134,26 @@ def train(
     # on clips that were trained on a network gains a whole dB by knowing the place
     judged = (pair_set.of(split="held out") if pair_set else []) or shards
     gains = repair_gain(run.average, [s for s in judged if s.meta["kind"] in RENDERED])
+    if origin is not None and not {"prior", "enhancer"} & set(stages):
+        gains = origin.get(REPAIR_GAIN, [WORTH, WORTH])  # nothing was done to what repairs
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
     data |= {"further": origin} if origin is not None else {}
     made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
     save_net(run.average, weights, {**(about or {}), **made, REPAIR_GAIN: gains})
     return weights
+
+
+def _stages(only: Sequence[str] | None, usual: Sequence[str], sampler: Sampler) -> list[str]:
+    """What is trained, each once: `only`, or of the `usual` stages those that there is something to train on; the others are said."""
+    there = {"objects": sampler.has_objects, "shade": bool(sampler.shards["shadow"]), "enhancer": bool(sampler.rendered)}
+    lacking = [stage for stage in only or usual if not there.get(stage, True)]
+    for stage in lacking:
+        said = f"these pairs hold nothing to train {stage} on, which takes {TAKES[stage]}"
+        if only:
+            raise ValueError(f"{said}; make some with sidestep pairs --kinds, or leave {stage} out of --only")
+        print(f"{said}: left out", file=sys.stderr)
+    return [stage for stage in dict.fromkeys(only or usual) if stage not in lacking]
 
 
 def _stage(

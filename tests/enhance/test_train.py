@@ -10,7 +10,7 @@ import torch
 from small_net import SMALL
 
 from enhance.enhancer import Enhancer
-from enhance.evaluate import METHODS, PHOTOS, PUT_IN, _told, evaluate, table
+from enhance.evaluate import ALL_TOLD, ALONE, METHODS, PUT_IN, _told, evaluate, table
 from enhance.net import Net
 from enhance.run import TrainConfig
 from enhance.shards import PairSet, to_bytes, write_shard
@@ -92,7 +92,7 @@ def test_training_undoes_a_constant_error(pairs, tmp_path, device):
     config = replace(QUICK, autoencoder=0.05, objects=0.01, rate=3e-3, kinds=("underfit", "isp", "clean"))
     weights = train(pairs, tmp_path, steps=400, config=config, net=SMALL, device=device)
     rows = evaluate(pairs, Enhancer.load(weights, device))
-    assert [r.method for r in rows] == [*METHODS, *PHOTOS, *METHODS, PUT_IN, *METHODS]
+    assert [r.method for r in rows] == [*METHODS, ALONE, ALL_TOLD, *METHODS, PUT_IN, *METHODS]
     by = {(r.kind, r.method): r for r in rows}
     assert by["underfit", "ours"].mean("region") > by["underfit", "identity"].mean("region") + 0.3
     assert by["clean", "identity"].mean("frame") == float("inf") and by["isp", "identity"].mean("warp error") > 0
@@ -210,5 +210,5 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
             return frame.rgb * 0.5, True
 
     rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
-    assert [r.method for r in rows] == [*METHODS, *PHOTOS, "half", *METHODS, PUT_IN, "half", *METHODS, "half"]
+    assert [r.method for r in rows] == [*METHODS, ALONE, ALL_TOLD, "half", *METHODS, PUT_IN, "half", *METHODS, "half"]
     assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)

@@ -1,0 +1,134 @@
+"""What training and pairs refuse before they begin, and what they leave as it was."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from small_net import stirred
+
+from enhance.clips import PairConfig
+from enhance.evaluate import main
+from enhance.pairs import make_pairs
+from enhance.photo_pairs import make_photo_pairs
+from enhance.run import TrainConfig
+from enhance.shards import PairSet, to_bytes, write_shard
+from enhance.step import checked
+from enhance.train import train
+from enhance.weights_file import REPAIR_GAIN, load_net, save_net
+from render.frame_types import Frame
+from render.video import write_image
+from scenes.camera import Camera
+from scenes.lenses import Pinhole
+
+QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2, looked_at=2)
+
+
+def written(folder, *kinds) -> PairSet:
+    """A training clip of noise of each kind."""
+    rgb = to_bytes(torch.rand(3, 40, 56, 3, generator=torch.Generator().manual_seed(1)))
+    region = torch.zeros(3, 40, 56, dtype=torch.uint8)
+    region[:, 10:30, 10:40] = 255
+    flow, seen = torch.zeros(3, 40, 56, 2, dtype=torch.float16), torch.ones(3, 40, 56, dtype=torch.uint8)
+    depth = torch.ones(3, 40, 56, dtype=torch.float16)
+    pictures = {"input": rgb, "target": rgb.clone(), "region": region, "instance": region // 255}
+    tensors = {**pictures, "flow": flow, "visible": seen, "depth": depth}
+    for kind in kinds:
+        write_shard(folder / kind / "a.safetensors", tensors, {"kind": kind, "split": "train", "instances": [1], "seed": 0})
+    return PairSet(folder)
+
+
+@pytest.fixture(scope="module")
+def awake(tmp_path_factory):
+    """Weights whose network was found worth running."""
+    path = tmp_path_factory.mktemp("weights") / "awake.safetensors"
+    save_net(stirred(), path, {REPAIR_GAIN: [1.5, 2.0]})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "only", "takes"),
+    [("isp", "enhancer", "sparse, cycle, crossref"), ("clean", "shade", "shadow pairs"), ("shadow", "objects", "isp or clean pairs")],
+)
+def test_a_stage_without_anything_to_train_on_is_refused_before_it_begins(awake, tmp_path, kind, only, takes):
+    with pytest.raises(ValueError, match=f"nothing to train {only} on.*{takes}"):
+        train(written(tmp_path / "p", kind), tmp_path / "t", steps=4, config=QUICK, start=awake, only=[only])
+    assert not (tmp_path / "t").exists()
+
+
+def test_stages_that_nobody_named_are_left_out_and_said(awake, tmp_path, capsys):
+    weights = train(written(tmp_path / "p", "isp"), tmp_path / "t", steps=4, config=QUICK, start=awake)
+    assert load_net(weights)[1]["steps"] == {"autoencoder": 0, "prior": 0, "objects": 4, "shade": 0, "enhancer": 0}
+    said = capsys.readouterr().err
+    assert "shadow pairs: left out" in said and "crossref: left out" in said
+
+
+def test_what_repairs_keeps_its_measured_gain_where_it_was_not_trained(awake, tmp_path):
+    weights = train(written(tmp_path / "p", "isp", "underfit"), tmp_path / "t", steps=3, config=QUICK, start=awake, only=["objects"] * 2)
+    about = load_net(weights)[1]
+    assert about[REPAIR_GAIN] == [1.5, 2.0] and about["steps"]["objects"] == 3
+
+
+@pytest.mark.parametrize("change", ["stages", "start", "pairs"])
+def test_a_resumed_training_of_something_else_is_refused(awake, tmp_path, change):
+    first, other = written(tmp_path / "p", "isp"), written(tmp_path / "q", "isp", "clean")
+    how = {"steps": 4, "config": QUICK, "start": awake, "only": ["objects"]}
+    train(first, tmp_path / "t", **how)
+    before = (tmp_path / "t" / "checkpoint.pt").read_bytes()
+    again = {"stages": {**how, "only": ["prior"]}, "start": {**how, "start": "builtin"}, "pairs": how}[change]
+    if change == "start":
+        shutil.copy(awake, tmp_path / "twin.safetensors")
+        again = {**how, "start": tmp_path / "twin.safetensors"}
+    with pytest.raises(ValueError, match=f"begun with the {change}.*resume with the same command"):
+        train(other if change == "pairs" else first, tmp_path / "t", resume=True, **again)
+    assert (tmp_path / "t" / "checkpoint.pt").read_bytes() == before
+
+
+@pytest.mark.parametrize("spoil", ["cut", "foreign", "other size"])
+def test_a_damaged_clip_is_named_with_the_fix(tmp_path, spoil, capsys):
+    written(tmp_path / "p", "isp")
+    clip = tmp_path / "p" / "isp" / "a.safetensors"
+    if spoil == "other size":
+        about = json.loads(clip.with_suffix(".json").read_text())
+        clip.with_suffix(".json").write_text(json.dumps({**about, "height": 39}))
+    else:
+        clip.write_bytes(clip.read_bytes()[:900] if spoil == "cut" else b"no tensors")
+    with pytest.raises(ValueError, match=r"a.safetensors .*delete a.json"):
+        PairSet(tmp_path / "p").shards[0].window()
+    assert main([str(tmp_path / "p"), "--split", "train"]) == 1 and "delete a.json" in capsys.readouterr().err
+
+
+def test_pairs_of_another_scene_do_not_go_into_the_same_folder(street, recording, tmp_path):
+    config = PairConfig(width=32, frames=2, every=4)
+    out = make_pairs(street, recording, tmp_path / "p", ("clean",), config=config)
+    with pytest.raises(ValueError, match="pairs of another scene"):
+        make_pairs(replace(street, actors=()), recording, out, ("clean",), config=config)
+    note = out / "pairs.json"
+    settings = json.loads(note.read_text())
+    note.write_text(json.dumps({k: v for k, v in settings.items() if k not in ("scene", "recording")}))  # as the code before wrote it
+    make_pairs(street, recording, out, ("clean",), config=config)
+
+
+def test_photos_of_one_name_and_other_settings_are_refused(tmp_path):
+    for place in ("a", "b"):
+        (tmp_path / place / "img").mkdir(parents=True)
+        write_image(tmp_path / place / "img" / "0.png", torch.rand(40, 56, 3))
+    with pytest.raises(ValueError, match="called img"):
+        make_photo_pairs([tmp_path / "a" / "img", tmp_path / "b" / "img"], tmp_path / "p", width=32)
+    make_photo_pairs([tmp_path / "a" / "img"], tmp_path / "p", width=32)
+    with pytest.raises(ValueError, match="other settings"):
+        make_photo_pairs([tmp_path / "a" / "img"], tmp_path / "p", width=32, seed=1)
+
+
+def test_what_photos_say_must_be_finite_and_is_trusted_in_all_at_most():
+    rgb, trust = torch.rand(4, 6, 3), torch.full((4, 6), 2.0)
+    camera = Camera(Pinhole(5.0, 5.0, 3.0, 2.0), 6, 4, torch.eye(4, dtype=torch.float64))
+    given = checked(Frame(camera, rgb=rgb, reference=rgb, trust=trust, need=torch.full((4, 6), torch.nan)))
+    assert (given.reference[1] == 1).all() and (given.need == 1).all()
+    bad = rgb.clone()
+    bad[2, 3, 1] = torch.nan
+    with pytest.raises(ValueError, match="reference holds a value that is not finite at row 2, column 3"):
+        checked(Frame(camera, rgb=rgb, reference=bad, trust=trust))
+    with pytest.raises(ValueError, match="trust holds"):
+        checked(Frame(camera, rgb=rgb, reference=rgb, trust=torch.full((4, 6), torch.inf)))
