@@ -26,6 +26,10 @@ WIDTH = 320
 LOOKS, FEWEST = 48, 12
 """Pictures that are looked at, evenly along the way, and how many it takes."""
 
+APART, FARTHEST = 0.1, 3.0
+"""Metres between the pictures before and after a look, and from the first picture to the farthest, that it takes at least: of a car that
+stands, poses err by millimetres each way, and its street stays as its bonnet does."""
+
 FAINT, ALONG = 2.0, 0.25
 """Levels a pixel of such a picture: fainter edges count less, as dust and reflections in a windscreen are; and of an edge the part across
 the motion under which it counts less, as a lane line's, along which the car does not quite go."""
@@ -91,10 +95,13 @@ def at_size(mask: np.ndarray, height: int, width: int) -> torch.Tensor:
 
 
 def _along_the_way(camera: LogCamera, indices: list[int]) -> list[tuple[int, int, int]]:
-    """Places of pictures evenly along the way, each between the ones before and after it."""
-    way = camera.world_from_cam[indices, :3, 3].diff(dim=0).norm(dim=1).cumsum(0).numpy() if len(indices) > 2 else np.zeros(1)
-    places = np.unique(np.searchsorted(way, np.linspace(0, way[-1], LOOKS + 2)[1:-1]) + 1) if way[-1] > 0 else np.zeros(0, int)
-    return [(indices[i - 1], indices[i], indices[i + 1]) for i in places if i + 1 < len(indices)]
+    """Places of pictures evenly along the way, each between the ones before and after it; none where the car stands or hardly moves."""
+    at = camera.world_from_cam[indices, :3, 3]
+    if len(indices) < FEWEST or (at - at[0]).norm(dim=1).max() < FARTHEST:
+        return []
+    way = at.diff(dim=0).norm(dim=1).cumsum(0).numpy()
+    places = np.unique(np.searchsorted(way, np.linspace(0, way[-1], LOOKS + 2)[1:-1]) + 1)
+    return [(indices[i - 1], indices[i], indices[i + 1]) for i in places if i + 1 < len(indices) and (at[i + 1] - at[i - 1]).norm() >= APART]
 
 
 def _small(picture: np.ndarray) -> np.ndarray:

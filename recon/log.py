@@ -59,10 +59,12 @@ class LogCamera:
         """Frame `index` as uint8 sRGB `[H, W, 3]`, area-averaged to `width` x `height`. ValueError naming a file that does not decode."""
         from PIL import Image
 
+        from render.pictures import rgb_of
+
         path = self.files[index]
         try:
             with Image.open(BytesIO(path.read()) if isinstance(path, Packed) else path) as opened:
-                picture = opened.convert("RGB")
+                picture = rgb_of(opened)
         except FileNotFoundError:
             raise
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:

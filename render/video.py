@@ -33,9 +33,11 @@ def read_image(path: str | os.PathLike) -> torch.Tensor:
     """An image file as `[H, W, 3]` float32 0..1, turned as its EXIF says. ValueError where it cannot be decoded."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
+    from render.pictures import rgb_of
+
     try:
         with Image.open(path) as image:
-            return from_bytes(np.asarray(ImageOps.exif_transpose(image).convert("RGB")))
+            return from_bytes(np.asarray(rgb_of(ImageOps.exif_transpose(image))))
     except FileNotFoundError:
         raise
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
@@ -52,10 +54,10 @@ def write_image(path: str | os.PathLike, rgb: torch.Tensor) -> None:
 
 
 class Video:
-    """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1.
+    """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1, turned as the file says (phones').
 
-    fps: frames a second; width, height: pixels; count: frames as the file claims, None where it does not say.
-    Raises ValueError where the file is no video, has no frames, or breaks off in the middle.
+    fps: frames a second in the mean; width, height: pixels of the turned frames; count, seconds: frames and length as the file claims, None
+    where it does not say. Raises ValueError where the file is no video, has no frames, or breaks off in the middle.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -66,11 +68,28 @@ class Video:
             if not container.streams.video:
                 raise ValueError(f"{path} holds no video stream")
             stream = container.streams.video[0]
-            self.width, self.height = stream.codec_context.width, stream.codec_context.height
             self.fps = float(stream.average_rate or stream.guessed_rate or 25)
             self.count = stream.frames or None
+            self.seconds = float(stream.duration * stream.time_base) if stream.duration else None
+        frames = self._decoded()
+        first = next(frames)  # what turns them is said with the frames
+        frames.close()
+        self.width, self.height = (first.height, first.width) if _quarters(first) % 2 else (first.width, first.height)
 
     def __iter__(self) -> Iterator[torch.Tensor]:
+        for _, rgb in self.timed():
+            yield rgb
+
+    def timed(self) -> Iterator[tuple[int, torch.Tensor]]:
+        """The frames, each after its time in microseconds since the first: they need not be evenly apart."""
+        began = None
+        for i, frame in enumerate(self._decoded()):
+            at = i / self.fps if frame.pts is None else float(frame.pts * frame.time_base)
+            began = at if began is None else began
+            yield round((at - began) * 1e6), from_bytes(np.rot90(frame.to_ndarray(format="rgb24"), _quarters(frame)))
+
+    def _decoded(self):
+        """PyAV's frames, as they are stored."""
         from av.error import FFmpegError
 
         decoded = 0
@@ -82,7 +101,7 @@ class Video:
                     if packet.is_corrupt:  # threaded decoding would pass over it in silence
                         raise ValueError(f"{self.path} breaks off after frame {decoded}; fetch the file again")
                     for frame in packet.decode():
-                        yield from_bytes(frame.to_ndarray(format="rgb24"))
+                        yield frame
                         decoded += 1
             except FFmpegError as error:
                 raise ValueError(f"{self.path} cannot be decoded after frame {decoded}: {error.strerror}") from error
@@ -97,6 +116,11 @@ class Video:
             return av.open(str(self.path))
         except FFmpegError as error:
             raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}") from error
+
+
+def _quarters(frame) -> int:
+    """Quarter turns to the left that show a frame of PyAV's upright."""
+    return round(frame.rotation / 90)
 
 
 def read_video(path: str | os.PathLike) -> Video:

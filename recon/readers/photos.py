@@ -1,7 +1,8 @@
 """Reads plain photos or a video: structure from motion finds where they were taken, once, and is kept beside them.
 
 `drives/walk` (a folder of photos in the order of their names) or `drives/walk.mp4` becomes the COLMAP workspace `drives/walk.sfm`, which is
-read from then on; delete it to start over. All pictures are taken to share one camera, whose lens is found too.
+read from then on; delete it to start over. All pictures are taken to share one camera, whose lens is found too. Photos stay where they are,
+but where a phone stored any lying on its side: then the workspace holds them all, upright, as it holds a video's frames.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import shutil
 import sys
 from pathlib import Path
 
+from PIL import Image, ImageOps
+
 from recon.log import Log, image_size
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.sfm import solve
+from render.pictures import is_turned, rgb_of, swaps_sides
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
@@ -23,6 +27,9 @@ FEWEST = 3
 
 RATE, MOST = 10.0, 150
 """Frames a second that are taken from a video, and how many of it at most: more say little more, and matching takes long."""
+
+QUALITY = 95
+"""Of a JPEG that is written upright."""
 
 NARROWEST, WIDEST, SAME = math.radians(5), math.radians(150), 0.01
 """Radians of an angle of view that a lens of this kind has, and the part by which two may differ that mean the same."""
@@ -50,9 +57,12 @@ def read_photos(
     workspace = path.with_name(path.name + ".sfm")
     if find_model(workspace) is None:
         _make(path, workspace, angle_of_view)
-    pictures = workspace / "images" if is_video(path) else path
-    log = read_colmap(workspace, camera_height, metres_per_unit, pictures)
+    inside = workspace / "images"
+    log = read_colmap(workspace, camera_height, metres_per_unit, inside if inside.is_dir() else path)
     camera = log.camera(log.front[0])
+    lying = next((file for file in camera.files if _turned(file)), None)
+    if lying is not None:
+        raise ValueError(f"{workspace} was made of photos as they are stored, and {lying.name} lies on its side; delete it to begin again")
     found = 2 * math.atan(camera.width / 2 / camera.lens.focal()[0])
     if angle_of_view is not None and abs(found - angle_of_view) > SAME * angle_of_view:
         fix = f"delete it to begin again with {math.degrees(angle_of_view):g}deg"
@@ -76,7 +86,8 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
             names = _of_one_size(path)
-            placed = solve(path, names, partial, False, angle_of_view)
+            pictures = _upright(path, names, partial / "images")
+            placed = solve(pictures, names, partial, False, angle_of_view)
             times = dict.fromkeys(names, 0)
         print(f"placed {placed} of {len(times)} pictures", file=sys.stderr)
         partial.rename(workspace)
@@ -84,9 +95,33 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def _turned(file: Path) -> bool:
+    with Image.open(file) as picture:
+        return is_turned(picture)
+
+
+def _upright(path: Path, names: list[str], folder: Path) -> Path:
+    """Where the photos `names` stand upright: their own folder, or where some are turned, `folder`, to which all are written.
+
+    They keep the rest of their EXIF, whose focal length COLMAP asks for. One folder, since a model's pictures have one.
+    """
+    turned = {name for name in names if _turned(path / name)}
+    if not turned:
+        return path
+    folder.mkdir()
+    for name in names:
+        if name not in turned:
+            shutil.copyfile(path / name, folder / name)
+            continue
+        with Image.open(path / name) as stored:
+            upright = ImageOps.exif_transpose(stored)
+            rgb_of(upright).save(folder / name, exif=upright.getexif(), quality=QUALITY)
+    return folder
+
+
 def _of_one_size(path: Path) -> list[str]:
-    """The photos that share the most common size; the others, from another camera or turned, are left out and said."""
-    sizes = {p.name: image_size(p) for p in sorted(path.iterdir()) if p.suffix.lower() in PHOTOS}
+    """The photos that share the most common size when upright; the others, from another camera or turned, are left out and said."""
+    sizes = {p.name: _size(p) for p in sorted(path.iterdir()) if p.suffix.lower() in PHOTOS}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     most = max(counts, key=lambda size: counts[size])
     others = [name for name, size in sizes.items() if size != most]
@@ -95,20 +130,29 @@ def _of_one_size(path: Path) -> list[str]:
     return [name for name, size in sizes.items() if size == most]
 
 
+def _size(file: Path) -> tuple[int, int]:
+    """Width and height of a photo that stands upright."""
+    width, height = image_size(file)
+    with Image.open(file) as picture:
+        return (height, width) if swaps_sides(picture) else (width, height)
+
+
 def _frames(path: Path, folder: Path) -> dict[str, int]:
-    """Write frames of a video to `folder`, evenly over it; their times in microseconds by name."""
+    """Write frames of a video to `folder`, evenly over its time; their times in microseconds by name."""
     from render.video import read_video, write_image
 
     folder.mkdir()
     video = read_video(path)
-    count = video.count or sum(1 for _ in video)
-    rate = min(RATE, MOST * video.fps / count)
-    step = max(1, math.ceil(video.fps / rate - 0.5))
-    times = {}
-    for i, frame in enumerate(video):
-        if i % step == 0:
+    seconds = video.seconds or max(t for t, _ in video.timed()) / 1e6
+    # the next one that is due, or comes at most half a frame too early
+    apart = max(1, round((max(1 / RATE, seconds / MOST) - 0.5 / video.fps) * 1e6))
+    times: dict[str, int] = {}
+    last, count = -apart, 0
+    for i, (time_us, frame) in enumerate(video.timed()):
+        count += 1
+        if time_us - last >= apart:
             write_image(folder / f"{i:06d}.jpg", frame)
-            times[f"{i:06d}.jpg"] = round(i * 1e6 / video.fps)
+            times[f"{i:06d}.jpg"] = last = time_us
     if len(times) < FEWEST:
         raise ValueError(f"{path} has {count} frames; a world needs at least {FEWEST}")
     return times

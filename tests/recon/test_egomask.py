@@ -99,6 +99,30 @@ def test_a_car_that_stands_or_has_few_pictures_tells_nothing():
     assert found(drive(count=9)) is None
 
 
+def test_a_street_before_a_car_that_stands_is_no_bonnet():
+    """Poses that err by millimetres are no motion, neither alone nor before the car drives off."""
+    noise = 0.003 * torch.from_numpy(np.random.default_rng(0).normal(size=(40, 3)))
+
+    def standing(count: int) -> LogCamera:
+        camera = drive(count=40)
+        poses = camera.world_from_cam.clone()
+        poses[:count, :3, 3] = poses[count - 1, :3, 3] + noise[:count]
+        return replace(camera, world_from_cam=poses)
+
+    still = street(drive(), 0, None)
+    camera = standing(40)
+    assert ego_mask(camera, range(40), lambda i: still) is None
+    off = standing(24)
+    looked = []
+    assert ego_mask(off, range(40), lambda i: looked.append(i) or street(off, i, None)) is None
+    assert min(looked) >= 23
+
+
+def test_the_street_before_drive_002_sets_off_is_no_bonnet(pandaset):
+    camera = open_log(pandaset).camera("front_camera")
+    assert ego_mask(camera, range(20), lambda i: camera.image(i, 240, 135)) is None
+
+
 def test_what_the_camera_says_counts():
     said = np.zeros((9, 16), bool)
     assert found(replace(drive(), ego_mask=said)) is None

@@ -98,3 +98,11 @@ def test_pictures_without_colour_tell_no_sky():
 def test_the_made_up_streets_sky_is_blue(drive):
     log = open_log(drive)
     assert load_frames(log, list(log.cameras), ALL, (96, 54), 8).under == "blue"
+
+
+def test_a_camera_of_sixteen_bits_of_grey_is_seen_as_one_of_eight():
+    log, buffer = _log((150, 180, 225), strikes=False), BytesIO()
+    eight = np.arange(SIZE[0] * SIZE[1]).reshape(SIZE[::-1]) % 256
+    Image.fromarray((eight * 257).astype(np.uint16)).save(buffer, "png")
+    camera = replace(log.camera("front"), files=(Packed("grey", buffer.getvalue),) * 3)
+    assert np.array_equal(camera.image(0), np.repeat(eight[..., None], 3, 2))

@@ -1,6 +1,9 @@
 import math
 import shutil
+from fractions import Fraction
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_colmap import pictures_along, write_colmap
@@ -9,6 +12,7 @@ from PIL import Image
 from recon import open_log
 from recon.readers import photos as reader
 from recon.readers.sfm import read_model
+from render.pictures import ORIENTATION
 from render.video import VideoWriter
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
@@ -75,6 +79,53 @@ def test_photos_of_another_size_are_left_out_and_said(walk, solved, tmp_path, ca
     assert len(solved[0][0]) == 6 and "left out turned.png: not 96x54" in capsys.readouterr().err
 
 
+def _lie_down(folder: Path) -> None:
+    """Store all photos but the first as a phone held upright does: turned to the left, with EXIF that says so."""
+    for file in sorted(folder.iterdir())[1:]:
+        with Image.open(file) as photo:
+            exif = Image.Exif()
+            exif[ORIENTATION], exif[0x010F] = 6, "Maker"
+            photo.transpose(Image.Transpose.ROTATE_90).save(file, exif=exif)
+
+
+def test_photos_that_lie_on_their_side_are_read_upright(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    _lie_down(tmp_path / "walk")
+    camera = open_log(tmp_path / "walk").camera("camera")
+    assert len(solved[0][0]) == 6 and {f.parent for f in camera.files} == {tmp_path / "walk.sfm/images"}
+    for i, file in enumerate(camera.files):
+        with Image.open(walk / "images" / file.name) as photo, Image.open(file) as kept:
+            assert np.array_equal(camera.image(i), np.asarray(photo))
+            assert ORIENTATION not in kept.getexif() and (i == 0 or kept.getexif()[0x010F] == "Maker")  # COLMAP asks it for the focal length
+    assert open_log(tmp_path / "walk").camera("camera").files == camera.files and len(solved) == 1
+
+
+def test_a_workspace_of_photos_that_lay_on_their_side_is_refused_with_the_fix(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    open_log(tmp_path / "walk")
+    _lie_down(tmp_path / "walk")
+    with pytest.raises(ValueError, match="walk.sfm was made of photos as they are stored, and 001.png lies on its side; delete it"):
+        open_log(tmp_path / "walk")
+
+
+def test_frames_of_a_video_that_are_unevenly_apart_keep_their_times(tmp_path):
+    """A phone films fast in the light and slowly in the dark: 30 frames in the first second, then 10 in two."""
+    import av
+
+    at = [round(1000 * i / 30) for i in range(30)] + [1000 + 200 * i for i in range(10)]
+    with av.open(str(tmp_path / "uneven.mp4"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.codec_context.time_base = 96, 54, "yuv420p", Fraction(1, 1000)
+        for i, ms in enumerate(at):
+            frame = av.VideoFrame.from_ndarray(np.full((54, 96, 3), 6 * i, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    times = reader._frames(tmp_path / "uneven.mp4", tmp_path / "frames")
+    assert all(t == pytest.approx(1000 * at[int(name[:6])], abs=1000) for name, t in times.items())
+    assert {f"{i:06d}.jpg" for i in range(30, 40)} <= times.keys() and len(times) <= 30
+
+
 def test_a_video_keeps_its_clock(solved, tmp_path):
     with VideoWriter(tmp_path / "drive.mp4", 25, 96, 54) as video:
         for i in range(12):
@@ -96,8 +147,6 @@ def test_what_cannot_be_placed_leaves_nothing_behind(walk, tmp_path, monkeypatch
 
 
 def test_a_folder_that_cannot_be_written_is_named_with_the_fix(walk, tmp_path, monkeypatch):
-    from pathlib import Path
-
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 

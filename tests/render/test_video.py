@@ -1,9 +1,13 @@
 import os
+import struct
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from render.compare import psnr
+from render.pictures import rgb_of
 from render.video import VideoWriter, read_image, read_video, write_image
 
 
@@ -33,6 +37,36 @@ def test_a_video_comes_back_alike(tmp_path):
     frames = list(back)
     assert len(frames) == 4
     assert all(psnr(frame, image) > 32 for frame in frames)  # so small an image loses most to 4:2:0
+
+
+@pytest.mark.parametrize(("matrix", "quarters"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
+def test_a_video_that_was_filmed_upright_is_read_upright(tmp_path, matrix, quarters):
+    """As phones write it: frames as the sensor lies, and how to turn them in the track's header."""
+    image = smooth_image(48, 64)
+    with VideoWriter(tmp_path / "a.mp4", 10, 64, 48) as video:
+        video.write(image)
+    stored = bytearray((tmp_path / "a.mp4").read_bytes())
+    header = stored.find(b"tkhd") + 44
+    a, b, c, d = (65536 * v for v in matrix)
+    stored[header : header + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    (tmp_path / "a.mp4").write_bytes(stored)
+    back = read_video(tmp_path / "a.mp4")
+    (frame,) = back
+    upright = image.rot90(quarters)
+    assert frame.shape == (back.height, back.width, 3) == upright.shape and psnr(frame, upright) > 32
+
+
+def test_sixteen_bits_of_grey_are_shown_as_eight(tmp_path):
+    grey = np.linspace(0, 65535, 256).round().astype(np.uint16).reshape(16, 16)
+    Image.fromarray(grey).save(tmp_path / "a.png")
+    assert (read_image(tmp_path / "a.png")[..., 1] * 255).flatten().tolist() == pytest.approx(range(256), abs=0.01)
+
+
+@pytest.mark.parametrize("picture", [np.int32, ">u2"], ids=["I", "I;16B"])
+def test_other_orders_of_bytes_are_sixteen_bits_too(picture):
+    grey = np.array([[0, 257, 32896, 65535]])
+    image = Image.fromarray(grey.astype(np.int32)) if picture is np.int32 else Image.frombytes("I;16B", (4, 1), grey.astype(">u2").tobytes())
+    assert np.asarray(rgb_of(image))[0, :, 0].tolist() == [0, 1, 128, 255]
 
 
 @pytest.mark.parametrize("colour", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.5, 0.5, 0.5), (0.2, 0.5, 0.8), (0.9, 0.1, 0.1)])
