@@ -70,7 +70,7 @@ class LogCamera:
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:
             raise ValueError(f"{path} does not decode as an image ({problem}); fetch the file again") from None
         if picture.size != (self.width, self.height):
-            raise ValueError(f"{path} is {picture.width}x{picture.height}, but the camera's first image is {self.width}x{self.height}")
+            raise ValueError(f"{path} is {picture.width}x{picture.height}, but camera {self.name} is {self.width}x{self.height}")
         size = (width or self.width, height or self.height)
         return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.BOX))
 

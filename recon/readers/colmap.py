@@ -1,7 +1,7 @@
 """Reads a COLMAP model with its pictures (Schönberger and Frahm 2016; the files as in COLMAP's doc/format.rst).
 
-A model has no clock: pictures follow each other half a second apart in the order of their names, unless `times.json` beside the
-model's files gives microseconds by picture name. The body is the first camera, turned to x forward, y left, z up.
+A model has no clock: pictures follow each other half a second apart in the order of their names (and of the numbers in them), unless
+`times.json` beside the model's files gives microseconds by picture name. The body is the first camera, turned to x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import Log, LogCamera, SparsePoints
+from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
+from recon.readers.order import recorded
 from recon.readers.sfm import Model, ModelCamera, ModelImage, is_model, read_model
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
@@ -64,7 +65,11 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         for file in files:
             if not file.is_file():
                 raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file)}")
-        found, times = model.cameras[key], torch.tensor([moments[k] for k in chosen])
+        found, size = model.cameras[key], image_size(files[0])
+        if size != (found.width, found.height):
+            fix = f"put the pictures that the model was made of into {pictures}, or make a model of these"
+            raise ValueError(f"{files[0]} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}; {fix}")
+        times = torch.tensor([moments[k] for k in chosen])
         cameras[names[key]] = LogCamera(names[key], lens_of(found, where), found.width, found.height, files, times, placed[chosen])
         seen[names[key]] = tuple(model.images[k].points for k in chosen)
     about = path.resolve()
@@ -140,24 +145,42 @@ def _lead(model: Model) -> int:
 
 
 def _moments(where: Path, model: Model) -> list[int]:
-    """Microseconds of every picture. Those of one frame of a rig, or of one file name in several folders, share a moment."""
+    """Microseconds of every picture. Those of one frame of a rig share a moment, as do those of several cameras whose names differ in the
+    cameras' folders alone. ValueError where that makes a camera take two pictures at one moment."""
     clock = where / "times.json"
     if clock.is_file():
         try:
             times = json.loads(clock.read_text())
-            return [int(times[i.name]) for i in model.images]
+            moments = [int(times[i.name]) for i in model.images]
         except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, ValueError) as problem:
             raise ValueError(f"{clock} must give whole microseconds by picture name ({problem!r})") from None
-    several = len({i.camera for i in model.images}) > 1
+        fix = f"give them different times in {clock}"
+    else:
+        names = _without_cameras(model)
+        keys = [str(i.frame) if model.rigid else name for i, name in zip(model.images, names, strict=True)]
+        first: dict[str, str] = {}
+        for key, name in zip(keys, names, strict=True):
+            first.setdefault(key, name)
+        order = {key: i for i, key in enumerate(sorted(first, key=lambda k: recorded(first[k])))}
+        moments = [order[key] * STEP_US for key in keys]
+        fix = f"give microseconds by picture name in {clock}"
+    taken: dict[tuple[int, int], str] = {}
+    for image, moment in zip(model.images, moments, strict=True):
+        other = taken.setdefault((image.camera, moment), image.name)
+        if other != image.name:
+            raise ValueError(f"{where} has one camera take {other} and {image.name} at one moment; {fix}")
+    return moments
 
-    def moment(image: ModelImage) -> object:
-        return image.frame if model.rigid else Path(image.name).stem if several else image.name
 
-    first: dict[object, str] = {}
-    for image in model.images:
-        first.setdefault(moment(image), Path(image.name).name)
-    order = {key: i for i, key in enumerate(sorted(first, key=lambda k: (first[k], str(k))))}
-    return [order[moment(i)] * STEP_US for i in model.images]
+def _without_cameras(model: Model) -> list[str]:
+    """The pictures' names; those of several cameras without the folders that all pictures of the camera share, and without suffix."""
+    names = [i.name for i in model.images]
+    cameras = {i.camera for i in model.images}
+    if len(cameras) == 1:
+        return names
+    shared = {key: set.intersection(*(set(Path(i.name).parts[:-1]) for i in model.images if i.camera == key)) for key in cameras}
+    paths = [Path(name).with_suffix("") for name in names]
+    return ["/".join(p for p in path.parts if p not in shared[i.camera]) for path, i in zip(paths, model.images, strict=True)]
 
 
 def _picture_folder(path: Path, where: Path, name: str) -> Path:

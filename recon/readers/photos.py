@@ -1,8 +1,9 @@
 """Reads plain photos or a video: structure from motion finds where they were taken, once, and is kept beside them.
 
-`drives/walk` (a folder of photos in the order of their names) or `drives/walk.mp4` becomes the COLMAP workspace `drives/walk.sfm`, which is
-read from then on; delete it to start over. All pictures are taken to share one camera, whose lens is found too. Photos stay where they are,
-but where a phone stored any lying on its side: then the workspace holds them all, upright, as it holds a video's frames.
+`drives/walk` (a folder of photos in the order of their names, and of the numbers in them) or `drives/walk.mp4` becomes the COLMAP
+workspace `drives/walk.sfm`, which is read from then on; delete it to start over. All pictures are taken to share one camera, whose lens is
+found too. Photos stay where they are, but where a phone stored any lying on its side: then the workspace holds them all, upright, as it
+holds a video's frames.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from PIL import Image, ImageOps
 
 from recon.log import Log, image_size
 from recon.readers.colmap import find_model, read_colmap
+from recon.readers.order import recorded
 from recon.readers.sfm import solve
 from render.pictures import is_turned, rgb_of, swaps_sides
 
@@ -121,7 +123,7 @@ def _upright(path: Path, names: list[str], folder: Path) -> Path:
 
 def _of_one_size(path: Path) -> list[str]:
     """The photos that share the most common size when upright; the others, from another camera or turned, are left out and said."""
-    sizes = {p.name: _size(p) for p in sorted(path.iterdir()) if p.suffix.lower() in PHOTOS}
+    sizes = {p.name: _size(p) for p in sorted(path.iterdir(), key=lambda p: recorded(p.name)) if p.suffix.lower() in PHOTOS}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     most = max(counts, key=lambda size: counts[size])
     others = [name for name, size in sizes.items() if size != most]

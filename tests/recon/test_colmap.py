@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
+from PIL import Image
 
 from recon import open_log, reconstruct
 from recon.build import MOST, PER_PHOTO, fit_config, fit_size
@@ -139,6 +140,60 @@ def test_two_cameras_share_the_moments_of_equal_names(street, tmp_path):
     apart = inverse(rig["front"].body_from_cam) @ rig["left"].body_from_cam
     truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
     torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
+
+
+def renamed(folder, names):
+    """A workspace whose pictures, in the order in which they were taken, have other names."""
+    images = folder / "sparse/0/images.txt"
+    lines = images.read_text()
+    old = sorted(p.relative_to(folder / "images") for p in (folder / "images").rglob("*.png"))
+    for before, name in zip(old, names, strict=True):
+        lines = lines.replace(f" {before}\n", f" ={name}\n")
+        (folder / "new" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "images" / before).rename(folder / "new" / name)
+    images.write_text(lines.replace(" =", " "))
+    shutil.rmtree(folder / "images")
+    (folder / "new").rename(folder / "images")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "names",
+    [[f"frame{i}.png" for i in range(12)], [f"{'ab'[i // 6]}/{i % 6:03d}.png" for i in range(12)],
+     [f"{1533151603 + i / 4}.png" for i in range(12)],
+     [str(1533151603547590 + 99_999 * i) + ".png" for i in range(12)], [str(315966253572412942 + 10**9 * i) + ".png" for i in range(12)]],
+    ids=["unpadded", "two folders", "seconds", "microseconds", "nanoseconds"],
+)  # fmt: skip
+def test_pictures_follow_each_other_as_the_numbers_in_their_names_do(own, workspace, names):
+    ours, truth = open_log(renamed(own, names)).camera("camera"), open_log(workspace).camera("camera")
+    assert [str(f.relative_to(own / "images")) for f in ours.files] == names
+    torch.testing.assert_close(ours.world_from_cam, truth.world_from_cam, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("layout", ["{camera}/{part}/{i:03d}.png", "{part}/{camera}/{i:03d}.png"])
+def test_two_cameras_in_two_parts_of_a_drive_share_moments_part_by_part(street, tmp_path, layout):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    names = [layout.format(camera=c, part="ab"[i // 2], i=i % 2) for c in pair for i in range(4)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
+    assert [len(camera) for camera in log.cameras.values()] == [4, 4]
+    for camera in log.cameras.values():
+        assert camera.times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
+        assert [f.parts[-3:] for f in camera.files] == sorted(f.parts[-3:] for f in camera.files)
+
+
+def test_a_camera_with_two_pictures_at_a_moment_is_named_with_the_fix(own):
+    names = sorted(p.name for p in (own / "images").iterdir())
+    (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * max(1, i) for i, n in enumerate(names)}))
+    with pytest.raises(ValueError, match="one camera take 000.png and 001.png at one moment; give them different times in .*times.json"):
+        open_log(own)
+
+
+def test_pictures_of_another_size_than_the_models_are_named_with_the_fix(own):
+    for file in (own / "images").iterdir():
+        with Image.open(file) as picture:
+            picture.resize((48, 27)).save(file)
+    with pytest.raises(ValueError, match="000.png is 48x27, but the model in .* has a camera of 96x54; put the pictures that the model"):
+        open_log(own)
 
 
 def test_a_clock_beside_the_model_is_read(own):

@@ -72,6 +72,14 @@ def test_who_knows_his_lenses_needs_no_angle_of_view(walk, drive):
             open_log(path, angle_of_view=1.0)
 
 
+def test_photos_are_in_the_order_of_their_numbers(walk, solved, tmp_path):
+    (tmp_path / "walk").mkdir()
+    for i in range(6):
+        shutil.copy(walk / f"images/{i:03d}.png", tmp_path / f"walk/shot{i + 7}.png")
+    camera = open_log(tmp_path / "walk").camera("camera")
+    assert solved[0][0] == [f.name for f in camera.files] == [f"shot{i + 7}.png" for i in range(6)]
+
+
 def test_photos_of_another_size_are_left_out_and_said(walk, solved, tmp_path, capsys):
     shutil.copytree(walk / "images", tmp_path / "walk")
     Image.new("RGB", (54, 96)).save(tmp_path / "walk/turned.png")
