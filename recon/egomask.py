@@ -100,8 +100,9 @@ def _along_the_way(camera: LogCamera, indices: list[int]) -> list[tuple[int, int
     if len(indices) < FEWEST or (at - at[0]).norm(dim=1).max() < FARTHEST:
         return []
     way = at.diff(dim=0).norm(dim=1).cumsum(0).numpy()
-    places = np.unique(np.searchsorted(way, np.linspace(0, way[-1], LOOKS + 2)[1:-1]) + 1)
-    return [(indices[i - 1], indices[i], indices[i + 1]) for i in places if i + 1 < len(indices) and (at[i + 1] - at[i - 1]).norm() >= APART]
+    near = np.unique(np.searchsorted(way, np.linspace(0, way[-1], LOOKS + 2)[1:-1]) + 1)
+    places = [i for i in near if i + 1 < len(indices) and (at[i + 1] - at[i - 1]).norm() >= APART]
+    return [(indices[i - 1], indices[i], indices[i + 1]) for i in places]
 
 
 def _small(picture: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import torch
 from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
 from recon.readers.order import recorded
-from recon.readers.sfm import Model, ModelCamera, ModelImage, is_model, read_model
+from recon.readers.sfm import Model, ModelCamera, is_model, read_model
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
 from scenes.trajectory import Trajectory
@@ -68,7 +68,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         found, size = model.cameras[key], image_size(files[0])
         if size != (found.width, found.height):
             fix = f"put the pictures that the model was made of into {pictures}, or make a model of these"
-            raise ValueError(f"{files[0]} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}; {fix}")
+            taken = f"{files[0]} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}"
+            raise ValueError(f"{taken}; {fix}")
         times = torch.tensor([moments[k] for k in chosen])
         cameras[names[key]] = LogCamera(names[key], lens_of(found, where), found.width, found.height, files, times, placed[chosen])
         seen[names[key]] = tuple(model.images[k].points for k in chosen)

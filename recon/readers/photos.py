@@ -16,7 +16,7 @@ from pathlib import Path
 
 from PIL import Image, ImageOps
 
-from recon.log import Log, image_size
+from recon.log import Log, Packed, image_size
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.order import recorded
 from recon.readers.sfm import solve
@@ -97,7 +97,9 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _turned(file: Path) -> bool:
+def _turned(file: Path | Packed) -> bool:
+    if isinstance(file, Packed):
+        return False
     with Image.open(file) as picture:
         return is_turned(picture)
 

@@ -65,7 +65,8 @@ def test_sixteen_bits_of_grey_are_shown_as_eight(tmp_path):
 @pytest.mark.parametrize("picture", [np.int32, ">u2"], ids=["I", "I;16B"])
 def test_other_orders_of_bytes_are_sixteen_bits_too(picture):
     grey = np.array([[0, 257, 32896, 65535]])
-    image = Image.fromarray(grey.astype(np.int32)) if picture is np.int32 else Image.frombytes("I;16B", (4, 1), grey.astype(">u2").tobytes())
+    swapped = Image.frombytes("I;16B", (4, 1), grey.astype(">u2").tobytes())
+    image = Image.fromarray(grey.astype(np.int32)) if picture is np.int32 else swapped
     assert np.asarray(rgb_of(image))[0, :, 0].tolist() == [0, 1, 128, 255]
 
 
