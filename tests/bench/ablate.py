@@ -147,7 +147,8 @@ class Bench:
         start = self.started()
         used = tuple(k for k in kinds if k in variant.config.kinds or k not in LEARNT_BY_OBJECTS)
         part = " without ".join(["objects", *(k for k in kinds if k not in used)])
-        looked = self.trained(part, start, replace(CONFIG, kinds=used), "objects", "shade", share=3.0)
+        stages = ("objects", "shade") if "shadow" in used else ("objects",)  # without its pairs there is nothing to train shade on
+        looked = self.trained(part, start, replace(CONFIG, kinds=used), *stages, share=3.0)
         begun = self.out / name.replace(" ", "_") / "start.safetensors"
         if not begun.exists():
             net = load_net(self.trained("prior", start, CONFIG, "prior", share=0.5) if variant.prior else start)[0]
