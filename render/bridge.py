@@ -108,7 +108,7 @@ class Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):
-        assert ctx.saved_tensors is not None
+        _unchanged = ctx.saved_tensors  # raises where a field was written to
         settings, device, groups = ctx.settings, ctx.scene.records.device, ctx.work.groups
         threads, instances = _threads(device), len(ctx.like_poses)
         outs, shared, jobs = [], [], []
