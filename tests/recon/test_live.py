@@ -33,7 +33,7 @@ def test_who_looks_changes_nothing(drive):
 
 
 def test_the_live_figure_is_that_of_the_finished_scene(drive, tmp_path, capfd):
-    config = replace(CONFIG, steps=10 * EVERY)
+    config = replace(CONFIG, steps=20 * EVERY)  # at half of these a fit still gains 0.7 dB from a look to the next
     scene = reconstruct(open_log(drive), tmp_path / "s", size=SIZE, held_out=4, config=config)
     step, seconds, decibels = scene.meta["fit"]["live"][-1]
     row = next(r for r in scene.meta["held_out"] if r["which"] == "all")
