@@ -187,17 +187,17 @@ def image_size(file: Path) -> tuple[int, int]:
         raise ValueError(f"{file} does not decode as an image ({problem}); fetch the file again") from None
 
 
-def leading(files: Sequence[Path]) -> tuple[Path, ...]:
-    """The pictures that are there of those that a camera's time stamps name, where no more than the last are missing.
+def leading(files: Sequence[Path], what: str = "pictures") -> tuple[Path, ...]:
+    """The files that are there of those that time stamps name, where no more than the last are missing. what: they are, for messages.
 
     A piece of a drive, as others share it, has its first pictures and all of its time stamps; stderr says how many. FileNotFoundError
-    naming a picture that is missing before others, which a download broke off, or the first where there is none.
+    naming a file that is missing before others, which a download broke off, or the first where there is none.
     """
     count = next((i for i, file in enumerate(files) if not file.is_file()), len(files))
     if count < len(files):
         if not count or any(file.is_file() for file in files[count:]):
             raise FileNotFoundError(f"{files[count]} is missing; the time stamps name {len(files)} frames")
-        print(f"{files[0].parent} holds the first {count} of {len(files)} pictures, which are read", file=sys.stderr)
+        print(f"{files[0].parent} holds the first {count} of {len(files)} {what}, which are read", file=sys.stderr)
     return tuple(files[:count])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.log import Log
 from recon.readers.argoverse2 import is_argoverse2, read_argoverse2
 from recon.readers.colmap import find_model, read_colmap
-from recon.readers.kitti import is_kitti_odometry, is_kitti_raw, read_kitti_odometry, read_kitti_raw
+from recon.readers.kitti import is_kitti_odometry, is_kitti_raw, lacks_oxts, read_kitti_odometry, read_kitti_raw
 from recon.readers.ncore import is_ncore, read_ncore
 from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
@@ -45,6 +45,8 @@ def open_log(
         return read_colmap(path, camera_height, metres_per_unit)
     if is_photos(path):
         return read_photos(path, camera_height, metres_per_unit, angle_of_view)
+    if lacks_oxts(path):
+        raise FileNotFoundError(f"{path / 'oxts'} is missing; it says where a KITTI drive's car was: fetch it too")
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
     hint = f" Did you mean {inside[0]}?" if inside else ""
     raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")

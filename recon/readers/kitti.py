@@ -2,6 +2,7 @@
 
 Raw, synced and rectified: `<date>_drive_<n>_sync` with image_00 to image_03, oxts, velodyne_points, tracklet_labels.xml where there are
 any, and the three calibration files in the folder above. The body is the IMU: x forward, y left, z up; the world is a Mercator plane.
+Pictures are .png, or .jpg where someone made them smaller. A piece of a drive is read as far as its pictures and oxts go.
 The lidar turns counter-clockwise and looks ahead at its stamp: its points are untwisted by the body's motion.
 
 Odometry: `sequences/<n>` with image_0 to image_3, velodyne, calib.txt, times.txt and the poses in `../../poses/<n>.txt`. The body is the
@@ -30,11 +31,17 @@ EARTH = 6378137.0
 
 LABELS = {"Person_sitting": "pedestrian", "Misc": "object"}
 SHARE = {"licence": "CC BY-NC-SA 3.0", "attribution": "KITTI by Geiger, Lenz, Stiller and Urtasun"}
+SUFFIXES = (".png", ".jpg")
 FRONT = ("image_02", "image_2", "image_00", "image_0")
 
 
 def is_kitti_raw(path: Path) -> bool:
     return (path / "oxts").is_dir() and any(path.glob("image_0[0-3]"))
+
+
+def lacks_oxts(path: Path) -> bool:
+    """Whether a folder would be a raw drive, but for where the car was."""
+    return not (path / "oxts").is_dir() and any(path.glob("image_0[0-3]/timestamps.txt"))
 
 
 def is_kitti_odometry(path: Path) -> bool:
@@ -51,29 +58,32 @@ def read_kitti_raw(path: Path) -> Log:
     lidar_from_imu = _rigid(above / "calib_imu_to_velo.txt")
 
     times = _stamps(path / "oxts" / "timestamps.txt")
-    poses = _mercator([_oxts(path / "oxts" / "data" / f"{i:010d}.txt") for i in range(len(times))])
+    packets = [_oxts(file) for file in leading([path / "oxts" / "data" / f"{i:010d}.txt" for i in range(len(times))], "packets")]
+    times, poses = times[: len(packets)], _mercator(packets)
     origin = poses[0, :3, 3].clone()
     poses[:, :3, 3] -= origin
     ego = lengthened(times, poses)
+    known = int(ego.times_us[-1])
     cameras = {}
-    recorded = [folder for folder in sorted(path.glob("image_0[0-3]")) if any((folder / "data").glob("*.png"))]
+    recorded = [folder for folder in sorted(path.glob("image_0[0-3]")) if _suffix(folder / "data")]
     if not recorded:
         raise FileNotFoundError(f"{path} has no pictures in image_00/data to image_03/data; fetch one camera's at least")
     for folder in recorded:  # some fetch no more than image_02, of the others there are time stamps alone
         projection = _named(cams, f"P_rect_{folder.name[-2:]}", 12, above / "calib_cam_to_cam.txt")
         body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
         stamps = _stamps(folder / "timestamps.txt")
-        files = _files(folder / "data", ".png", len(stamps), 10)
+        stamps = stamps[stamps <= known]
+        files = _files(folder / "data", len(stamps), 10)
         world = ego.near_each(torch.from_numpy(stamps)) @ body_from_cam
         cameras[folder.name] = _camera(folder.name, projection, files, stamps, world)
     sweeps, lidar_times = _spinning(path / "velodyne_points", inverse(lidar_from_imu), ego)
-    first = _oxts(path / "oxts" / "data" / f"{0:010d}.txt")
+    boxed = lidar_times if len(lidar_times) else times  # synced, a frame of the one is a frame of the other
     meta = {
         "name": f"kitti-{path.resolve().name}", "source": f"KITTI raw drive {path.resolve().name}", **SHARE,
         "body": "IMU, x forward, y left, z up", "world_origin": origin.tolist(),
-        "geodetic_origin": dict(zip(("lat", "long", "height"), first[:3], strict=True)),
+        "geodetic_origin": dict(zip(("lat", "long", "height"), packets[0][:3], strict=True)),
     }  # fmt: skip
-    tracks = _tracklets(path / "tracklet_labels.xml", lidar_times, inverse(lidar_from_imu), ego)
+    tracks = _tracklets(path / "tracklet_labels.xml", boxed, inverse(lidar_from_imu), ego)
     return _log(meta, path, cameras, sweeps, tracks, ego, inverse(lidar_from_imu)[:3, 3])
 
 
@@ -98,7 +108,7 @@ def read_kitti_odometry(path: Path) -> Log:
     cameras = {}
     for folder in sorted(path.glob("image_[0-3]")):
         projection = _named(calib, f"P{folder.name[-1]}", 12, path / "calib.txt")
-        files = _files(folder, ".png", len(times), 6)
+        files = _files(folder, len(times), 6)
         world = poses @ inverse(_beside(projection) @ cam_from_body)
         cameras[folder.name] = _camera(folder.name, projection, files, times, world)
     sweeps = tuple(
@@ -202,8 +212,14 @@ def _stamps(path: Path) -> np.ndarray:
     return np.array(times, dtype=np.int64)
 
 
-def _files(folder: Path, end: str, count: int, digits: int) -> tuple[Path, ...]:
+def _files(folder: Path, count: int, digits: int) -> tuple[Path, ...]:
+    end = _suffix(folder) or SUFFIXES[0]
     return leading([folder / f"{i:0{digits}d}{end}" for i in range(count)])
+
+
+def _suffix(folder: Path) -> str | None:
+    """How the pictures of a folder end; None where it has none."""
+    return next((end for end in SUFFIXES if any(folder.glob(f"*{end}"))), None)
 
 
 def _oxts(path: Path) -> list[float]:
@@ -229,11 +245,12 @@ def _mercator(packets: list[list[float]]) -> torch.Tensor:
 
 
 def _spinning(folder: Path, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[tuple[Sweep, ...], np.ndarray]:
-    """The sweeps of a raw drive, some of which may be missing, and all their stamps."""
+    """The sweeps of a raw drive, some of which may be missing, and all their stamps, as far as the body's path is known."""
     if not folder.is_dir():
         return (), np.zeros(0, np.int64)
     times = _stamps(folder / "timestamps.txt")
     turn = int(np.median(np.diff(times))) if len(times) > 1 else 100_000
+    times = times[times <= int(ego.times_us[-1])]
     sweeps = tuple(
         Sweep(i, int(t), partial(_turn, file, int(t), turn, body_from_lidar, ego))
         for i, t in enumerate(times)

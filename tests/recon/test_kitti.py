@@ -1,10 +1,12 @@
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from made_kitti import write_kitti_odometry, write_kitti_raw
 from made_tape import STAMPS, check, tape
+from PIL import Image
 
 from recon import open_log
 
@@ -94,6 +96,44 @@ def test_a_piece_of_a_raw_drive_is_read_as_far_as_its_pictures_go(raw, own, caps
     assert len(piece.camera("image_03")) == 6 and [s.index for s in piece.sweeps] == [0, 1, 3]
     assert torch.equal(piece.ego.times_us, whole.ego.times_us) and len(piece.tracks) == 2
     assert abs(piece.sweeps[-1].read().xyz - whole.sweeps[2].read().xyz).max() == 0
+
+
+def test_a_piece_of_a_raw_drive_is_read_as_far_as_its_oxts_go(raw, own, capsys):
+    """And one frame on, where constant motion leads."""
+    for i in (3, 4, 5):
+        (own / f"oxts/data/{i:010d}.txt").unlink()
+    for i in (4, 5):
+        (own / f"image_02/data/{i:010d}.png").unlink()
+    whole, piece = open_log(raw), open_log(own)
+    assert f"{own}/oxts/data holds the first 3 of 6 packets, which are read" in capsys.readouterr().err
+    assert [len(camera) for camera in piece.cameras.values()] == [4, 4] and [s.index for s in piece.sweeps] == [0, 1, 3]
+    torch.testing.assert_close(piece.camera("image_03").world_from_cam, whole.camera("image_03").world_from_cam[:4], atol=0.02, rtol=0)
+    assert all(track.times_us[-1] <= piece.ego.times_us[-1] for track in piece.tracks) and len(piece.tracks) == 2
+
+
+def test_a_drive_without_oxts_is_told_so(own):
+    shutil.rmtree(own / "oxts")
+    with pytest.raises(FileNotFoundError, match="oxts is missing; it says where a KITTI drive's car was: fetch it too"):
+        open_log(own)
+
+
+def test_pictures_that_were_made_smaller_are_read_too(own, own_sequence):
+    for folder in (own / "image_02/data", own_sequence / "image_2"):
+        for file in folder.glob("*.png"):
+            with Image.open(file) as picture:
+                picture.save(file.with_suffix(".jpg"))
+            file.unlink()
+    for path, name in ((own, "image_02"), (own_sequence, "image_2")):
+        cameras = open_log(path).cameras
+        assert len(cameras) == 2 and [f.suffix for f in cameras[name].files] == [".jpg"] * 6
+
+
+def test_boxes_are_read_without_the_lidar_they_were_drawn_by(raw, own):
+    shutil.rmtree(own / "velodyne_points")
+    whole, bare = open_log(raw).tracks, open_log(own).tracks
+    assert [t.name for t in bare] == [t.name for t in whole] == ["veh_1", "veh_2"]
+    for a, b in zip(bare, whole, strict=True):
+        assert np.array_equal(a.times_us, b.times_us) and torch.equal(a.world_from_box, b.world_from_box)
 
 
 def test_a_piece_of_a_sequence_is_read_as_far_as_its_pictures_go(odometry, own_sequence, capsys):
