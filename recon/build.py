@@ -14,7 +14,7 @@ import torch
 from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit.config import FitConfig
+from recon.fit.config import FitConfig, check_size
 from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
 from recon.fit.model import MODEL, Knots
@@ -98,6 +98,7 @@ def reconstruct(
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
     size, config = size or fit_size(log, names), config or fit_config(log, names, span)
+    check_size(size)
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)

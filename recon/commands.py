@@ -48,6 +48,7 @@ class Recon:
 
     def run(self) -> None:
         from recon import open_log, reconstruct
+        from recon.fit.config import check_size
         from scenes.usd_scene import is_scene
 
         shelf = self.output.parent
@@ -57,6 +58,8 @@ class Recon:
         if self.output.exists() and not is_scene(self.output):
             raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
         check_device(self.device)
+        if self.size is not None:
+            check_size(self.size)  # before photos are placed, which takes long
         log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
         try:
             reconstruct(

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 import torch.nn.functional as F
 
-from recon.fit.config import FitConfig
+from recon.fit.config import SMALLEST, FitConfig
 from recon.fit.densify import Growth, grow, joined, kept
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
@@ -285,7 +285,7 @@ class Fit:
         self.descent.still_colours(self.guessed)
 
     def _size(self, shrink: int) -> tuple[int, int]:
-        return max(16, self.frames.width // shrink), max(16, self.frames.height // shrink)
+        return max(SMALLEST, self.frames.width // shrink), max(SMALLEST, self.frames.height // shrink)
 
     def _target(self, view: View, shrink: int) -> torch.Tensor:
         if shrink == 1:

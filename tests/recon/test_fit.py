@@ -13,12 +13,14 @@ from recon import open_log, reconstruct, stopped_early
 from recon.actors import split_points
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from recon.commands import Recon
 from recon.fit.config import FitConfig
 from recon.fit.densify import kept
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.fit.swept import Swept
+from recon.log import LogCamera
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers, mistake
 from recon.skies import cells
 from render import render_frame
@@ -115,6 +117,15 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
     for name, tensor in resumed.background.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
     assert resumed.meta["held_out"] == whole[1].meta["held_out"] and out.is_dir()
+
+
+def test_a_size_that_is_too_small_is_refused_before_any_picture_is_read(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr(LogCamera, "image", lambda *_: pytest.fail("read a picture"))
+    with pytest.raises(ValueError, match="pictures of 28x15 are too small to fit to; the smallest size is 16x16"):
+        reconstruct(open_log(drive), tmp_path / "scene", size=(28, 15), config=CONFIG)
+    monkeypatch.setattr("recon.open_log", lambda *_: pytest.fail("opened the log"))
+    with pytest.raises(ValueError, match="28x15 are too small"):
+        Recon(drive, tmp_path / "scene", size=(28, 15)).run()
 
 
 def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive, tmp_path):
