@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,9 @@ def read_model(folder: Path) -> Model:
         images.append(ModelImage(image.name, image.camera_id, image.frame_id, pose, _shown(image, place)))
     if not images:
         raise ValueError(f"{folder} registers no picture; COLMAP found no pose, so there is nothing to reconstruct from")
+    twice = next((a.name for a, b in pairwise(images) if a.name == b.name), None)
+    if twice is not None:
+        raise ValueError(f"{folder} registers two pictures as {twice}; names in a text model end at their first space: export it as binary")
     values = np.concatenate([xyz.ravel(), *(i.cam_from_world.ravel() for i in images)])
     if not np.isfinite(values).all():
         raise ValueError(f"{folder} holds a pose or a point that is not finite; run COLMAP's mapper again")

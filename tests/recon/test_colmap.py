@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -185,6 +186,15 @@ def test_a_camera_with_two_pictures_at_a_moment_is_named_with_the_fix(own):
     names = sorted(p.name for p in (own / "images").iterdir())
     (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * max(1, i) for i, n in enumerate(names)}))
     with pytest.raises(ValueError, match="one camera take 000.png and 001.png at one moment; give them different times in .*times.json"):
+        open_log(own)
+
+
+def test_names_with_a_space_in_a_text_model_are_refused_with_the_fix(own):
+    images = own / "sparse/0/images.txt"
+    images.write_text(re.sub(r"(\d{3}\.png)", r"May \1", images.read_text()))
+    with pytest.raises(
+        ValueError, match="registers two pictures as May; names in a text model end at their first space: export it as binary"
+    ):
         open_log(own)
 
 
