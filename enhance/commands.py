@@ -46,20 +46,21 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.clips import PairConfig
-        from enhance.pairs import check_cameras, check_kinds, kinds_for, make_pairs, open_reconstruction, prepare_sources
-        from enhance.photo_pairs import make_photo_pairs
+        from enhance.pairs import check_cameras, check_kinds, claim_pairs, kinds_for, make_pairs, open_reconstruction, prepare_sources
+        from enhance.photo_pairs import check_names, make_photo_pairs
         from recon import open_log
         from render.progress import Progress
 
         if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
-        if self.kinds == ():
-            raise UsageError("--kinds names none; leave it out for all that can be made")
+        _some("--kinds", self.kinds)
+        _some("--cameras", self.cameras)
         names = [path.resolve().name for path in self.scenes]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
         check_kinds(self.kinds or ())
+        check_names(self.photos)
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
@@ -68,6 +69,7 @@ class Pairs:
             cameras = check_cameras(scene, log, self.cameras)
             kinds = self.kinds or kinds_for(scene, log)
             out = self.output if len(self.scenes) == 1 else self.output / path.name
+            claim_pairs(out, scene, log, self.seed, PairConfig(width=self.size))
             relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / path.name
             sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device, self.seed, relit)
             with Progress(f"pairs {path.name}") as steps:
@@ -79,6 +81,12 @@ class Pairs:
                 make_pairs(scene, log, out, kinds, cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
         make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
+
+
+def _some(flag: str, names: tuple[str, ...] | None) -> None:
+    """UsageError where names were asked for and none was given."""
+    if names == ():
+        raise UsageError(f"{flag} names none; leave it out for all")
 
 
 @dataclass
@@ -111,6 +119,7 @@ class Train:
 
         if not self.pairs:
             raise UsageError("give at least one folder of pairs; sidestep pairs makes them")
+        _some("--only", self.only)
         check_device(self.device)
         pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:

@@ -63,9 +63,7 @@ def make_pairs(
     log = log_path if isinstance(log_path, Log) else open_log(log_path)
     kinds = check_kinds(kinds)
     chosen = check_cameras(scene, log, cameras)
-    out = Path(out)
-    settings = {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every}
-    claim(out, settings, {"scene": _digest(scene), "recording": log.name})
+    out = claim_pairs(out, scene, log, seed, config)
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
     log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
@@ -181,19 +179,28 @@ def _write(path: Path, kind: str, clip: Clip, damage: Damage) -> None:
     write_shard(path, tensors, {"kind": kind, **clip.meta, **damage.what})
 
 
+def claim_pairs(out: str | Path, scene: Scene, log: Log, seed: int, config: PairConfig) -> Path:
+    """The folder for a scene's pairs, which is noted in it; ValueError where it holds others, before anything is reconstructed for them."""
+    settings = {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every}
+    claim(Path(out), settings, {"scene": _digest(scene), "recording": log.name})
+    return Path(out)
+
+
 def claim(out: Path, settings: dict, made_of: dict) -> None:
     """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
-    note = out / "pairs.json"
+    note, before = out / "pairs.json", {}
     if note.exists():
         before = json.loads(note.read_text())
         if {k: v for k, v in before.items() if k in settings} != settings:
             raise ValueError(f"{out} holds pairs made with other settings ({note.read_text()}); choose another folder")
-        if any(before.get(k, v) != v for k, v in made_of.items()):
-            raise ValueError(f"{out} holds pairs of another scene, or of this one before it was changed; choose another folder")
-        return
+        for name, digest in made_of.items():
+            if before.get(name, digest) != digest:
+                raise ValueError(f"{out} holds pairs of another {name}, or of this one before it was changed; choose another folder")
+        if made_of.keys() <= before.keys():
+            return
     out.mkdir(parents=True, exist_ok=True)
     with atomic_file(note) as half:
-        Path(half).write_text(json.dumps(settings | made_of))
+        Path(half).write_text(json.dumps(before | settings | made_of))
 
 
 def _digest(scene: Scene) -> str:

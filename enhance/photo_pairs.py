@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,16 +25,15 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
     same region is told and is as it was.
 
     They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path
-    holds no photos.
+    holds no photos, where two have one name, and where the folder holds pairs of others of that name or made with other settings.
     """
     out = Path(out)
-    stems = [Path(path).stem for path in paths]
-    if twice := sorted({s for s in stems if stems.count(s) > 1}):
-        raise ValueError(f"two of the photos' paths are called {twice[0]}, by which pairs are named; make one's in another folder")
-    if paths:
-        claim(out, {"seed": seed, "width": width}, {})
+    check_names(paths)
     for path in map(Path, paths):
-        for i, photo in enumerate(Photos((path,), STRIDE, width).frames):
+        photos = Photos((path,), STRIDE, width).frames
+        digest = hashlib.sha256(photos[0].tobytes()).hexdigest()[:16]
+        claim(out, {"seed": seed, "width": width}, {f"source {path.stem}": f"{len(photos)} {digest}"})
+        for i, photo in enumerate(photos):
             rng = np.random.default_rng([seed, i])
             target = torch.from_numpy(photo).permute(2, 0, 1).float() / 255
             region = torch.from_numpy(random_mask(rng, *photo.shape[:2]))[None]
@@ -43,6 +43,13 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
             _write(out, "isp_frame", isp(target), target, everywhere, everywhere, {**meta, "isp": vars(isp)})
             _write(out, "clean", target, target, region, torch.zeros_like(region), meta)
     return out
+
+
+def check_names(paths: Sequence[str | Path]) -> None:
+    """ValueError where two have one name, less its suffix."""
+    stems = [Path(path).stem for path in paths]
+    if twice := sorted({s for s in stems if stems.count(s) > 1}):
+        raise ValueError(f"two of the photos' paths are called {twice[0]}, by which pairs are named; make one's in another folder")
 
 
 def _write(out: Path, kind: str, given: torch.Tensor, target: torch.Tensor, told: torch.Tensor, region: torch.Tensor, meta: dict) -> None:
