@@ -146,25 +146,29 @@ class Run:
         whole = BytesIO()  # written by Python, which says that the disk is full; torch's own writer says "unexpected pos"
         torch.save({**facts, **state}, whole)
         with atomic_file(path) as half:
-            half.write_bytes(whole.getbuffer())
+            try:
+                with open(half, "wb") as file:
+                    file.write(whole.getbuffer())
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(path)) from error
 
     def load(self, path: Path) -> None:
+        """Go on from a checkpoint. ValueError where that is not whole, or of a training of something else."""
+        state = opened(path)
+        if state["seed"] != self.seed:
+            raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
+        before = state["config"] | state.get("told", {})
+        for name, value in (asdict(self.config) | self.told).items():
+            if before.get(name, value) != value:
+                was, now = ("other ones", "these") if name == "pairs" else (before[name], value)
+                fix = "resume with the same command, or choose another folder"
+                raise ValueError(f"{path} was begun with the {name} {was}, not {now}; {fix}")
         try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
             for name, part in self.parts().items():
                 part.load_state_dict(state[name])
             self.step, self.seconds = state["step"], state["seconds"]
-        except (LookupError, RuntimeError, EOFError, ValueError, OSError, pickle.UnpicklingError) as error:
-            why = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again") from error
-        if state["seed"] != self.seed:
-            raise ValueError(f"{path} was begun with seed {state['seed']}, not {self.seed}; resume with --seed {state['seed']}")
-        before = state.get("told", {})
-        for name in self.told:
-            if before.get(name, self.told[name]) != self.told[name]:
-                was, now = ("other ones", "these") if name == "pairs" else (before[name], self.told[name])
-                fix = "resume with the same command, or choose another folder"
-                raise ValueError(f"{path} was begun with the {name} {was}, not {now}; {fix}")
+        except (LookupError, RuntimeError, ValueError) as error:
+            raise _broken(path, error) from error
 
     def share(self, stage: str) -> float:
         """A stage's share of the budget, of which those that are left out take nothing."""
@@ -188,3 +192,18 @@ class Run:
         rate = highest * min(1.0, (self.step[stage] + 1) / 100) * (0.505 + 0.495 * np.cos(np.pi * self.done(stage)))
         for group in self.optimiser[stage].param_groups:
             group["lr"] = float(rate)
+
+
+def opened(path: Path) -> dict:
+    """What `Run.save` wrote; ValueError where a file is nothing of the kind."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        TrainConfig(**state["config"])
+        return state
+    except (LookupError, RuntimeError, EOFError, TypeError, ValueError, OSError, pickle.UnpicklingError) as error:
+        raise _broken(path, error) from error
+
+
+def _broken(path: Path, error: Exception) -> ValueError:
+    why = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return ValueError(f"{path} is not a checkpoint of this training ({why}); delete it to start again")

@@ -7,6 +7,7 @@ their past, with any number of latents from 0 to K, so that it never sees a past
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -28,13 +29,13 @@ from enhance.objects import changed
 from enhance.past import Past
 from enhance.precision import autocast
 from enhance.prior import flow_matching_loss
-from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig
+from enhance.run import FROZEN, FURTHER, STAGES, Run, TrainConfig, opened
 from enhance.samples import Images, Photos, Sample, Sampler
 from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
 from enhance.shade_samples import Grounds
 from enhance.shards import RENDERED, PairSet
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
 from scenes.names import unknown
 
 NEAR_ENOUGH = 3e-4
@@ -75,7 +76,7 @@ def train(
     start     weights to train further, "builtin" or a file; their autoencoder is kept
     only      of STAGES those to train, which takes weights to start from; the others' parts stay as they are
     device    where to train; a run may be resumed on another
-    config    `TrainConfig.of` the device where None
+    config    that of the checkpoint, or else `TrainConfig.of` the device, where None
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off; ValueError where there is nothing to train a stage of `only`
     on (others are left out then), and where the checkpoint is of a training of something else.
@@ -94,14 +95,17 @@ def train(
     if checkpoint.exists() and not resume:
         raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
-    config = config or TrainConfig.of(torch.device(device))
+    if config is None:
+        config = TrainConfig(**opened(checkpoint)["config"]) if checkpoint.exists() else TrainConfig.of(torch.device(device))
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
-    begun, origin = load_net(BUILTIN if start == "builtin" else start) if start is not None else (None, None)
+    first = BUILTIN if start == "builtin" else start
+    begun, origin = load_net(first) if first is not None else (None, None)
     if begun is None:
         torch.manual_seed(seed)
         begun = Net(net or NetConfig())
     stages = _stages(only, STAGES if start is None else FURTHER, sampler)
-    told = {"stages": stages, "start": str(start), "pairs": pair_set.digest() if pair_set else "", "photos": [Path(p).name for p in photos]}
+    weights_of = "nothing" if first is None else f"{Path(first).name} ({hashlib.sha256(Path(first).read_bytes()).hexdigest()[:8]})"
+    told = {"stages": stages, "start": weights_of, "pairs": pair_set.digest() if pair_set else "", "photos": [Path(p).name for p in photos]}
     run = Run(config, begun, minutes, steps, seed, stages, device, told)
     if resume and checkpoint.exists():
         run.load(checkpoint)
@@ -131,29 +135,37 @@ def train(
     run.save(checkpoint)
     weights = out / "enhancer.safetensors"
     shards = pair_set.of(split="train") if pair_set else []
-    # on clips that were trained on a network gains a whole dB by knowing the place
-    judged = (pair_set.of(split="held out") if pair_set else []) or shards
-    gains = repair_gain(run.average, [s for s in judged if s.meta["kind"] in RENDERED])
-    if origin is not None and not {"prior", "enhancer"} & set(stages):
-        gains = origin.get(REPAIR_GAIN, [WORTH, WORTH])  # nothing was done to what repairs
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
     data |= {"further": origin} if origin is not None else {}
     made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
-    save_net(run.average, weights, {**(about or {}), **made, REPAIR_GAIN: gains})
+    save_net(run.average, weights, {**(about or {}), **made, **_gain(run, pair_set, origin)})
     return weights
 
 
 def _stages(only: Sequence[str] | None, usual: Sequence[str], sampler: Sampler) -> list[str]:
     """What is trained, each once: `only`, or of the `usual` stages those that there is something to train on; the others are said."""
-    there = {"objects": sampler.has_objects, "shade": bool(sampler.shards["shadow"]), "enhancer": bool(sampler.rendered)}
+    there = {"objects": sampler.has_objects, "shade": sampler.grounds(0, 1) is not None, "enhancer": bool(sampler.rendered)}
     lacking = [stage for stage in only or usual if not there.get(stage, True)]
     for stage in lacking:
         said = f"these pairs hold nothing to train {stage} on, which takes {TAKES[stage]}"
         if only:
             raise ValueError(f"{said}; make some with sidestep pairs --kinds, or leave {stage} out of --only")
         print(f"{said}: left out", file=sys.stderr)
+    if len(lacking) == len(usual):
+        raise ValueError(f"these pairs hold nothing to train any of {', '.join(usual)} on; make some with sidestep pairs")
     return [stage for stage in dict.fromkeys(only or usual) if stage not in lacking]
+
+
+def _gain(run: Run, pairs: PairSet | None, origin: dict | None) -> dict[str, object]:
+    """What repairing is worth, for the header: measured anew where the repairing was trained and something is held out to judge it by, else
+    what was known of the weights begun with. Where there were none, training clips judge it."""
+    # on clips that were trained on a network gains a whole dB by knowing the place
+    held_out, trained = ([] if pairs is None else pairs.of(split=split) for split in ("held out", "train"))
+    judged = [s for s in held_out or trained if s.meta["kind"] in RENDERED]
+    if origin is not None and not ("enhancer" in run.stages and held_out and judged):
+        return {REPAIR_GAIN: origin[REPAIR_GAIN]} if REPAIR_GAIN in origin else {}
+    return {REPAIR_GAIN: repair_gain(run.average, judged)}
 
 
 def _stage(
@@ -222,9 +234,7 @@ def _objects_step(run: Run, batch: Objects, step: int) -> torch.Tensor:
     return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
 
 
-def _shade_step(run: Run, batch: Grounds | None, step: int) -> torch.Tensor:
-    if batch is None:
-        return torch.zeros(())
+def _shade_step(run: Run, batch: Grounds, step: int) -> torch.Tensor:
     dark = shaded(batch.given, optical_depth(batch.places, run.net.objects.shade(batch.read)))
     error = (dark - batch.target).square().mean((1, 2))
     return _update(run, "shade", [torch.log(error + SHADE_NEAR_ENOUGH).mean()])

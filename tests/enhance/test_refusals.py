@@ -9,18 +9,21 @@ import torch
 from small_net import stirred
 
 from enhance.clips import PairConfig
+from enhance.commands import Pairs, Train
 from enhance.evaluate import main
 from enhance.pairs import make_pairs
 from enhance.photo_pairs import make_photo_pairs
-from enhance.run import TrainConfig
+from enhance.run import TrainConfig, opened
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.step import checked
 from enhance.train import train
 from enhance.weights_file import REPAIR_GAIN, load_net, save_net
 from render.frame_types import Frame
 from render.video import write_image
+from scenes import save
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
+from scenes.opening import UsageError
 
 QUICK = TrainConfig(crop=32, images=2, clips=1, frames=2, looked_at=2)
 
@@ -68,6 +71,41 @@ def test_what_repairs_keeps_its_measured_gain_where_it_was_not_trained(awake, tm
     weights = train(written(tmp_path / "p", "isp", "underfit"), tmp_path / "t", steps=3, config=QUICK, start=awake, only=["objects"] * 2)
     about = load_net(weights)[1]
     assert about[REPAIR_GAIN] == [1.5, 2.0] and about["steps"]["objects"] == 3
+
+
+def test_a_gain_is_not_measured_anew_where_nothing_is_held_out(awake, tmp_path):
+    pairs = written(tmp_path / "p", "isp", "underfit")
+    for stage in ("prior", "enhancer"):
+        weights = train(pairs, tmp_path / stage, steps=3, config=QUICK, start=awake, only=[stage])
+        assert load_net(weights)[1][REPAIR_GAIN] == [1.5, 2.0]
+    save_net(stirred(), tmp_path / "of_before.safetensors", {})
+    weights = train(pairs, tmp_path / "old", steps=3, config=QUICK, start=tmp_path / "of_before.safetensors", only=["objects"])
+    assert REPAIR_GAIN not in load_net(weights)[1]
+
+
+def test_where_no_stage_has_anything_to_train_on_none_is_written(awake, tmp_path):
+    with pytest.raises(ValueError, match="nothing to train any of objects, shade, enhancer on"):
+        train(written(tmp_path / "p", "relight"), tmp_path / "t", steps=4, config=QUICK, start=awake)
+    assert not (tmp_path / "t").exists()
+
+
+def test_a_training_goes_on_with_its_own_settings_and_with_no_others(awake, tmp_path):
+    pairs, how = written(tmp_path / "p", "isp"), {"start": awake, "only": ["objects"]}
+    train(pairs, tmp_path / "t", steps=3, config=QUICK, **how)
+    with pytest.raises(ValueError, match="begun with the rate 0.0008, not 0.01"):
+        train(pairs, tmp_path / "t", steps=4, config=replace(QUICK, rate=1e-2), resume=True, **how)
+    assert load_net(train(pairs, tmp_path / "t", steps=4, resume=True, **how))[1]["steps"]["objects"] == 4
+    assert opened(tmp_path / "t" / "checkpoint.pt")["config"]["crop"] == QUICK.crop
+
+
+def test_weights_trained_anew_are_other_weights_to_start_from(awake, tmp_path):
+    start, how = tmp_path / "start.safetensors", {"config": QUICK, "only": ["objects"]}
+    shutil.copy(awake, start)
+    pairs = written(tmp_path / "p", "isp")
+    train(pairs, tmp_path / "t", steps=3, start=start, **how)
+    save_net(stirred(seed=1), start, {})
+    with pytest.raises(ValueError, match="begun with the start start.safetensors"):
+        train(pairs, tmp_path / "t", steps=4, start=start, resume=True, **how)
 
 
 @pytest.mark.parametrize("change", ["stages", "start", "pairs"])
@@ -119,6 +157,28 @@ def test_photos_of_one_name_and_other_settings_are_refused(tmp_path):
     make_photo_pairs([tmp_path / "a" / "img"], tmp_path / "p", width=32)
     with pytest.raises(ValueError, match="other settings"):
         make_photo_pairs([tmp_path / "a" / "img"], tmp_path / "p", width=32, seed=1)
+    kept = {p: p.read_bytes() for p in (tmp_path / "p").rglob("*.safetensors")}
+    with pytest.raises(ValueError, match="another source img"):  # by another command
+        make_photo_pairs([tmp_path / "b" / "img"], tmp_path / "p", width=32)
+    assert kept == {p: p.read_bytes() for p in (tmp_path / "p").rglob("*.safetensors")}
+
+
+def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("recon.open_log", lambda _: recording)
+    monkeypatch.setattr("enhance.pairs.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
+    save(street, tmp_path / "street")
+    one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))
+    with pytest.raises(ValueError, match="Did you mean left_camera"):
+        one.run()
+    with pytest.raises(ValueError, match="called img"):
+        replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
+    with pytest.raises(UsageError, match="--cameras names none"):
+        replace(one, cameras=()).run()
+    with pytest.raises(UsageError, match="--only names none"):
+        Train((tmp_path,), tmp_path / "t", only=()).run()
+    make_pairs(replace(street, actors=()), recording, tmp_path / "out", ("clean",), config=PairConfig(frames=2, width=32))
+    with pytest.raises(ValueError, match="other settings"):
+        replace(one, cameras=None).run()
 
 
 def test_what_photos_say_must_be_finite_and_is_trusted_in_all_at_most():

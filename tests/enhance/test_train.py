@@ -189,6 +189,31 @@ def test_a_full_disk_is_called_that(pairs, trained, monkeypatch):
         train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
 
 
+def test_a_disk_that_fills_while_it_is_written_to_is_called_that_and_the_file_named(pairs, trained, monkeypatch):
+    class Filling:
+        left = 1000
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def write(self, some):
+            self.left -= len(some)
+            if self.left < 0:
+                raise OSError(28, "No space left on device")
+            return len(some)
+
+        def flush(self):
+            pass
+
+    monkeypatch.setattr(sys.modules["enhance.run"], "open", lambda *_: Filling(), raising=False)
+    with pytest.raises(OSError, match="No space left") as full:
+        train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
+    assert full.value.errno == 28 and full.value.filename == str(trained / "checkpoint.pt")
+
+
 @pytest.mark.parametrize("spoil", [lambda b: b[: len(b) // 2], lambda b: b"not a checkpoint", lambda b: b""])
 def test_a_broken_checkpoint_is_refused_by_name(pairs, trained, tmp_path, spoil):
     (tmp_path / "checkpoint.pt").write_bytes(spoil((trained / "checkpoint.pt").read_bytes()))
