@@ -71,9 +71,10 @@ def enhance_video(
 ) -> int:
     """Enhance any video that FFmpeg decodes, of any size, in constant memory; returns the number of frames.
 
-    The result is H.264 at the source's rate without its sound. A side that is odd gains one repeated row or column, which H.264's 4:2:0
-    needs. `progress` is called with frames done and frames in all, where the file says. rendered: whether the video shows renders, which
-    our own network repairs; else it leaves a video as it is, since nobody says what was put in. It warns where no frame was changed.
+    The result is H.264 with the source's times and shape of pixels, without its sound. A side that is odd gains one repeated row or
+    column, which H.264's 4:2:0 needs. `progress` is called with frames done and frames in all, where the file says. rendered: whether the
+    video shows renders, which our own network repairs; else it leaves a video as it is, since nobody says what was put in. It warns where
+    no frame was changed.
     Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     from render.video import VideoWriter, read_video
@@ -85,11 +86,11 @@ def enhance_video(
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
     memory, done, changed = None, 0, False
-    with VideoWriter(out, video.fps, video.width, video.height) as writer:
-        for rgb in video:
+    with VideoWriter(out, video.fps, video.width, video.height, pixel_aspect=video.pixel_aspect) as writer:
+        for time_us, rgb in video.timed():
             better, memory = enhancer.step(rgb, memory)
             changed = changed or not torch.equal(better, rgb.to(better).clamp(0, 1))
-            writer.write(better)
+            writer.write(better, time_us)
             done += 1
             if progress is not None:
                 progress(done, video.count)

@@ -15,6 +15,9 @@ from scenes.atomic import atomic_file
 from scenes.checks import check_tensor
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
+TICK = Fraction(1, 90_000)
+"""Seconds by which the times of frames that are not evenly apart are counted, as in MPEG's own clock."""
+
 BT709 = 1  # the code point of ITU-R BT.709 in H.264, for primaries, transfer and matrix alike
 
 
@@ -56,8 +59,9 @@ def write_image(path: str | os.PathLike, rgb: torch.Tensor) -> None:
 class Video:
     """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1, turned as the file says (phones').
 
-    fps: frames a second in the mean; width, height: pixels of the turned frames; count, seconds: frames and length as the file claims, None
-    where it does not say. Raises ValueError where the file is no video, has no frames, or breaks off in the middle.
+    fps: frames a second in the mean; width, height: pixels of the turned frames; pixel_aspect: how much wider than high a pixel is to be
+    shown; count, seconds: frames and length as the file claims, None where it does not say. Raises ValueError where the file is no video,
+    has no frames, or breaks off in the middle.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -71,10 +75,13 @@ class Video:
             self.fps = float(stream.average_rate or stream.guessed_rate or 25)
             self.count = stream.frames or None
             self.seconds = float(stream.duration * stream.time_base) if stream.duration else None
+            aspect = stream.sample_aspect_ratio or Fraction(1)
         frames = self._decoded()
         first = next(frames)  # what turns them is said with the frames
         frames.close()
-        self.width, self.height = (first.height, first.width) if _quarters(first) % 2 else (first.width, first.height)
+        lies = _quarters(first) % 2 == 1
+        self.width, self.height = (first.height, first.width) if lies else (first.width, first.height)
+        self.pixel_aspect = 1 / aspect if lies else aspect
 
     def __iter__(self) -> Iterator[torch.Tensor]:
         for _, rgb in self.timed():
@@ -134,15 +141,17 @@ class VideoWriter:
     with VideoWriter("out.mp4", fps=10, width=640, height=360) as video:
         video.write(rgb)
 
+    Frames are evenly apart but for those whose times are told. pixel_aspect: how much wider than high a pixel is to be shown.
     Sizes that are odd gain a repeated last row or column, since 4:2:0 has none. A block that wrote no frame raises ValueError.
     """
 
-    def __init__(self, path: str | os.PathLike, fps: float, width: int, height: int, crf: int = 18):
+    def __init__(self, path: str | os.PathLike, fps: float, width: int, height: int, crf: int = 18, pixel_aspect: Fraction = Fraction(1)):
         if Path(path).suffix.lower() not in CONTAINERS:
             raise ValueError(f"{path} must end in {', '.join(CONTAINERS)} to be written as video")
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.path, self.fps, self.width, self.height, self.crf, self.count = Path(path), fps, width, height, crf, 0
+        self.pixel_aspect, self._last = pixel_aspect, -1
         self._stack = ExitStack()
 
     def __enter__(self) -> VideoWriter:
@@ -155,21 +164,28 @@ class VideoWriter:
             rate = Fraction(self.fps).limit_denominator(1_000_000)
             self._stream = self._container.add_stream("libx264", rate=rate, options={"crf": str(self.crf), "preset": "veryfast"})
             context = self._stream.codec_context
+            context.sample_aspect_ratio = self.pixel_aspect
             context.width, context.height, context.pix_fmt = self.width + self.width % 2, self.height + self.height % 2, "yuv420p"
             context.color_primaries = context.color_trc = context.colorspace = BT709
             context.color_range = 1
             self._stack = stack.pop_all()
         return self
 
-    def write(self, rgb: torch.Tensor) -> None:
-        """Add one frame `[height, width, 3]`."""
+    def write(self, rgb: torch.Tensor, time_us: int | None = None) -> None:
+        """Add one frame `[height, width, 3]`. time_us: when it is shown, later than the one before, of all frames or of none."""
         import av
         from av.video.reformatter import Colorspace
 
         check_tensor("a video frame", rgb, (self.height, self.width, 3))
         pixels = np.pad(to_bytes(rgb), ((0, self.height % 2), (0, self.width % 2), (0, 0)), mode="edge")
         frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
-        frame.pts = self.count
+        if self.count == 0 and time_us is not None:
+            self._stream.codec_context.time_base = TICK
+        if time_us is None:
+            frame.pts = self.count
+        else:
+            self._last = max(self._last + 1, round(time_us / 1e6 / TICK))
+            frame.pts, frame.time_base = self._last, TICK
         self._container.mux(self._stream.encode(frame))
         self.count += 1
 

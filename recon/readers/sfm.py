@@ -15,7 +15,7 @@ from render.progress import Progress
 
 PARTS = ("cameras", "images", "points3D")
 EXHAUSTIVE = 40
-"""Pictures of which every pair is matched; of more, those whose names are near."""
+"""Pictures of which every pair is matched; of more, those that were taken one soon after the other."""
 
 FEATURES = 4096
 """Of a picture whose pose is known, at most: they only have to tell how far things are."""
@@ -108,7 +108,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     """Find the poses of the named pictures and their common lens; writes `workspace`/sparse/0. Returns how many were placed.
 
     angle_of_view: radians from the left to the right side, where the focal length need not be found.
-    SIFT features, matched between all pictures, or where they are `ordered` (a video) between near ones, then incremental mapping
+    SIFT features, matched between all pictures, or where they are `ordered` (a video) or many between near ones, then incremental mapping
     (Schönberger and Frahm 2016), all on the CPU. The largest of the models is kept. ValueError where it holds too few pictures.
     """
     colmap = pycolmap()
@@ -123,7 +123,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
         colmap.extract_features(database, pictures, names, camera_mode=single, reader_options=reader, device=cpu)
         steps.step(note="matches")
         if ordered or len(names) > EXHAUSTIVE:
-            colmap.match_sequential(database, device=cpu)
+            _match_following(colmap, database, names)
         else:
             colmap.match_exhaustive(database, device=cpu)
         steps.step(note="poses")
@@ -191,6 +191,21 @@ def triangulate(
     xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
     nothing = dict.fromkeys(poses, np.zeros(0, np.int64))
     return xyz, nothing | {image.name: _shown(image, place) for image in found.images.values()}
+
+
+def _match_following(colmap, database: Path, names: list[str]) -> None:
+    """Match the features of pictures that follow each other in the order of `names`."""
+
+    def rename(called: dict[str, str]) -> None:
+        with colmap.Database.open(database) as opened:
+            for image in opened.read_all_images():
+                image.name = called[image.name]
+                opened.update_image(image)
+
+    in_order = {name: f"{i:08d}" for i, name in enumerate(names)}  # COLMAP goes by the alphabet, where 10.jpg comes before 9.jpg
+    rename(in_order)
+    colmap.match_sequential(database, device=colmap.Device.cpu)
+    rename({number: name for name, number in in_order.items()})
 
 
 def _at_poses(colmap, database: Path, poses: dict[str, np.ndarray]):

@@ -1,6 +1,7 @@
 """Whole videos."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -39,6 +40,17 @@ def test_every_frame_is_enhanced_and_said(tmp_path, enhancer):
     out = list(read_video(tmp_path / "out.mp4"))
     assert [round(float(f.mean()), 1) for f in out] == [0.2, 0.3, 0.4, 0.5] and out[0].shape == (34, 50, 3)
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)] and read_video(tmp_path / "out.mp4").fps == 10
+
+
+def test_frames_keep_their_times_and_the_shape_of_their_pixels(tmp_path, enhancer):
+    """As a phone's frames, which come late in the dark, and a camcorder's, whose pixels are wider than high."""
+    times_us = [0, 33_000, 66_000, 250_000, 283_000]
+    with VideoWriter(tmp_path / "in.mp4", 30, 48, 32, pixel_aspect=Fraction(4, 3)) as video:
+        for time_us in times_us:
+            video.write(torch.full((32, 48, 3), 0.5), time_us)
+    enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer)
+    out = read_video(tmp_path / "out.mp4")
+    assert [t for t, _ in out.timed()] == pytest.approx(times_us, abs=12) and out.pixel_aspect == Fraction(4, 3)
 
 
 def test_odd_sizes_gain_the_row_and_column_that_h264_needs(tmp_path, enhancer):

@@ -11,6 +11,7 @@ from PIL import Image
 
 from recon import open_log
 from recon.readers import photos as reader
+from recon.readers import sfm
 from recon.readers.sfm import read_model
 from render.pictures import ORIENTATION
 from render.video import VideoWriter
@@ -133,6 +134,27 @@ def test_frames_of_a_video_that_are_unevenly_apart_keep_their_times(tmp_path):
     times = reader._frames(tmp_path / "uneven.mp4", tmp_path / "frames")
     assert all(t == pytest.approx(1000 * at[int(name[:6])], abs=1000) for name, t in times.items())
     assert {f"{i:06d}.jpg" for i in range(30, 40)} <= times.keys() and len(times) <= 30
+
+
+def test_many_photos_are_matched_in_the_order_of_their_numbers(tmp_path, monkeypatch):
+    """COLMAP's matcher goes by the alphabet, in which a walk's second photo is its tenth."""
+    colmap = sfm.pycolmap()
+    names = [f"IMG ({i}).jpg" for i in range(1, 13)]
+    for i, name in enumerate(names):
+        Image.fromarray(np.random.default_rng(i).integers(0, 255, (64, 96, 3)).astype(np.uint8)).save(tmp_path / name)
+    database, seen = tmp_path / "database.db", []
+
+    colmap.extract_features(database, tmp_path, names, camera_mode=colmap.CameraMode.SINGLE, device=colmap.Device.cpu)
+    before = {i.image_id: i.name for i in _images(colmap, database)}
+    monkeypatch.setattr(colmap, "match_sequential", lambda path, device: seen.extend(_images(colmap, path)))
+    sfm._match_following(colmap, database, names)
+    assert [before[i.image_id] for i in sorted(seen, key=lambda i: i.name)] == names
+    assert {i.image_id: i.name for i in _images(colmap, database)} == before
+
+
+def _images(colmap, database):
+    with colmap.Database.open(database) as opened:
+        return opened.read_all_images()
 
 
 def test_a_video_keeps_its_clock(solved, tmp_path):
