@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -69,15 +70,21 @@ def make_pairs(
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
     if "relight" in kinds and sources.relit is not None:
         _ask(sources.relit, starts, config)
+    untouched = dict.fromkeys(kinds, 0)
     for done, (camera, start) in enumerate(starts):
         name = clip_label(camera.name, start)
         missing = [kind for kind in kinds if not (out / kind / f"{name}.json").exists()]
         clip = Clip(scene, camera, start, config, seed, rights, device) if missing else None
         for kind in missing:
             assert clip is not None
-            _write(out / kind / f"{name}.safetensors", kind, clip, make(kind, clip, sources))
+            damage = make(kind, clip, sources)
+            untouched[kind] += kind != "clean" and not damage.region.any()
+            _write(out / kind / f"{name}.safetensors", kind, clip, damage)
         if progress is not None:
             progress(done + 1, len(starts), name)
+    for kind, count in untouched.items():
+        if count:
+            print(f"{kind}: {count} of {len(starts)} clips show nothing to change, and stay as their photos are", file=sys.stderr)
     for kind in kinds:
         contact_sheet(PairSet(out), kind, out / f"{kind}.png")
     return out
@@ -107,11 +114,19 @@ def prepare_sources(
 ) -> Sources:
     """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once; each seed leaves out other
     things), assets cut out of the scene and those of a databank, and .hdr skies; `relit` is the folder in which DiffusionRenderer is met.
-    Raises ValueError for an unknown kind, and where the rig has too few cameras for one."""
+    Raises ValueError for an unknown kind, where the rig has too few cameras for one, and where shadow has no asset to put in."""
     check_kinds(kinds)
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
     log = with_ego_masks(log, names, PairConfig.width)
+    found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
+    bank = Databank(databank) if databank is not None else None
+    stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
+    anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored
+    if "shadow" in kinds and not anywhere:
+        raise ValueError(
+            "shadow pairs need assets to put in, and the scene has none to cut out; give --databank, or --kinds without shadow"
+        )
     less = Less.drawn(seed)
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
     there, half_done = as_aligned(log, scene.meta), exposed_as(scene, half_done)
@@ -119,12 +134,8 @@ def prepare_sources(
     shots = shots_of(as_reconstructed(log, scene), scene) if {"underfit", "reinsert"} & set(kinds) else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
     made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
-    found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
     moved = [c for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS and "reinsert" in kinds]
     own = {c.track: replace(c.asset, photos=c.photos(scene, shots)) for c in moved}
-    bank = Databank(databank) if databank is not None else None
-    stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
-    anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored
     lit = None if relit is None else Relit(Path(relit))
     return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere)
 

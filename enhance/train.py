@@ -78,8 +78,8 @@ def train(
     device    where to train; a run may be resumed on another
     config    that of the checkpoint, or else `TrainConfig.of` the device, where None
 
-    Raises FileExistsError where `out` holds a checkpoint and `resume` is off; ValueError where there is nothing to train a stage of `only`
-    on (others are left out then), and where the checkpoint is of a training of something else.
+    Raises FileExistsError where `out` holds a checkpoint and `resume` is off, or weights alone; ValueError where there is nothing to train
+    a stage of `only` on (others are left out then), and where the checkpoint is of a training of something else.
     """
     if (minutes is None) == (steps is None):
         raise ValueError("give the training budget either as minutes or as steps")
@@ -91,9 +91,11 @@ def train(
     if only and start is None:
         raise ValueError("a stage alone takes weights to start from; pass start, as builtin")
     out = Path(out)
-    checkpoint = out / "checkpoint.pt"
+    checkpoint, weights = out / "checkpoint.pt", out / "enhancer.safetensors"
     if checkpoint.exists() and not resume:
-        raise FileExistsError(f"{out} holds an unfinished training; continue it with --resume or choose another folder")
+        raise FileExistsError(f"{out} holds a training already; go on with it by --resume, or choose another folder")
+    if weights.exists() and not checkpoint.exists():
+        raise FileExistsError(f"{weights} exists already, and no checkpoint of its training to go on from; choose another folder")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     if config is None:
         config = TrainConfig(**opened(checkpoint)["config"]) if checkpoint.exists() else TrainConfig.of(torch.device(device))
@@ -133,7 +135,6 @@ def train(
         run.save(checkpoint)
         raise
     run.save(checkpoint)
-    weights = out / "enhancer.safetensors"
     shards = pair_set.of(split="train") if pair_set else []
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}

@@ -126,6 +126,20 @@ def test_a_kind_without_what_it_is_made_from_says_what_it_needs(street, recordin
         prepare_sources(street, recording, tmp_path, ("spars",))
 
 
+def test_shadows_without_an_asset_are_refused_before_anything_is_reconstructed(street, recording, tmp_path):
+    bare = replace(street, actors=(), meta={**street.meta, "parked": []})
+    with pytest.raises(ValueError, match="none to cut out; give --databank"):
+        prepare_sources(bare, recording, tmp_path / "p", ("sparse", "shadow"))
+    assert not (tmp_path / "p").exists()
+
+
+def test_clips_that_show_nothing_to_change_are_said(street, recording, tmp_path, capsys):
+    empty = replace(street, actors=())
+    make_pairs(empty, recording, tmp_path, kinds=("isp", "clean"), config=CONFIG)
+    count = len(PairSet(tmp_path).of("isp"))
+    assert f"isp: {count} of {count} clips show nothing to change" in (said := capsys.readouterr().err) and "clean:" not in said
+
+
 def test_without_being_told_kinds_are_those_that_can_be_made(street, recording):
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]}, actors=())
     assert kinds_for(street, recording) == KINDS

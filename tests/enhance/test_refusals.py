@@ -192,3 +192,13 @@ def test_what_photos_say_must_be_finite_and_is_trusted_in_all_at_most():
         checked(Frame(camera, rgb=rgb, reference=bad, trust=trust))
     with pytest.raises(ValueError, match="trust holds"):
         checked(Frame(camera, rgb=rgb, reference=rgb, trust=torch.full((4, 6), torch.inf)))
+
+
+def test_weights_are_never_trained_over(tmp_path):
+    pairs, out = written(tmp_path / "p", "clean"), tmp_path / "t"
+    out.mkdir()
+    (out / "enhancer.safetensors").write_bytes(b"someone's weights")
+    for resume in (False, True):
+        with pytest.raises(FileExistsError, match=r"enhancer.safetensors exists already.*choose another folder"):
+            train(pairs, out, steps=4, config=QUICK, resume=resume)
+    assert [p.read_bytes() for p in out.iterdir()] == [b"someone's weights"]
