@@ -23,8 +23,8 @@ from scenes.poses import inverse
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory
 
-SECTOR = math.radians(12)
-"""Directions that are one: of each the best photos are kept."""
+SECTORS = 30
+"""Directions around an object, 12 degrees each: of each the best photos are kept."""
 
 EACH, APART = 2, 1_000_000
 """Photos that are kept of a direction, and microseconds between them: reflections in a car are those of the street around it."""
@@ -98,7 +98,7 @@ def _views(shots: Iterable[Shot], box: Trajectory, size: torch.Tensor) -> Iterab
         inside = ((torch.minimum(high, side) - low.clamp_min(0)).clamp_min(0) / (high - low)).prod()
         diagonal = max(lens.focal()) * float(size.norm()) / float((eye - middle).norm())
         if float(inside) >= INSIDE and diagonal >= FEWEST_PIXELS:
-            sector = round(math.atan2(float(eye[1]), float(eye[0])) / SECTOR)
+            sector = round(math.atan2(float(eye[1]), float(eye[0])) / math.tau * SECTORS) % SECTORS
             yield _View(shot, replace(shot.camera, world_from_cam=pose), min(diagonal, MOST_PIXELS), sector)
 
 
