@@ -17,14 +17,13 @@ from render.warp import visible
 from scenes.scene import Scene
 
 SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
-HELD_OUT = ("front_camera",)
 NOWHERE = 255  # stored instance where nothing stands, or one beyond what a byte numbers
 CLOCKS_DIFFER = 20_000  # microseconds at most between a log's and a scene's time of one picture: far less than from picture to picture
 
 
 @dataclass(frozen=True)
 class PairConfig:
-    """Sizes of the clips, and what is kept away from training."""
+    """Sizes of the clips."""
 
     width: int = 640
     """Width of the stored frames in pixels; the height follows from the camera."""
@@ -32,8 +31,6 @@ class PairConfig:
     """Consecutive frames of a clip."""
     every: int = 6
     """Frames from one clip's start to the next's."""
-    held_out: tuple[str, ...] = HELD_OUT
-    """Cameras never trained on."""
 
 
 def scene_time(scene: Scene, camera: str, time_us: int) -> int:
@@ -50,10 +47,10 @@ def clip_label(camera: str, start: int) -> str:
 
 class Clip:
     """Consecutive photos of one camera, uint8 `[T, H, W, 3]`, and the finished scene's cameras there. Scenes are rendered on `device`;
-    photos, scenes and what comes of them are on the host."""
+    photos, scenes and what comes of them are on the host. meta: further facts to keep with it."""
 
     def __init__(
-        self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, rights: dict, device: torch.device | str = "cpu"
+        self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, meta: dict, device: torch.device | str = "cpu"
     ):
         self.scene, self.start, self.device = scene, start, device
         height = round(config.width * camera.height / camera.width)
@@ -67,9 +64,8 @@ class Clip:
         # Seeded by name: a clip is the same whichever others are made beside it.
         digest = hashlib.sha256(f"{seed} {camera.name} {start}".encode()).digest()
         self.seed = int.from_bytes(digest[:6], "little")
-        split = "held out" if camera.name in config.held_out else "train"
         times = [c.time_us for c in self.cameras]
-        self.meta = {"split": split, "camera": camera.name, "start": start, "times_us": times, "seed": seed} | rights
+        self.meta = {"camera": camera.name, "start": start, "times_us": times, "seed": seed} | meta
         self._geometry: dict[str, torch.Tensor] | None = None
 
     def _leave_out(self, ego: torch.Tensor) -> None:

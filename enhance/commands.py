@@ -46,7 +46,7 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.clips import PairConfig
-        from enhance.pairs import check_cameras, check_kinds, claim_pairs, kinds_for, make_pairs, open_reconstruction, prepare_sources
+        from enhance.pairs import check_cameras, check_kinds, claim_pairs, make_pairs, open_reconstruction, prepare_sources
         from enhance.photo_pairs import check_names, make_photo_pairs
         from recon import open_log
         from render.progress import Progress
@@ -64,21 +64,20 @@ class Pairs:
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
-        for path, data in zip(self.scenes, self.data, strict=True):
+        for path, name, data in zip(self.scenes, names, self.data, strict=True):
             scene, log = open_reconstruction(path), open_log(data)
             cameras = check_cameras(scene, log, self.cameras)
-            kinds = self.kinds or kinds_for(scene, log)
-            out = self.output if len(self.scenes) == 1 else self.output / path.name
+            out = self.output if len(self.scenes) == 1 else self.output / name
             claim_pairs(out, scene, log, self.seed, PairConfig(width=self.size))
-            relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / path.name
-            sources = prepare_sources(scene, log, out, kinds, self.skies, self.databank, self.device, self.seed, relit)
-            with Progress(f"pairs {path.name}") as steps:
+            relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
+            sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
+            with Progress(f"pairs {name}") as steps:
 
                 def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
                     steps.total = total
                     steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, kinds, cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
+                make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
         make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 

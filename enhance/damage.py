@@ -34,6 +34,7 @@ class Sources:
     relit   the recording's photos under other skies, by which relight lights objects anew (without, by their splats' normals)
     own     assets cut out of the scene with their photos, by track, for reinsert
     assets  those that may be put anywhere, for shadow
+    kinds   for which this was prepared
     """
 
     early: Sequence[Refit] = ()
@@ -43,6 +44,7 @@ class Sources:
     relit: Relit | None = None
     own: Mapping[str, Asset] = field(default_factory=dict)
     assets: Sequence[Asset] = ()
+    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

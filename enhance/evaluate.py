@@ -25,6 +25,7 @@ from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
 from scenes.opening import check_device
+from scenes.spread import spread
 
 HIGHEST = 60.0
 """PSNR in dB that a frame counts at most in a mean: some frames come back bit by bit."""
@@ -93,7 +94,8 @@ def evaluate(
     features, rows, others = shipped_features(enhancer.device), [], dict(beside or {})
     of_photos = enhancer.for_photos() if isinstance(enhancer, Enhancer) else enhancer
     for kind in KINDS:
-        shards = spread(pairs.of(kind, split), limit)
+        shards = pairs.of(kind, split)
+        shards = shards if limit is None else spread(shards, limit)
         put_in = any("instances" in s.meta for s in shards)
         photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if kind in RENDERED or any(s.referenced for s in shards) else ()
         mine = enhancer if kind in RENDERED else of_photos
@@ -104,13 +106,6 @@ def evaluate(
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
-
-
-def spread(shards: Sequence[Shard], most: int | None) -> Sequence[Shard]:
-    """At most `most` of the clips, from the first to the last as evenly as there can be."""
-    if most is None or len(shards) <= most:
-        return shards
-    return [shards[i] for i in np.linspace(0, len(shards) - 1, most).round().astype(int)]
 
 
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")

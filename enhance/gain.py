@@ -12,9 +12,10 @@ from torch.nn import functional as F
 from enhance.net import MULTIPLE, Net, photos_of
 from enhance.precision import autocast
 from enhance.shards import Shard
+from scenes.spread import spread
 
 CLIPS = 32
-"""Clips that are looked at, spread over all of a kind."""
+"""Clips of a kind that are looked at, at most, spread over all."""
 
 
 @torch.no_grad()
@@ -24,7 +25,7 @@ def repair_gain(net: Net, rendered: Sequence[Shard]) -> list[float]:
     by_kind = defaultdict(list)
     for shard in rendered:
         by_kind[shard.meta["kind"]].append(shard)
-    means = [[_gains(net, shard) for shard in shards[:: max(1, len(shards) // CLIPS)]] for shards in by_kind.values()]
+    means = [[_gains(net, shard) for shard in spread(shards, CLIPS)] for shards in by_kind.values()]
     if not means:
         return [0.0, 0.0]
     return torch.stack([torch.tensor(of_kind).mean(0) for of_kind in means]).mean(0).tolist()

@@ -19,7 +19,7 @@ from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed
 from enhance.shards import KINDS, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.align import as_aligned
-from recon.assets.extract import FEWEST_SPLATS, candidates
+from recon.assets.extract import FEWEST_SPLATS, Candidate, candidates
 from recon.early import SHORT as EARLY
 from recon.egomask import with_ego_masks
 from recon.log import Log, LogCamera
@@ -31,6 +31,7 @@ from scenes.hdr import load_hdr
 from scenes.names import unknown
 from scenes.scene import Scene
 from scenes.sky import Sky
+from scenes.spread import spread
 
 ANYWHERE = ("underfit", "isp", "isp_frame", "clean")
 """Kinds that need nothing but a scene and its recording."""
@@ -56,6 +57,7 @@ def make_pairs(
 
     The same seed makes the same pairs. A run that was broken off goes on where it stopped, and kinds may be added later. `progress` is
     called with clips done, clips in all, and the last one's name. A contact sheet of each kind, `<kind>.png`, stands beside the clips.
+    The front camera's are of the split "held out", which is never trained on, where the drive has other cameras.
 
     Raises ValueError for an unknown kind or camera, for a camera that the scene was not given, and for a folder made with other settings.
     """
@@ -63,7 +65,7 @@ def make_pairs(
     scene = open_reconstruction(scene_path)
     log = log_path if isinstance(log_path, Log) else open_log(log_path)
     kinds = check_kinds(kinds)
-    chosen = check_cameras(scene, log, cameras)
+    chosen, kept = check_cameras(scene, log, cameras), held_out_camera(scene, log)
     out = claim_pairs(out, scene, log, seed, config)
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
     log = with_ego_masks(log, chosen, config.width)
@@ -74,7 +76,8 @@ def make_pairs(
     for done, (camera, start) in enumerate(starts):
         name = clip_label(camera.name, start)
         missing = [kind for kind in kinds if not (out / kind / f"{name}.json").exists()]
-        clip = Clip(scene, camera, start, config, seed, rights, device) if missing else None
+        split = {"split": "held out" if camera.name == kept else "train"}
+        clip = Clip(scene, camera, start, config, seed, split | rights, device) if missing else None
         for kind in missing:
             assert clip is not None
             damage = make(kind, clip, sources)
@@ -105,21 +108,23 @@ def prepare_sources(
     scene: Scene,
     log: Log,
     folder: str | Path,
-    kinds: Sequence[str] = KINDS,
+    kinds: Sequence[str] | None = None,
     skies: Sequence[str | Path] = (),
     databank: str | Path | None = None,
     device: str = "cpu",
     seed: int = 0,
     relit: str | Path | None = None,
 ) -> Sources:
-    """What `kinds` are made from: reconstructions, kept in `folder` (made on `device`, some minutes each, once; each seed leaves out other
-    things), assets cut out of the scene and those of a databank, and .hdr skies; `relit` is the folder in which DiffusionRenderer is met.
-    Raises ValueError for an unknown kind, where the rig has too few cameras for one, and where shadow has no asset to put in."""
-    check_kinds(kinds)
+    """What `kinds` are made from, all that can be made where None (`kinds` of the result): reconstructions, kept in `folder` (made on
+    `device`, some minutes each, once; each seed leaves out other things), assets cut out of the scene and those of a databank, and .hdr
+    skies; `relit` is the folder in which DiffusionRenderer is met. Raises ValueError for an unknown kind, where the rig has too few cameras
+    for one, and where shadow has no asset to put in."""
+    check_kinds(kinds or ())
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
     log = with_ego_masks(log, names, PairConfig.width)
-    found = list(candidates(scene)) if {"shadow", "reinsert"} & set(kinds) else []
+    found = list(candidates(scene)) if kinds is None or {"shadow", "reinsert"} & set(kinds) else []
+    kinds = kinds_for(scene, log, found, databank) if kinds is None else kinds
     bank = Databank(databank) if databank is not None else None
     stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
     anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored
@@ -134,17 +139,26 @@ def prepare_sources(
     shots = shots_of(as_reconstructed(log, scene), scene) if {"underfit", "reinsert"} & set(kinds) else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
     made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
-    moved = [c for c in found if c.asset.meta["moved"] and len(c.asset.gaussians) >= FEWEST_SPLATS and "reinsert" in kinds]
+    moved = [c for c in found if _returns(c)] if "reinsert" in kinds else []
     own = {c.track: replace(c.asset, photos=c.photos(scene, shots)) for c in moved}
     lit = None if relit is None else Relit(Path(relit))
-    return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere)
+    return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere, tuple(kinds))
 
 
-def kinds_for(scene: Scene, log: Log) -> tuple[str, ...]:
-    """All kinds that can be made of a scene and its recording: crossref takes two cameras, shadow an object to cut out."""
-    cameras = [name for name in log.cameras if name in scene.rig]
-    objects = scene.actors or scene.meta.get("parked")
-    return tuple(k for k in KINDS if (k != "crossref" or len(cameras) > 1) and (k not in ("shadow", "reinsert") or objects))
+def kinds_for(scene: Scene, log: Log, found: Sequence[Candidate], databank: str | Path | None = None) -> tuple[str, ...]:
+    """All kinds that can be made of a scene, what was found in it to cut out, its recording and a databank: crossref takes two cameras,
+    shadow an asset to put in, reinsert something that moved."""
+    able = {
+        "crossref": len([name for name in log.cameras if name in scene.rig]) > 1,
+        "shadow": any(not c.flaw for c in found) or (databank is not None and bool(Databank(databank).entries())),
+        "reinsert": any(_returns(c) for c in found),
+    }
+    return tuple(kind for kind in KINDS if able.get(kind, True))
+
+
+def _returns(candidate: Candidate) -> bool:
+    """Whether it can be put back where it moved."""
+    return bool(candidate.asset.meta["moved"]) and len(candidate.asset.gaussians) >= FEWEST_SPLATS
 
 
 def open_reconstruction(path: str | Path | Scene) -> Scene:
@@ -164,6 +178,12 @@ def check_cameras(scene: Scene, log: Log, cameras: Sequence[str] | None) -> list
     if not both:
         raise ValueError("the scene and the recording have no camera in common; make the pairs from the drive that the scene came from")
     return list(cameras or both)
+
+
+def held_out_camera(scene: Scene, log: Log) -> str | None:
+    """The camera whose pairs are never trained on: the front one of those that scene and recording share; None where they share but one."""
+    both = check_cameras(scene, log, None)
+    return next((name for name in log.front if name in both), both[0]) if len(both) > 1 else None
 
 
 def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
@@ -232,7 +252,7 @@ def contact_sheet(pairs: PairSet, kind: str, path: str | Path, rows: int = 8, wi
 
     shards = pairs.of(kind)
     lines = []
-    for shard in shards[:: max(1, len(shards) // rows)][:rows]:
+    for shard in spread(shards, rows):
         w = shard.window(shard.frames // 2, 1)
         pictures = torch.stack([w.input[0], w.target[0], w.region[0].expand(3, -1, -1)])
         small = F.interpolate(pictures, (round(shard.height * width / shard.width), width), mode="area")

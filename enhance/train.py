@@ -146,8 +146,12 @@ def train(
 
 def _stages(only: Sequence[str] | None, usual: Sequence[str], sampler: Sampler) -> list[str]:
     """What is trained, each once: `only`, or of the `usual` stages those that there is something to train on; the others are said."""
-    there = {"objects": sampler.has_objects, "shade": sampler.grounds(0, 1) is not None, "enhancer": bool(sampler.rendered)}
-    lacking = [stage for stage in only or usual if not there.get(stage, True)]
+    there = {  # asked only of what is to be trained: all shadow clips are read to find out
+        "objects": lambda: sampler.has_objects,
+        "shade": lambda: sampler.grounds(0, 1) is not None,
+        "enhancer": lambda: bool(sampler.rendered),
+    }
+    lacking = [stage for stage in only or usual if stage in there and not there[stage]()]
     for stage in lacking:
         said = f"these pairs hold nothing to train {stage} on, which takes {TAKES[stage]}"
         if only:
@@ -162,11 +166,11 @@ def _gain(run: Run, pairs: PairSet | None, origin: dict | None) -> dict[str, obj
     """What repairing is worth, for the header: measured anew where the repairing was trained and something is held out to judge it by, else
     what was known of the weights begun with. Where there were none, training clips judge it."""
     # on clips that were trained on a network gains a whole dB by knowing the place
-    held_out, trained = ([] if pairs is None else pairs.of(split=split) for split in ("held out", "train"))
-    judged = [s for s in held_out or trained if s.meta["kind"] in RENDERED]
-    if origin is not None and not ("enhancer" in run.stages and held_out and judged):
+    rendered = [] if pairs is None else [s for s in pairs.of() if s.meta["kind"] in RENDERED]
+    held_out = [s for s in rendered if s.meta["split"] == "held out"]
+    if origin is not None and not ("enhancer" in run.stages and held_out):
         return {REPAIR_GAIN: origin[REPAIR_GAIN]} if REPAIR_GAIN in origin else {}
-    return {REPAIR_GAIN: repair_gain(run.average, judged)}
+    return {REPAIR_GAIN: repair_gain(run.average, held_out or rendered)}
 
 
 def _stage(

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from recon.fit.fit import Fit
 from recon.report import DRIVING
-from recon.seeds.points import spread
 from render.compare import psnr
+from scenes.spread import spread
 
 EVERY = 25
 """Steps from a look to the next: a look costs a third of a step."""

@@ -14,6 +14,7 @@ from render import render_frame
 from scenes.camera import Camera
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb, srgb_from_linear
+from scenes.spread import spread
 
 LOOKS = 12
 """Moments of each camera at which it is found out where light comes from the sky."""
@@ -154,7 +155,7 @@ def looks_of(scene: Scene) -> Iterator[tuple[np.ndarray, Camera]]:
     """Masks `[h, w]` of where light comes from the sky, at `LOOKS` moments of each of a scene's cameras, and the cameras of their size."""
     for name in scene.rig:
         times = scene.frame_times(name)
-        for k in np.unique(np.linspace(0, len(times) - 1, LOOKS).astype(int)):
+        for k in spread(range(len(times)), LOOKS):
             camera = scene.camera(name, int(times[k]))
             camera = camera.resized(max(16, camera.width // 2), max(16, camera.height // 2))
             alpha = render_frame(scene, camera, ("alpha",)).alpha

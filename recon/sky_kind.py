@@ -14,6 +14,7 @@ from recon.skies import WHITE, SkyKind, like_sky, sky_mask
 from recon.view import View
 from scenes.camera import Camera
 from scenes.poses import inverse
+from scenes.spread import spread
 
 RIM = 6
 """Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
@@ -44,7 +45,7 @@ def under_their_sky(log: Log, names: list[str], views: list[View]) -> tuple[list
     within = log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views)))
     if (blue >= BLUE and not within) or all(_colourless(v.image) for v in views[:: max(1, len(views) // 8)]):
         return views, "blue"
-    chosen = [within[i] for i in np.unique(np.linspace(0, len(within) - 1, min(SWEEPS, len(within))).astype(int))]
+    chosen = spread(within, SWEEPS)
     points = [s.read().xyz for s in chosen]
     kind: SkyKind = "blinding" if blue >= BLUE else "overcast"
     more = DAZZLED if blue >= BLUE else 2

@@ -148,9 +148,10 @@ class References:
         y, x = ((torch.arange(n) + 0.5) * side / n for n, side in zip(GRID, (camera.height, camera.width), strict=True))
         at = y.long()[:, None], x.long()
         depth = frame.depth.cpu()[at].clamp_max(FARTHEST)
-        points = (camera_rays(camera)[at] * depth[..., None]).reshape(-1, 3).double()
-        points = points @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
-        detail = camera.lens.focal()[0] / camera.width / depth.reshape(-1)
+        rays = camera_rays(camera)[at]
+        seen = (rays != 0).any(-1)  # past the edge of a fisheye's image there is nothing to show
+        points = (rays[seen] * depth[seen, None]).double() @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
+        detail = camera.lens.focal()[0] / camera.width / depth[seen]
         shows = torch.zeros(len(self.shots), dtype=torch.float64)
         for (_, width, height), indices in self.alike.items():
             lens = self.shots[indices[0]].camera.lens

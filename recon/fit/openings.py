@@ -10,13 +10,13 @@ import torch.nn.functional as F
 
 from recon.fit.motion import Motion
 from recon.frames import Frames
-from recon.seeds.points import spread
 from recon.skies import always_hidden, cells
 from recon.view import View
 from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.sky import sample_equirect
+from scenes.spread import spread
 
 SKY_WEIGHT = 0.03
 """Of the alpha of pixels that are surely sky, beside the picture's loss: haze before the sky shows from elsewhere."""

@@ -12,13 +12,14 @@ from recon.frames import Frames
 from recon.log import Log, SparsePoints, Track
 from recon.project import project
 from recon.seeds.measured import PICTURES, Measured, by_pictures
-from recon.seeds.points import Cloud, nearest_box, spread
+from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.stereo import Plate, plate_of, swept
 from recon.view import View
 from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
+from scenes.spread import spread
 
 VIEWS, BETWEEN = (40, 150), 0.15
 """Pictures a camera whose depth is found: from so many, where there are, up to so many, to stand no farther apart on a long way than this

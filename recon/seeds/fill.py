@@ -14,12 +14,13 @@ import torch
 from scipy import ndimage
 
 from recon.log import Track
-from recon.seeds.points import Cloud, nearest_box, splats_from, spread
+from recon.seeds.points import Cloud, nearest_box, splats_from
 from recon.seeds.sweep import companions, swept_depth
 from recon.view import View
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
+from scenes.spread import spread
 
 FAR = 250.0
 """Metres to things with nothing below them that lidar reaches."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,8 +17,6 @@ from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import inverse, quat_from_matrix
 from scenes.trajectory import all_at
-
-T = TypeVar("T")
 
 OPACITY = 0.7
 THICKNESS = 0.25
@@ -191,8 +188,3 @@ def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndar
         torch.full((n,), float(np.log(OPACITY / (1 - OPACITY)))),
         sh,
     )
-
-
-def spread(views: Sequence[T], count: int) -> list[T]:
-    """About `count` of the views of a drive, or their places, spread evenly over it."""
-    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))]

@@ -21,7 +21,7 @@ import torch
 from torch.nn import functional as F
 
 from enhance.enhancer import Enhancer
-from enhance.evaluate import TOLD, Row, measured, shipped_features, spread
+from enhance.evaluate import TOLD, Row, measured, shipped_features
 from enhance.losses import PatchPerceptual, pixel_loss
 from enhance.net import Net, told_of
 from enhance.precision import autocast, channels_last
@@ -33,6 +33,7 @@ from enhance.train import train
 from enhance.weights_file import BUILTIN, load_net, save_net
 from render.frame_types import Frame
 from scenes.atomic import atomic_file
+from scenes.spread import spread
 from tests.bench.nafnet import NafNet
 
 CONFIG = TrainConfig(crop=96, images=6, clips=2, looked_at=16, objects=0.2, shade=0.1, rate=1.6e-3)

@@ -13,13 +13,16 @@ from enhance.clips import PairConfig
 from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
-from enhance.pairs import kinds_for, make_pairs, prepare_sources
+from enhance.pairs import held_out_camera, kinds_for, make_pairs, prepare_sources
 from enhance.photo_pairs import make_photo_pairs
 from enhance.refits import REFITS, Refit, shots_of
 from enhance.shards import KINDS, PairSet
+from recon.assets.extract import FEWEST_SPLATS, Candidate
 from render import render_frame
 from render.references import References
 from render.video import write_image
+from scenes.databank import Databank
+from scenes.trajectory import Trajectory
 
 CONFIG = PairConfig(width=96, frames=3, every=4)
 
@@ -140,10 +143,23 @@ def test_clips_that_show_nothing_to_change_are_said(street, recording, tmp_path,
     assert f"isp: {count} of {count} clips show nothing to change" in (said := capsys.readouterr().err) and "clean:" not in said
 
 
-def test_without_being_told_kinds_are_those_that_can_be_made(street, recording):
+def test_without_being_told_kinds_are_those_that_can_be_made(street, recording, tmp_path):
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]}, actors=())
-    assert kinds_for(street, recording) == KINDS
-    assert set(KINDS) - set(kinds_for(alone, recording)) == {"crossref", "shadow", "reinsert"}
+    fine = car().gaussians.select(torch.arange(FEWEST_SPLATS) % len(car().gaussians))
+    moved = replace(car(), gaussians=fine, meta={"moved": True})
+    found = [Candidate(moved, "veh_1", "", Trajectory(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None]), 1)]
+    assert kinds_for(street, recording, found) == KINDS
+    assert set(KINDS) - set(kinds_for(alone, recording, [])) == {"crossref", "shadow", "reinsert"}
+    Databank(tmp_path / "bank").add(car())
+    assert set(KINDS) - set(kinds_for(alone, recording, [], tmp_path / "bank")) == {"crossref", "reinsert"}
+
+
+def test_the_front_camera_is_held_out_whatever_it_is_called_where_there_are_others(street, recording):
+    cameras, rig = dict(recording.cameras), street.rig
+    renamed = replace(recording, cameras={"CAM_FRONT": cameras["front_camera"], "CAM_LEFT": cameras["left_camera"]}, front=("CAM_FRONT",))
+    both = replace(street, rig={"CAM_LEFT": rig["left_camera"], "CAM_FRONT": rig["front_camera"]})
+    assert held_out_camera(both, renamed) == "CAM_FRONT" and held_out_camera(street, recording) == "front_camera"
+    assert held_out_camera(replace(both, rig={"CAM_FRONT": rig["front_camera"]}), renamed) is None
 
 
 def test_the_recording_car_is_no_target(street, recording, tmp_path):

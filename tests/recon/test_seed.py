@@ -3,9 +3,10 @@ import torch
 
 from recon import open_log
 from recon.frames import load_frames
-from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, spread, thin
+from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, thin
 from recon.start import even_limit
 from scenes.poses import matrix_from_quat
+from scenes.spread import spread
 
 ALL = (0, 2**62)
 

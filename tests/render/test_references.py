@@ -10,10 +10,12 @@ import torch
 from render import render_frame
 from render.album import keep_photos, references_of
 from render.compare import psnr
+from render.rays import camera_rays
 from render.references import GONE, READS, References, Shot
 from render.video import to_bytes
 from scenes.edit import Edit
 from scenes.files import load, save
+from scenes.lenses import Fisheye
 from scenes.poses import translation
 from scenes.scene import Scene
 from scenes.usd_edit import add_change
@@ -111,6 +113,15 @@ def test_without_photos_nothing_is_trusted(street):
 def test_a_splat_scene_that_explains_its_photos_is_left_nearly_as_it_is(street):
     (frame,) = References(shots(street), street).along(views(street, street.frame_times(CAMERA)[3:4], 0.5))
     assert (better(frame) - frame.rgb.clamp(0, 1)).abs().max() < 2 / 255
+
+
+def test_a_fisheyes_photos_are_found_though_its_image_ends_within_the_picture(street):
+    camera = street.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+    lens = Fisheye(camera.width / 6, camera.width / 6, camera.width / 2, camera.height / 2, -0.05)
+    round_ = replace(camera, lens=lens)
+    assert not camera_rays(round_)[0, 0].any() and camera_rays(round_)[camera.height // 2, camera.width // 2].any()
+    frame = render_frame(street, round_, READS)
+    assert References([Shot(round_, lambda w, h: np.zeros((h, w, 3), np.uint8))], street).chosen(frame) == [(0, pytest.approx(1.0))]
 
 
 def test_shares_of_photos_change_little_along_a_path(street, unclear):
