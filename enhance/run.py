@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from enhance.net import Net
 from enhance.precision import channels_last
 from enhance.prior import Time
 from enhance.shards import KINDS
-from scenes.atomic import atomic_file
+from scenes.state import save_state
 
 STAGES = ("autoencoder", "prior", "objects", "shade", "enhancer")
 FURTHER = STAGES[2:]
@@ -139,18 +138,12 @@ class Run:
         return loss
 
     def save(self, path: Path) -> None:
+        """Write the checkpoint from which `load` goes on. ValueError where a loss is not finite: the former checkpoint stays."""
         for stage in STAGES:  # weights that are spoilt must not take the place of good ones
             self.loss(stage)
         state = {name: part.state_dict() for name, part in self.parts().items()}
         facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds, "told": self.told}
-        whole = BytesIO()  # written by Python, which says that the disk is full; torch's own writer says "unexpected pos"
-        torch.save({**facts, **state}, whole)
-        with atomic_file(path) as half:
-            try:
-                with open(half, "wb") as file:
-                    file.write(whole.getbuffer())
-            except OSError as error:
-                raise OSError(error.errno, error.strerror, str(path)) from error
+        save_state(path, {**facts, **state})
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint. ValueError where that is not whole, or of a training of something else."""

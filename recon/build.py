@@ -32,12 +32,15 @@ from recon.start import Start, prepare
 from recon.tracks import LIMBED
 from render.progress import Progress
 from scenes.asset import Actor, Asset
+from scenes.atomic import atomic_folder
 from scenes.camera import RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
+from scenes.opening import fresh
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 from scenes.space_order import space_order
+from scenes.usd_scene import is_scene
 
 PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""
@@ -88,13 +91,10 @@ def reconstruct(
 
     The folder keeps the photos that were fitted to, too: the enhancer looks detail up there.
 
-    Raises ValueError for data and options that do not fit, FileExistsError where `output` exists, KeyboardInterrupt passed on.
+    Raises ValueError for data and options that do not fit, FileExistsError where `check_free` does,
+    KeyboardInterrupt passed on.
     """
-    output = Path(output)
-    if output.exists() and not overwrite:
-        raise FileExistsError(f"{output} exists already; choose another folder or remove it")
-    if not output.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
+    output = check_free(output, resume, overwrite)
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
     size, config = size or fit_size(log, names), config or fit_config(log, names, span)
@@ -136,11 +136,25 @@ def reconstruct(
     if within:
         scene.meta["off_path"] = off_path_table(there, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
-    save(scene, output, overwrite, half)
-    with Progress("photos", total=len(fit.frames.training())) as steps:
-        keep_album(there, fit.frames, start.rig, output, steps.step)
+    with atomic_folder(output, overwrite) as whole, Progress("photos", total=len(fit.frames.training())) as steps:
+        whole.rmdir()
+        save(scene, whole, half=half)
+        keep_album(there, fit.frames, start.rig, whole, steps.step)
     checkpoint.unlink(missing_ok=True)
     return scene
+
+
+def check_free(output: str | Path, resume: bool = False, overwrite: bool = False) -> Path:
+    """A folder that a scene may be written to. FileNotFoundError where it would stand in none, FileExistsError where it is something else
+    than a scene, or one that is not to be overwritten, and where it was begun and is neither to be resumed nor overwritten."""
+    output = Path(output)
+    fresh(output, overwrite)
+    if output.exists() and not is_scene(output):
+        raise FileExistsError(f"{output} is not a scene, so it is left alone; give another name with -o")
+    begun = checkpoint_path(output)
+    if begun.exists() and not (resume or overwrite):
+        raise FileExistsError(f"{begun} is a fit that was interrupted; go on with it by --resume, or give -w to begin again")
+    return output
 
 
 def fitted(log: Log, held_out: int) -> Log:

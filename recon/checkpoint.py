@@ -14,10 +14,10 @@ from recon.fit.swept import Swept
 from recon.log import Track
 from recon.seeds.measured import Measured
 from recon.start import Start
-from scenes.atomic import atomic_file
 from scenes.camera import RigCamera
 from scenes.ground import Ground
 from scenes.lenses import LENSES
+from scenes.state import save_state
 from scenes.trajectory import Trajectory
 
 VERSION = 14
@@ -31,8 +31,7 @@ def checkpoint_path(output: Path) -> Path:
 def save_checkpoint(path: Path, options: dict, start: Start, fit: dict) -> None:
     """Write the fit's state; the former one stays until this one is whole."""
     data = {"version": VERSION, "options": options, "start": _plain_start(start), "fit": fit}
-    with atomic_file(path) as partial:
-        torch.save(data, partial)
+    save_state(path, data)
 
 
 def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from scenes.opening import check_device, fresh
+from scenes.opening import check_device
 from scenes.options import AngleOrNone, FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 
 if TYPE_CHECKING:
@@ -48,15 +48,14 @@ class Recon:
 
     def run(self) -> None:
         from recon import open_log, reconstruct
+        from recon.build import check_free
+        from recon.checkpoint import checkpoint_path
         from recon.fit.config import check_size
-        from scenes.usd_scene import is_scene
 
         shelf = self.output.parent
         if not shelf.exists() and shelf.parent.is_dir():
             shelf.mkdir()  # the first scene of scenes/ makes that folder
-        fresh(self.output, self.overwrite)
-        if self.output.exists() and not is_scene(self.output):
-            raise FileExistsError(f"{self.output} is not a scene, so it is left alone; give another name with -o")
+        check_free(self.output, self.resume, self.overwrite)
         check_device(self.device)
         if self.size is not None:
             check_size(self.size)  # before photos are placed, which takes long
@@ -67,7 +66,9 @@ class Recon:
                 size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
             )  # fmt: skip
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
+            begun = checkpoint_path(self.output).exists()
+            fix = "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
+            raise KeyboardInterrupt(f"interrupted; {fix}") from None
 
 
 @dataclass

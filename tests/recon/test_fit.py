@@ -1,5 +1,6 @@
 import os
 import signal
+import time
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -112,7 +113,13 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
         with pytest.raises(KeyboardInterrupt):
             reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=resume)
         assert checkpoint_path(out).is_file() and not out.exists()
+    with pytest.raises(FileExistsError, match="go on with it by --resume"):
+        reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG)
     monkeypatch.setattr(Fit, "step", step)
+    with monkeypatch.context() as late, pytest.raises(KeyboardInterrupt):  # its photos make a scene whole
+        late.setattr("recon.build.keep_album", lambda *_: os.kill(os.getpid(), signal.SIGINT) or time.sleep(9))
+        reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
+    assert checkpoint_path(out).is_file() and [p.name for p in tmp_path.iterdir()] == ["scene.fit"]
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     for name, tensor in resumed.background.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
