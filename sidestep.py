@@ -1,7 +1,7 @@
 """The front door: `sidestep COMMAND`, one dataclass each. The main job stands here; commands about one package in its commands.py.
 
 Exit codes: 0 done, 1 bad data (one line says what, where and the fix; SIDESTEP_TRACEBACK=1 shows where it came from), 2 usage,
-130 interrupted.
+130 interrupted, 143 stopped by SIGTERM.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ class Render:
             stages, needs = enhancement(self.weights, self.device, references, scene)
             facts["photos"] = len(references.shots) if references else 0
         record(
-            scene, camera, self.output, self.lateral_shift, times, width, height, self.outputs,
-            not self.no_shadows, stages, needs, facts, warnings,
+            scene, camera, self.output, shift=self.lateral_shift, times_us=times, width=width, height=height, keep=self.outputs,
+            shadows=not self.no_shadows, stages=stages, needs=needs, facts=facts, warnings=warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")
@@ -201,10 +201,9 @@ def parse(words: list[str]) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit."""
-    command = parse(list(sys.argv[1:] if arguments is None else arguments))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that half-written files are removed on the way out
     try:
-        command.run()
+        parse(list(sys.argv[1:] if arguments is None else arguments)).run()
     except UsageError as error:
         fail(error, 2)
     except KeyboardInterrupt as stop:

@@ -106,6 +106,8 @@ class Train:
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
     """What of prior, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
+    vgg: Path | None = None
+    """torchvision's vgg16 weights, a file of your own, whose features the perceptual loss compares; the autoencoder's own without."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train; the weights run on either."""
     resume: Flag = False
@@ -135,6 +137,7 @@ class Train:
                     start=self.start,
                     only=self.only,
                     device=self.device,
+                    vgg=self.vgg,
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None

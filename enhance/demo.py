@@ -75,7 +75,18 @@ def demonstrate(data: Path, folder: Path, weights: str = "builtin") -> None:
         return _noting(enhance(_noting(frames, shown, before)), shown, after)
 
     facts = {"scene": str(data / "drive002"), "enhanced": weights}
-    record(scene, CAMERA, folder / "out.mp4", SHIFT, times, WIDTH, HEIGHT, stages={**stages, "enhance": noted}, needs=needs, facts=facts)
+    record(
+        scene,
+        CAMERA,
+        folder / "out.mp4",
+        shift=SHIFT,
+        times_us=times,
+        width=WIDTH,
+        height=HEIGHT,
+        stages={**stages, "enhance": noted},
+        needs=needs,
+        facts=facts,
+    )
 
     rows = []
     for i in shown:

@@ -17,6 +17,7 @@ from PIL import Image
 
 from recon.log import LogCamera
 from scenes.atomic import atomic_file
+from scenes.pictures import opened
 
 FRAMES = 57
 """Frames that it takes at once; shorter clips it fills up with their last one, longer ones it cuts."""
@@ -45,11 +46,8 @@ class Relit:
         """A clip under a light, uint8 `[T, H, W, 3]` of a size (width, height). ValueError naming a file that does not decode."""
         pictures = []
         for file in (self._file(light, clip, i) for i in range(frames)):
-            try:
-                with Image.open(file) as opened:
-                    pictures.append(np.array(opened.convert("RGB").resize(size, Image.Resampling.LANCZOS)))
-            except OSError as problem:
-                raise ValueError(f"{file} does not decode as an image ({problem}); run the forward renderer again") from None
+            with opened(file, str(file), "run the forward renderer again") as picture:
+                pictures.append(np.array(picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)))
         return torch.from_numpy(np.stack(pictures))
 
     def ask(self, camera: LogCamera, clip: str, indices: range) -> None:

@@ -16,12 +16,11 @@ from enhance.samples import Photos
 from enhance.shards import to_bytes, write_shard
 
 STRIDE = 8
-KINDS_OF_PHOTOS = ("isp", "isp_frame", "clean")
 
 
 def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0, width: int = 640) -> Path:
-    """Of every photo in the folders and every STRIDE-th frame of the videos `paths`, `width` pixels wide, a clip of one frame of
-    KINDS_OF_PHOTOS in the folder `out`, which is returned. Where a region is in other colours, it is told as instance 1; in "clean" the
+    """Of every photo in the folders and every STRIDE-th frame of the videos `paths`, `width` pixels wide, a clip of one frame of isp,
+    isp_frame and clean in the folder `out`, which is returned. Where a region is in other colours, it is told as instance 1; in clean the
     same region is told and is as it was.
 
     They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path

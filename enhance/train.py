@@ -64,6 +64,7 @@ def train(
     start: str | Path | None = None,
     only: Sequence[str] | None = None,
     device: str | torch.device = "cpu",
+    vgg: str | Path | None = None,
 ) -> Path:
     """Train on pairs and further photos; returns `out/enhancer.safetensors`.
 
@@ -76,6 +77,7 @@ def train(
     start     weights to train further, "builtin" or a file; their autoencoder is kept
     only      of STAGES those to train, which takes weights to start from; the others' parts stay as they are
     device    where to train; a run may be resumed on another
+    vgg       torchvision's vgg16 as a local file, whose features the perceptual loss compares; the autoencoder's own where None
     config    that of the checkpoint, or else `TrainConfig.of` the device, where None
 
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off, or weights alone; ValueError where there is nothing to train
@@ -107,7 +109,13 @@ def train(
         begun = Net(net or NetConfig())
     stages = _stages(only, STAGES if start is None else FURTHER, sampler)
     weights_of = "nothing" if first is None else f"{Path(first).name} ({hashlib.sha256(Path(first).read_bytes()).hexdigest()[:8]})"
-    told = {"stages": stages, "start": weights_of, "pairs": pair_set.digest() if pair_set else "", "photos": [Path(p).name for p in photos]}
+    told = {
+        "stages": stages,
+        "start": weights_of,
+        "pairs": pair_set.digest() if pair_set else "",
+        "photos": [Path(p).name for p in photos],
+        "vgg": None if vgg is None else Path(vgg).name,
+    }
     run = Run(config, begun, minutes, steps, seed, stages, device, told)
     if resume and checkpoint.exists():
         run.load(checkpoint)
@@ -129,7 +137,7 @@ def train(
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
-        perceptual = PatchPerceptual(run.net.encoder)
+        perceptual = PatchPerceptual(run.net.encoder, vgg).to(run.device)
         go("enhancer", partial(_clips, run, sampler), partial(_enhancer_step, run, perceptual))
     except KeyboardInterrupt:
         run.save(checkpoint)

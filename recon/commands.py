@@ -21,7 +21,8 @@ class Recon:
     on held-out frames."""
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
-    """Folder of one drive, as pandaset/002: PandaSet, nuScenes, Argoverse 2, Waymo, KITTI or COLMAP's, or photos, or a video."""
+    """Folder of one drive, as pandaset/002: PandaSet, nuScenes, Argoverse 2, Waymo, NCore (its .json), KITTI or COLMAP's, or photos,
+    or a video."""
     output: Output
     """Folder of the new scene."""
     cameras: Names = None
@@ -35,7 +36,7 @@ class Recon:
     camera_height: LengthOrNone = None
     """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
     metres_per_unit: Ratio = None
-    """The same for a COLMAP folder by number: metres that one unit of its model has."""
+    """The same by number: metres that one unit of the model has."""
     angle_of_view: AngleOrNone = None
     """Of photos or a video: how wide their camera sees, from the left side to the right, as 58deg; else it is found, which a straight road
     does not allow."""
@@ -73,7 +74,7 @@ class Recon:
 
 @dataclass
 class Extract:
-    """Cut the moving and parked vehicles of a scene into the databank, with the scene's photos of them."""
+    """Cut what moves and parked vehicles out of a scene into the databank, with the scene's photos of them."""
 
     scene: ScenePath
     """Scene folder."""

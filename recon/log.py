@@ -17,6 +17,9 @@ from scenes.names import unknown
 from scenes.poses import interpolate, inverse
 from scenes.trajectory import Trajectory
 
+FETCH = "fetch the file again"
+"""What to do about one that does not decode."""
+
 SWEEP_US = 200_000
 """As long as a sweep may take."""
 
@@ -59,16 +62,11 @@ class LogCamera:
         """Frame `index` as uint8 sRGB `[H, W, 3]`, area-averaged to `width` x `height`. ValueError naming a file that does not decode."""
         from PIL import Image
 
-        from render.pictures import rgb_of
+        from scenes.pictures import opened, rgb_of
 
         path = self.files[index]
-        try:
-            with Image.open(BytesIO(path.read()) if isinstance(path, Packed) else path) as opened:
-                picture = rgb_of(opened)
-        except FileNotFoundError:
-            raise
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:
-            raise ValueError(f"{path} does not decode as an image ({problem}); fetch the file again") from None
+        with opened(BytesIO(path.read()) if isinstance(path, Packed) else path, str(path), FETCH) as stored:
+            picture = rgb_of(stored)
         if picture.size != (self.width, self.height):
             raise ValueError(f"{path} is {picture.width}x{picture.height}, but camera {self.name} is {self.width}x{self.height}")
         size = (width or self.width, height or self.height)
@@ -176,15 +174,10 @@ class Log:
 
 def image_size(file: Path) -> tuple[int, int]:
     """Width and height of an image file, without decoding it. ValueError naming a file that is none."""
-    from PIL import Image, UnidentifiedImageError
+    from scenes.pictures import opened
 
-    try:
-        with Image.open(file) as opened:
-            return opened.size
-    except FileNotFoundError:
-        raise
-    except (OSError, UnidentifiedImageError) as problem:
-        raise ValueError(f"{file} does not decode as an image ({problem}); fetch the file again") from None
+    with opened(file, str(file), FETCH) as picture:
+        return picture.size
 
 
 def leading(files: Sequence[Path], what: str = "pictures") -> tuple[Path, ...]:

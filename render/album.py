@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from render.pictures import rgb_of
 from render.references import References, Shot
 from render.video import write_image
 from scenes.atomic import atomic_folder
 from scenes.files import Dropping
+from scenes.pictures import opened, rgb_of
 from scenes.scene import Scene
 from scenes.usd_scene import load_recorded
 
@@ -54,9 +54,6 @@ def shots_in(folder: Path, scene: Scene) -> list[Shot]:
 
 
 def _read(file: Path, width: int, height: int) -> np.ndarray:
-    try:
-        with Image.open(file) as opened:
-            picture = rgb_of(opened)
-    except (OSError, SyntaxError, ValueError) as problem:
-        raise ValueError(f"{file} does not decode as an image ({problem}); remove it, and the photo is done without") from None
+    with opened(file, str(file), "remove it, and the photo is done without") as stored:
+        picture = rgb_of(stored)
     return np.asarray(picture if picture.size == (width, height) else picture.resize((width, height), Image.Resampling.BOX))

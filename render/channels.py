@@ -13,9 +13,6 @@ from scenes.poses import matrix_from_quat
 MOST = 128
 """Channels of a caller's field."""
 
-SUMMED = ("features", "normal", "instance_alpha")
-"""The outputs that are such sums."""
-
 Features = torch.Tensor | Sequence[torch.Tensor]
 
 

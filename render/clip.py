@@ -27,7 +27,7 @@ def render_clip(
     shadows: bool = True,
     config: RenderConfig = DEFAULT,
 ) -> Iterator[Frame]:
-    """The frames that a camera of the rig takes along a path; a stream, one frame in memory at a time.
+    """The frames that a camera of the rig takes along a path; a stream, one frame in memory at a time, two on CUDA.
 
     shift: metres to the left of the recorded path (negative: right), or any other path of the body.
     times_us: when; the camera's own frame times by default. width, height: pixels, the camera's own by default.
@@ -85,6 +85,12 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
 def frame_rate(times_us: torch.Tensor) -> float:
     """Frames a second of a clip with these times: by the median step, 10 for a single frame."""
     return 10.0 if len(times_us) < 2 else 1e6 / float(times_us.diff().double().median())
+
+
+def uneven(times_us: torch.Tensor) -> bool:
+    """Whether a frame is shown half as long again as most are: a clip's frames are dated then, and evenly apart else, jitter or not."""
+    steps = times_us.diff().double()
+    return len(steps) > 0 and bool(steps.max() > 1.5 * steps.median())
 
 
 def _evenly(begin: int, end: int, fps: float) -> torch.Tensor:

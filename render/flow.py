@@ -12,7 +12,7 @@ from render.kernels.flow import carry_kernel, see
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.launch import run, stage, view
 from render.projection import moves, optics_of, poses
-from render.rays import camera_origins, camera_rays, readout
+from render.rays import camera_origins, camera_rays, on_device, readout
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
@@ -65,7 +65,7 @@ def correspond(
     pixels = torch.empty(height, width, 2, dtype=torch.float64, device=device)
     found = Correspondence(torch.empty(height, width, 2, device=device), pixels, torch.empty(height, width, device=device))
     tensors = [
-        (rays, wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (bends, wp.vec3),
+        (on_device(rays, device), wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (bends, wp.vec3),
         (depth.detach(), float), (instance.to(torch.int32), int), (_places(placed, device), int), (ways, wp.mat44d),
         int(camera.shutter == "columns"),
     ]  # fmt: skip

@@ -51,8 +51,9 @@ class Frame:
     """The view of one camera. What was not asked for is None and was not computed.
 
     rgb `[H, W, 3]` display-referred, premultiplied over black where no background was given, not clamped above 1;
-    alpha `[H, W]`; depth `[H, W]` z in metres, inf where alpha is 0; median_depth `[H, W]` z of the splat behind which less than half
-    of the light passes, inf where alpha is below 0.5; normal `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
+    alpha `[H, W]`; depth `[H, W]` in metres, inf where alpha is 0: z, and for fisheye and equirectangular lenses the distance;
+    median_depth `[H, W]` the same of the splat behind which less than half of the light passes, inf where alpha is below 0.5; normal
+    `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
     visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32; instance_alpha `[H, W, P]` what each
     placed instance adds to alpha; need `[H, W]` 0 to 1, how badly the place is supported by photos (`render/need.py`).

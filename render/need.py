@@ -14,7 +14,7 @@ import torch
 
 from render.frame_types import Frame
 from render.kept import kept_beside
-from render.rays import camera_rays
+from render.rays import camera_rays, on_device
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
@@ -89,7 +89,7 @@ def far_from_photos(scene: Scene, camera: Camera, depth: torch.Tensor) -> torch.
         return torch.isfinite(depth).float()
     offsets = (places - pose[:3, 3]) @ pose[:3, :3]  # in the camera
     offsets = offsets[offsets.norm(dim=1).argsort()[:NEAREST]].to(depth)
-    rays = camera_rays(camera).to(depth)
+    rays = on_device(camera_rays(camera), depth.device)
     distance = rays.norm(dim=-1).clamp_min(1e-9)
     unit = rays / distance[..., None]
     distance = distance * depth

@@ -89,7 +89,7 @@ def rasterize(
     outputs = check_outputs(outputs)
     placed = as_placed(splats)
     flow_to = {way: (as_placed(there), other) for way, (there, other) in (flow_to or {}).items()}
-    _check(placed, camera, outputs, flow_to, model, config)
+    _check(placed, camera, outputs, flow_to, model)
     background = None if background is None else torch.as_tensor(background)
     _check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
@@ -120,7 +120,7 @@ def _draw(
         shutter=camera.shutter,
         rolling=moves(camera, placed),
         crop=crop,
-        mask=mask,
+        mask=None if mask is None else mask.to(placed[0].gaussians.device),
         gradients=torch.is_grad_enabled(),
         room=room,
     )
@@ -157,7 +157,7 @@ def picture_of(settings: Settings, background, rgb, alpha, z, weights, sums, med
     frame = {"alpha": alpha, "rgb": rgb.permute(1, 2, 0), "instance": instance}
     if background is not None:
         behind = background if background.ndim == 1 else background[settings.of_image]
-        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind.to(alpha.dtype)
+        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind.to(alpha)
     if settings.wanted.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
         drawn = weights > 0
@@ -195,7 +195,7 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
             raise ValueError(f"crop must be x, y, width, height of a part of the image, which has {size} pixels, got {crop}")
 
 
-def _check(placed, camera, outputs, flow_to, model, config) -> None:
+def _check(placed, camera, outputs, flow_to, model) -> None:
     if "need" in outputs:
         raise ValueError('output "need" depends on where a scene\'s photos were taken; ask render_frame for it')
     for name in outputs:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from render.clip import clip_cameras, frame_rate, render_clip
+from render.clip import clip_cameras, frame_rate, render_clip, uneven
 from render.frame_types import Frame
 from render.outputs import OUTPUTS
 from render.progress import Progress, Stopwatch
@@ -29,6 +29,7 @@ def record(
     scene: Scene,
     camera: str,
     path: Path,
+    *,
     shift: float | Trajectory = 0.0,
     times_us: torch.Tensor | None = None,
     width: int | None = None,
@@ -39,7 +40,6 @@ def record(
     needs: Sequence[str] = (),
     facts: dict | None = None,
     warnings: Sequence[str] = (),
-    fps: float | None = None,
 ) -> dict:
     """Render a clip to `path` (H.264) and its report to the same name with .json; return the report.
 
@@ -55,7 +55,8 @@ def record(
     torch.manual_seed(SEED)
     cameras = clip_cameras(scene, camera, shift, times_us, width, height)
     times = torch.tensor([c.time_us for c in cameras])
-    fps = fps or frame_rate(times)
+    fps = frame_rate(times)
+    moments = (times - times[0]).tolist() if uneven(times) else [None] * len(times)
     watch = Stopwatch()
     outputs = tuple(dict.fromkeys(("rgb", *keep, *needs)))
     frames = watch.during("render", render_clip(scene, camera, shift, times, width, height, outputs, shadows))
@@ -70,7 +71,7 @@ def record(
         for index, frame in enumerate(frames):
             assert frame.rgb is not None
             with watch.stage("write"):
-                video.write(frame.rgb)
+                video.write(frame.rgb, moments[index])
                 if folder is not None:
                     _keep(folder, index, frame, keep)
             steps.step()

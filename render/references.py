@@ -23,7 +23,7 @@ from render.frame import render_frame
 from render.frame_types import Frame
 from render.kernels.detail import add_photo, carry_over
 from render.portraits import portraits_of
-from render.rays import camera_rays
+from render.rays import camera_rays, on_device
 from render.seen import GONE, NOISE, PARALLAX, Seen, faded, run_over
 from scenes.asset import Asset
 from scenes.camera import Camera
@@ -120,7 +120,7 @@ class References:
         """What the photos add to a frame, and how far that is to be trusted, `[H, W, 4]`: the former is weighted by the latter already."""
         assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
         sums, squares = frame.rgb.new_zeros(*frame.rgb.shape[:2], 4), torch.zeros_like(frame.depth)
-        rays = camera_rays(frame.camera).to(frame.depth)
+        rays = on_device(camera_rays(frame.camera), frame.depth.device)
         for index, share in self.chosen(frame, predicted):
             baseline = float((self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm())
             told = [share, NOISE, baseline / PARALLAX, (rays, wp.vec3), (frame.depth, float), (sums, wp.vec4), (squares, float)]

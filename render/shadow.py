@@ -22,7 +22,7 @@ from render.frame_types import Frame
 from render.kernels.shadow import Falling, fall
 from render.launch import run, stage, view
 from render.occlusion import Box, Field, shadow_box, squares, trace_field
-from render.rays import camera_rays
+from render.rays import camera_rays, on_device
 from render.tracer import Blockers
 from scenes.asset import Actor
 from scenes.camera import Camera
@@ -99,7 +99,7 @@ def _light(frame: Frame, caster: Caster) -> torch.Tensor:
     told.half, told.ground, told.skirt = wp.vec2(*caster.half.tolist()), GROUND, SKIRT
     told.low, told.high = wp.vec3(*field.box.low.tolist()), wp.vec3(*field.box.high.tolist())
     light = torch.empty(y1 - y0, x1 - x0, device=device)
-    blocked, rays = field.blocked.to(device).contiguous(), camera_rays(frame.camera).to(device)
+    blocked, rays = field.blocked.to(device).contiguous(), on_device(camera_rays(frame.camera), device)
     depth, instance = frame.depth.detach().contiguous(), frame.instance.contiguous()
     with stage(device):
         seen = [view(rays, wp.vec3), view(depth, float), view(instance, int), x0, y0, view(light, float)]

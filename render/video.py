@@ -34,17 +34,12 @@ def from_bytes(pixels: np.ndarray) -> torch.Tensor:
 
 def read_image(path: str | os.PathLike) -> torch.Tensor:
     """An image file as `[H, W, 3]` float32 0..1, turned as its EXIF says. ValueError where it cannot be decoded."""
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import ImageOps
 
-    from render.pictures import rgb_of
+    from scenes.pictures import opened, rgb_of
 
-    try:
-        with Image.open(path) as image:
-            return from_bytes(np.asarray(rgb_of(ImageOps.exif_transpose(image))))
-    except FileNotFoundError:
-        raise
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise ValueError(f"{path} cannot be decoded as an image: {error}") from error
+    with opened(path, str(path), "fetch or export it again") as image:
+        return from_bytes(np.asarray(rgb_of(ImageOps.exif_transpose(image))))
 
 
 def write_image(path: str | os.PathLike, rgb: torch.Tensor) -> None:

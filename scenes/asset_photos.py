@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +26,15 @@ def photos_folder(file: Path) -> Path:
     return file.with_suffix(".photos")
 
 
-def save_photos(file: Path, photos: Sequence[AssetPhoto]) -> None:
-    """Write the photos of the asset in `file` beside it, all or none, in place of those that lie there. Their lenses must be pinholes."""
+@contextmanager
+def photos_beside(file: Path, photos: Sequence[AssetPhoto]) -> Iterator[None]:
+    """Within the block the asset is written to `file`; then its photos lie beside it, all or none, in place of those that lay there. Where
+    the block fails these stay. Lenses must be pinholes: ValueError before the block else."""
     from PIL import Image
 
     folder = photos_folder(file)
     if not photos:
+        yield
         shutil.rmtree(folder, ignore_errors=True)
         return
     with atomic_folder(folder, replace=True) as half:
@@ -48,6 +52,7 @@ def save_photos(file: Path, photos: Sequence[AssetPhoto]) -> None:
                 }
             )  # fmt: skip
         (half / INDEX).write_text(json.dumps(told, indent=1), encoding="utf-8")
+        yield
 
 
 def load_photos(file: Path) -> tuple[AssetPhoto, ...]:
@@ -76,13 +81,12 @@ def _photo(folder: Path, record: dict) -> AssetPhoto:
 
 
 def _read(file: Path, width: int, height: int) -> np.ndarray:
-    from PIL import Image
+    from scenes.pictures import opened
 
     fix = f"remove {file.parent}, and the asset is done without photos"
-    try:
-        with Image.open(file) as opened:
-            if opened.size != (width, height):  # before it is decoded: a header may claim any size
-                raise ValueError(f"{file} is {opened.size[0]}x{opened.size[1]} pixels, and {INDEX} says {width}x{height}; {fix}")
-            return np.array(opened.convert("RGBA"))
-    except (OSError, SyntaxError) as problem:
-        raise ValueError(f"{file} does not decode as a picture ({problem}); {fix}") from None
+    with opened(file, str(file), fix) as picture:
+        size = picture.size
+        pixels = np.array(picture.convert("RGBA")) if size == (width, height) else None  # a header may claim any size
+    if pixels is None:
+        raise ValueError(f"{file} is {size[0]}x{size[1]} pixels, and {INDEX} says {width}x{height}; {fix}")
+    return pixels

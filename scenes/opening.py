@@ -25,6 +25,12 @@ def fresh(path: Path, overwrite: bool) -> Path:
     return path
 
 
+def scene_folder(path: str | Path) -> Path:
+    """The folder of a scene that is named by it, or by its scene.usda."""
+    path = Path(path)
+    return path.parent if path.name == "scene.usda" else path
+
+
 def check_device(device: str) -> None:
     """ValueError where the machine has no such device."""
     import torch

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from scenes import units
+from scenes.opening import scene_folder
 from scenes.placement import Placement, parse_at, parse_path, parse_placement
 
 
@@ -88,5 +89,5 @@ Name = Annotated[str | None, written(str, "NAME", "edit, edit_2, ...")]
 Output = Annotated[Path, arg(aliases=("-o",))]
 Overwrite = FlagCreatePairsOff[Annotated[bool, arg(aliases=("-w",))]]
 Flag = FlagCreatePairsOff[bool]
-ScenePath = Positional[Annotated[Path, arg(metavar="SCENE")]]
+ScenePath = Positional[Annotated[Path, written(scene_folder, "SCENE", "none")]]
 AnyPath = Positional[Annotated[Path, arg(metavar="PATH")]]

@@ -17,7 +17,7 @@ import torch
 from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
 from scenes.asset import Asset
-from scenes.asset_photos import load_photos, save_photos
+from scenes.asset_photos import load_photos, photos_beside
 from scenes.formats.packing import logits_from, opacities_from, unit
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
@@ -54,8 +54,7 @@ def stage_axes(path: Path) -> tuple[str, float]:
 
 def save_asset(path: Path, asset: Asset, half: bool = False) -> None:
     """Write an asset as one USD file: its splats under an Xform that carries size, label and metadata; its photos beside it."""
-    save_photos(path, asset.photos)
-    with new_stage(path, "Asset") as stage:
+    with photos_beside(path, asset.photos), new_stage(path, "Asset") as stage:
         root = UsdGeom.Xform.Define(stage, "/Asset").GetPrim()
         size = Vt.DoubleArray(asset.size.tolist())
         set_own_data(root, kind="asset", label=asset.label, size=size, meta=to_json(asset.meta, "the asset's meta"))

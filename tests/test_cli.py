@@ -4,9 +4,11 @@ import json
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,7 +117,7 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
     (actor,) = load(street).actors
     assert actor.asset.label == "van" and int(actor.trajectory.times_us[0]) == made.START_US + 100_000
     assert "edit  kind edit  shift_m {'veh_1': [-1.0, 0.5]}" in door(["info", street])[0]
-    door(["edit", street, "--remove", "veh_1", "--name", "gone"])
+    door(["edit", f"{street}/scene.usda", "--remove", "veh_1", "--name", "gone"])  # what usdview opens names the scene as well
     assert load(street).actors == ()
     assert "again as it was" in door(["edit", street, "--undo", "gone", "--undo", "edit"])[0]
     assert load(street).actors[0].asset.label == "car"
@@ -241,6 +243,16 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
     (line,) = [line for line in errors.splitlines() if line.startswith("sidestep: ")]
     assert message in line
     assert not list(desk.glob("x*")) and not list(desk.glob(".x*"))
+
+
+def test_photos_that_claim_to_be_huge_are_bad_data(door, tmp_path):
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", 20_000, 20_000, 8, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "walk").mkdir()
+    for i in range(3):
+        (tmp_path / "walk" / f"{i}.png").write_bytes(data)
+    _, errors = door(["recon", str(tmp_path / "walk"), "-o", str(tmp_path / "s1")], 1)
+    assert "0.png does not decode as an image" in errors and "fetch the file again" in errors
 
 
 DEVICE_TAKERS = [

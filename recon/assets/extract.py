@@ -25,6 +25,7 @@ from scenes.files import load
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, turned
 from scenes.match import ground_linear
+from scenes.opening import scene_folder
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene, dimmed
 from scenes.seen import SECTORS, sector, unseen_sides
@@ -84,10 +85,11 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
     """
     shots: list[Shot] = []
     if not isinstance(scene, Scene):
+        scene = scene_folder(scene)
         loaded = load(scene)
         if not isinstance(loaded, Scene):
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
-        shots, scene = shots_in(Path(scene), loaded), loaded
+        shots, scene = shots_in(scene, loaded), loaded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids = Databank(databank), []
     for candidate in found:

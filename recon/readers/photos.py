@@ -14,13 +14,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 
-from recon.log import Log, Packed, image_size
+from recon.log import FETCH, Log, Packed
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.order import recorded
 from recon.readers.sfm import solve
-from render.pictures import is_turned, rgb_of, swaps_sides
+from scenes.pictures import is_turned, opened, rgb_of, swaps_sides
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
@@ -100,7 +100,7 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
 def _turned(file: Path | Packed) -> bool:
     if isinstance(file, Packed):
         return False
-    with Image.open(file) as picture:
+    with opened(file, str(file), FETCH) as picture:
         return is_turned(picture)
 
 
@@ -117,7 +117,7 @@ def _upright(path: Path, names: list[str], folder: Path) -> Path:
         if name not in turned:
             shutil.copyfile(path / name, folder / name)
             continue
-        with Image.open(path / name) as stored:
+        with opened(path / name, str(path / name), FETCH) as stored:
             upright = ImageOps.exif_transpose(stored)
             rgb_of(upright).save(folder / name, exif=upright.getexif(), quality=QUALITY)
     return folder
@@ -136,9 +136,8 @@ def _of_one_size(path: Path) -> list[str]:
 
 def _size(file: Path) -> tuple[int, int]:
     """Width and height of a photo that stands upright."""
-    width, height = image_size(file)
-    with Image.open(file) as picture:
-        return (height, width) if swaps_sides(picture) else (width, height)
+    with opened(file, str(file), FETCH) as picture:
+        return picture.size[::-1] if swaps_sides(picture) else picture.size
 
 
 def _frames(path: Path, folder: Path) -> dict[str, int]:

@@ -24,7 +24,6 @@ from scenes.trajectory import Trajectory
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 LABELS = {1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
-TOP = 1
 FRONT = ("front", "front_left", "front_right")
 OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 IMAGE = "[CameraImageComponent].image"

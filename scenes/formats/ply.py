@@ -124,7 +124,7 @@ def _check_splats(path: Path, elements: list[Element]) -> int:
     names = {e.name: e.properties for e in elements}
     vertex = names.get("vertex", {})
     if "packed_position" in vertex:
-        raise ValueError(f"{path} is a compressed splat PLY (PlayCanvas, SuperSplat), which is not read; export it uncompressed")
+        raise ValueError(f"{path} is a compressed splat PLY (PlayCanvas, SuperSplat); scenes.load reads it, by its header")
     missing = [name for group in _FIELDS.values() for name in group if vertex.get(name, "list") == "list"]
     if missing:
         what = "a mesh" if "face" in names else "not a Gaussian splat file"

@@ -176,7 +176,7 @@ def _picture(path: Path, fetch: Callable[[str], bytes], name: str, least: int) -
             if not least <= width * height <= min(2 * least, least + MOST_BYTES * len(data)) + _SLACK:
                 raise ValueError(f"{path} is corrupt: {name} has {width}x{height} pixels for {least} entries")
             return np.array(picture.convert("RGBA"))
-    except (OSError, SyntaxError, EOFError) as error:
+    except (OSError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
         raise ValueError(f"{path} is corrupt: {name} cannot be decoded: {error}") from error
 
 

@@ -13,8 +13,8 @@ from recon import open_log
 from recon.readers import photos as reader
 from recon.readers import sfm
 from recon.readers.sfm import read_model
-from render.pictures import ORIENTATION
 from render.video import VideoWriter
+from scenes.pictures import ORIENTATION
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
 

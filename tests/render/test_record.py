@@ -15,7 +15,7 @@ from scenes.placement import Placement
 
 def test_a_video_and_its_report_appear_together(street, tmp_path):
     scene = insert(street, car(), Placement("car/0001", 9, 2)).scene
-    report = record(scene, "front_camera", tmp_path / "out.mp4", 2.0, facts={"enhanced": None}, warnings=["mind the gap"])
+    report = record(scene, "front_camera", tmp_path / "out.mp4", shift=2.0, facts={"enhanced": None}, warnings=["mind the gap"])
     assert sorted(os.listdir(tmp_path)) == ["out.json", "out.mp4"]
     assert len(list(read_video(tmp_path / "out.mp4"))) == 8
     told = json.loads((tmp_path / "out.json").read_text())
@@ -28,6 +28,12 @@ def test_a_video_and_its_report_appear_together(street, tmp_path):
     assert {"render", "write"} == set(told["ms_per_frame"])
     assert {"sidestep", "torch", "warp-lang"} <= set(told["versions"])
     assert told["seed"] == 0
+
+
+def test_frames_that_are_missing_leave_their_gap(street, tmp_path):
+    times = street.frame_times("front_camera")[[0, 1, 4, 5]]
+    record(street, "front_camera", tmp_path / "out.mp4", times_us=times)
+    assert [t for t, _ in read_video(tmp_path / "out.mp4").timed()] == pytest.approx((times - times[0]).tolist(), abs=12)
 
 
 def test_kept_outputs_come_as_files(street, tmp_path):

@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 
 from render.compare import psnr
-from render.pictures import rgb_of
 from render.video import VideoWriter, read_image, read_video, write_image
+from scenes.pictures import rgb_of
 
 
 def smooth_image(height, width):

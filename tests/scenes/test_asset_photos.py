@@ -49,6 +49,14 @@ def test_an_asset_without_photos_takes_the_place_of_one_with_them(pictured, tmp_
     assert not photos_folder(tmp_path / "car.usdc").exists() and load(tmp_path / "car.usdc").photos == ()
 
 
+def test_photos_stay_where_the_asset_cannot_be_written(pictured, tmp_path):
+    save(pictured, tmp_path / "car.usdc")
+    for photos in ((), (photo(10),)):
+        with pytest.raises(ValueError, match="meta"):
+            save(replace(pictured, photos=photos, meta={"odd": object()}), tmp_path / "car.usdc", overwrite=True)
+    assert len(load(tmp_path / "car.usdc").photos) == 2 and len(list(tmp_path.iterdir())) == 2
+
+
 def test_photos_go_along_into_the_databank_and_into_edits(pictured, street, tmp_path):
     bank = Databank(tmp_path / "bank")
     stored = bank.load(bank.add(pictured))

@@ -1,6 +1,11 @@
-"""A picture's pixels out of its file: 8-bit RGB, whatever the file holds, as every reader here takes them."""
+"""A picture's pixels out of its file: 8-bit RGB, whatever the file holds, as every reader here takes them. PIL is loaded here alone."""
 
 from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO
 
 import numpy as np
 from PIL import Image
@@ -10,6 +15,19 @@ ORIENTATION, TURNED = 0x0112, range(2, 9)
 
 SIDEWAYS = range(5, 9)
 """Those that make its width its height."""
+
+
+@contextmanager
+def opened(file: str | os.PathLike | IO[bytes], name: str, fix: str) -> Iterator[Image.Image]:
+    """An image file, whose pixels are decoded when the block asks for them. ValueError with its name and the fix where that fails, also for
+    a header that claims more pixels than any picture has; FileNotFoundError passes."""
+    try:
+        with Image.open(file) as picture:
+            yield picture
+    except FileNotFoundError:
+        raise
+    except (OSError, SyntaxError, EOFError, ValueError, Image.DecompressionBombError) as problem:
+        raise ValueError(f"{name} does not decode as an image ({problem}); {fix}") from None
 
 
 def rgb_of(picture: Image.Image) -> Image.Image:
