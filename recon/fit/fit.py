@@ -8,9 +8,8 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-import torch.nn.functional as F
 
-from recon.fit.config import SMALLEST, FitConfig
+from recon.fit.config import FitConfig
 from recon.fit.densify import Growth, grow, joined, kept
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
@@ -24,6 +23,8 @@ from recon.fit.reach import reach_of
 from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
+from recon.fit.targets import Targets, ego_at
+from recon.fit.turns import Turns
 from recon.fit.unseen import as_neighbours, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
@@ -95,10 +96,8 @@ class Fit:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.recent_loss = 0.0
-        self._pyramid: dict[tuple[int, int], torch.Tensor] = {}
-        self._weights = self._chances()
-        # draws that each view is behind: from anywhere, or views of equal weight would come all at once
-        self.due = torch.rand(len(self.training), generator=self.generator)
+        self.targets = Targets(frames.width, frames.height)
+        self.turns = Turns(self._weights(), self.generator)
         self.openings = Openings(frames, motion, self.device)
         self.ground, self.swept = ground, swept.to(self.device)
         self.flat_ground = FlatGround(ground, self.device)
@@ -107,7 +106,7 @@ class Fit:
         self.guessed: torch.Tensor | None = None
         self._optimise()
 
-    def _chances(self) -> torch.Tensor:
+    def _weights(self) -> torch.Tensor:
         """How often each training view should be drawn: less while the car stands."""
         drawn = [self.motion.row[v.camera, v.index] for v in self.training]
         return torch.where(self.motion.speeds()[drawn] > 0.5, 1.0, self.config.still_weight)
@@ -135,18 +134,13 @@ class Fit:
 
     def step(self) -> float:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
-        if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
-            self._grow()
-        if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
-            self._refill()
-        if self.guessed is None and self.progress >= GUESSED_FROM:
-            self._guess()
-        view = self._next()
-        camera = self.motion.camera(view).resized(*self._size(self.shrink()))
-        target = self._target(view, self.shrink())
+        self._tend()
+        view = self.training[self.turns.next()]
+        camera = self.motion.camera(view).resized(*self.targets.size(self.shrink()))
+        target = self.targets.picture(view, self.shrink())
         aside = None
         if self.step_count % ASIDE_EVERY == 0:
-            aside = self.openings.aside(view, camera, self.generator).resized(*self._size(2 * self.shrink()))
+            aside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(2 * self.shrink()))
         ends = self.motion.readout(view, camera)
         rates = self._rates()
         which = self._in_sight(view, camera, ends, aside)
@@ -159,11 +153,7 @@ class Fit:
         sky = self.openings.backdrop(self.sky, self.generator)
         outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
         drawn = self._render(by_lot, view, camera, ends, sky, shift, outputs, blank)
-        rgb, alpha = drawn["rgb"], drawn["alpha"]
-        if view.ego is not None:
-            rgb = torch.where(self._ego(view, camera), target, rgb)  # the recording car is no part of the scene
-        if view.gain is not None:
-            rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
+        rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
         lattice = (STEP, *torch.randint(0, STEP, (2,), generator=self.generator).tolist())
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, lattice)
         haze = self.openings.haze(alpha, view, camera)
@@ -191,12 +181,13 @@ class Fit:
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
 
-    def _next(self) -> View:
-        """The view that is most overdue, or nearly: each comes as often as it should, and none waits for long."""
-        self.due = self.due + self._weights / self._weights.sum()  # anew: a checkpoint may hold the other
-        k = int((self.due + 0.5 * torch.rand(len(self.due), generator=self.generator)).argmax())
-        self.due[k] -= 1
-        return self.training[k]
+    def _judged(self, rgb: torch.Tensor, target: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
+        """The rendered picture of a view, as recorded where the record says nothing of the scene."""
+        if view.ego is not None:
+            rgb = torch.where(ego_at(view, camera), target, rgb)  # the recording car is no part of the scene
+        if view.gain is not None:
+            rgb = torch.where((target > CLIPPED) & (rgb > target), target, rgb)  # how much brighter it was, the picture does not say
+        return rgb
 
     def _known(self, view: View) -> list[tuple[float, torch.Tensor]]:
         """The depths that a view is held to, and their weights."""
@@ -277,31 +268,12 @@ class Fit:
         self._renew(*kept(self.splats, self.descent.tensors(), ~self.swept.holds(self.splats)))
         part = torch.zeros_like(self.splats.reach)
         for view in self.training:
-            camera = self.motion.camera(view).resized(*self._size(4))
+            camera = self.motion.camera(view).resized(*self.targets.size(4))
             which = self._in_sight(view, camera, [], None)
             shown = torch.cat(shown_parts(self._placed(self.splats.select(which, 1), view, camera), camera))
             part[which] = torch.maximum(part[which], shown)
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured())
         self.descent.still_colours(self.guessed)
-
-    def _size(self, shrink: int) -> tuple[int, int]:
-        return max(SMALLEST, self.frames.width // shrink), max(SMALLEST, self.frames.height // shrink)
-
-    def _target(self, view: View, shrink: int) -> torch.Tensor:
-        if shrink == 1:
-            return view.image.float().mul_(1 / 255)
-        key = (shrink, self.motion.row[view.camera, view.index])
-        if key not in self._pyramid:
-            width, height = self._size(shrink)
-            small = F.interpolate(view.image.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].permute(1, 2, 0)
-            self._pyramid = {k: v for k, v in self._pyramid.items() if k[0] == shrink}
-            self._pyramid[key] = small.contiguous()
-        return self._pyramid[key] / 255
-
-    def _ego(self, view: View, camera: Camera) -> torch.Tensor:
-        """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`."""
-        assert view.ego is not None
-        return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
 
     def _settled(self) -> float:
         """How long steps still are: towards the end they become ever shorter."""
@@ -327,6 +299,15 @@ class Fit:
         self.limbs.follow(self.progress)
 
     # ---- growth
+
+    def _tend(self) -> None:
+        """Add, drop and colour splats where it is time to."""
+        if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
+            self._grow()
+        if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
+            self._refill()
+        if self.guessed is None and self.progress >= GUESSED_FROM:
+            self._guess()
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""
@@ -375,7 +356,7 @@ class Fit:
             "motion": self.motion.tensors(),
             "limbs": self.limbs.tensors(),
             "adam": [o.state_dict() for o in (self.rest_adam, self.pose_adam)],
-            "due": self.due,
+            "due": self.turns.due,
             "generator": self.generator.get_state(),
             "step": self.step_count,
             "loss": self.recent_loss,
@@ -392,7 +373,7 @@ class Fit:
         self._optimise()
         for optimiser, saved in zip((self.rest_adam, self.pose_adam), state["adam"], strict=True):
             optimiser.load_state_dict(saved)
-        self.due = state["due"]
+        self.turns.due = state["due"]
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
 

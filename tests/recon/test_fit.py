@@ -21,6 +21,7 @@ from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.fit.swept import Swept
+from recon.fit.turns import Turns
 from recon.log import LogCamera
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers, mistake
 from recon.skies import cells
@@ -194,15 +195,10 @@ def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
         _span(log, names, 0, -1)
 
 
-def test_views_come_as_often_as_they_should_and_none_waits_for_long(drive):
-    log = open_log(drive)
-    names, span = choose(log)
-    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
-    count = len(fit.training)
-    fit._weights = torch.where(torch.arange(count) < count // 2, 0.4, 1.0)
-    share = fit._weights / fit._weights.sum()
-    place = {id(view): k for k, view in enumerate(fit.training)}
-    drawn = torch.tensor([place[id(fit._next())] for _ in range(20 * count)])
+def test_views_come_as_often_as_they_should_and_none_waits_for_long():
+    count = 12
+    turns = Turns(torch.where(torch.arange(count) < count // 2, 0.4, 1.0), torch.Generator().manual_seed(0))
+    share, drawn = turns.shares, torch.tensor([turns.next() for _ in range(20 * count)])
     assert (torch.bincount(drawn, minlength=count) - share * len(drawn)).abs().max() <= 1.5
     for k in range(count):
         assert (drawn == k).nonzero()[:, 0].diff().max() * share[k] <= 2
@@ -289,15 +285,15 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
     fit.step_count = BLAME_EVERY * 4
     view = fit.training[0]
-    fit._weights = torch.eye(len(fit.training))[0]  # the view that is drawn
-    camera = fit.motion.camera(view).resized(*fit._size(fit.shrink()))
+    fit.turns.shares = torch.eye(len(fit.training))[0]  # the view that is drawn
+    camera = fit.motion.camera(view).resized(*fit.targets.size(fit.shrink()))
     everything = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
     ones, ends, sky = torch.ones(len(fit.splats), 1), fit.motion.readout(view, camera), partial(sample_equirect, fit.sky)
     with torch.no_grad():
         drawn = fit._render(everything, view, camera, ends, sky, outputs=("rgb", "alpha", "features"), features=ones)
     alpha = drawn["alpha"]
     torch.testing.assert_close(drawn["features"][..., 0], alpha)  # a picture's weights of all splats are its alpha
-    wrong = (drawn["rgb"] - fit._target(view, fit.shrink())).abs().mean(-1)
+    wrong = (drawn["rgb"] - fit.targets.picture(view, fit.shrink())).abs().mean(-1)
     fit.step()
     assert abs(float(fit.growth.errors.sum() / (wrong * alpha).sum()) / fit.shrink() ** 2 - 1) < 0.1, (
         "but for what the backdrop changes where alpha is low"

@@ -1,0 +1,40 @@
+"""The recorded pictures that renders are compared with, shrunk as a fit goes from coarse to fine."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+
+from recon.fit.config import SMALLEST
+from recon.view import View
+from scenes.camera import Camera
+
+
+class Targets:
+    """Pictures of `width` x `height`, shrunk by a factor; those of the present factor are kept."""
+
+    def __init__(self, width: int, height: int):
+        self.width, self.height = width, height
+        self._kept: dict[tuple[int, int, int], torch.Tensor] = {}
+
+    def size(self, shrink: int) -> tuple[int, int]:
+        """Width and height of shrunk pictures."""
+        return max(SMALLEST, self.width // shrink), max(SMALLEST, self.height // shrink)
+
+    def picture(self, view: View, shrink: int) -> torch.Tensor:
+        """A view's picture `[h, w, 3]` in 0..1, area-averaged."""
+        if shrink == 1:
+            return view.image.float().mul_(1 / 255)
+        key = (shrink, view.camera, view.index)
+        if key not in self._kept:
+            width, height = self.size(shrink)
+            small = F.interpolate(view.image.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].permute(1, 2, 0)
+            self._kept = {k: v for k, v in self._kept.items() if k[0] == shrink}
+            self._kept[key] = small.contiguous()
+        return self._kept[key] / 255
+
+
+def ego_at(view: View, camera: Camera) -> torch.Tensor:
+    """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`."""
+    assert view.ego is not None
+    return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
