@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
 
@@ -12,6 +11,7 @@ from torch.nn import functional as F
 from enhance.net import MULTIPLE, Net, photos_of
 from enhance.precision import autocast
 from enhance.shards import Shard
+from render.compare import decibels
 from scenes.spread import spread
 
 CLIPS = 32
@@ -42,6 +42,6 @@ def _gains(net: Net, shard: Shard) -> list[float]:
         given = torch.lerp(rendered, reference, trust)
         with autocast(device):
             better = net(given, photos=photos_of(reference, trust)).rgb
-        before, after = ((x.clamp(0, 1) - target).square().mean().clamp_min(1e-12).item() for x in (given, better))
-        gains.append(10 * math.log10(before / after))
+        before, after = (decibels(max(1e-12, float((x.clamp(0, 1) - target).square().mean()))) for x in (given, better))
+        gains.append(after - before)
     return gains

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from scenes.checks import check_tensor
@@ -16,8 +18,12 @@ def psnr(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> 
     error = (a.clamp(0, 1) - b.clamp(0, 1)).double().square()
     if mask is not None:
         error = error[mask]
-    mse = float(error.mean())
-    return float("inf") if mse == 0 else -10 * float(torch.log10(torch.tensor(mse, dtype=torch.float64)))
+    return decibels(float(error.mean()))
+
+
+def decibels(mse: float) -> float:
+    """The PSNR in dB of a mean squared error at peak 1; inf where it is 0."""
+    return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> float:

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 
 from recon.assets.looking import looking_at
 from render import Frame, rasterize
+from render.compare import decibels
 from render.tracer import SKY, Blockers, Mesh, TracedMesh, fibonacci, lit
 from scenes.asset import Asset
 from scenes.axes import axis
@@ -235,7 +236,8 @@ def _drawn(splats: Gaussians, camera: Camera) -> Frame:
 
 
 def likeness(splats: Gaussians, traced: TracedMesh, cameras: list[Camera]) -> tuple[float, float]:
-    """PSNR in dB of the splats against the traced mesh over mid-grey: of whole pictures, and of the pixels that the mesh covers."""
+    """PSNR in dB, of all views' mean squared error, of the splats against the traced mesh over mid-grey: of whole pictures, and of the pixels
+    that the mesh covers."""
     whole, own = [], []
     for camera in cameras:
         with torch.no_grad():
@@ -244,7 +246,7 @@ def likeness(splats: Gaussians, traced: TracedMesh, cameras: list[Camera]) -> tu
         error = (ours.rgb + 0.5 * (1 - ours.alpha)[..., None]).clamp(0, 1) - (theirs.rgb + 0.5 * (1 - theirs.alpha)[..., None])
         whole.append(error.square().mean())
         own.append(error[theirs.alpha > 0].square().mean())
-    return tuple(float(-10 * torch.stack(e).mean().log10()) for e in (whole, own))  # type: ignore[return-value]
+    return decibels(float(torch.stack(whole).mean())), decibels(float(torch.stack(own).mean()))
 
 
 def asset_of_mesh(
