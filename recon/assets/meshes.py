@@ -236,7 +236,7 @@ def _drawn(splats: Gaussians, camera: Camera) -> Frame:
 
 
 def likeness(splats: Gaussians, traced: TracedMesh, cameras: list[Camera]) -> tuple[float, float]:
-    """PSNR in dB, of all views' mean squared error, of the splats against the traced mesh over mid-grey: of whole pictures, and of the pixels
+    """PSNR in dB, of all views' mean squared error, of the splats against the traced mesh over mid-grey: of whole pictures, and of pixels
     that the mesh covers."""
     whole, own = [], []
     for camera in cameras:
