@@ -6,7 +6,7 @@ Pictures are .png, or .jpg where someone made them smaller. A piece of a drive i
 The lidar turns counter-clockwise and looks ahead at its stamp: its points are untwisted by the body's motion.
 
 Odometry: `sequences/<n>` with image_0 to image_3, velodyne, calib.txt, times.txt and the poses in `../../poses/<n>.txt`. The body is the
-lidar; its points are published untwisted.
+lidar, whose points are published untwisted; the first camera, turned, where a calibration without lidar's `Tr` came with pictures alone.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ EARTH = 6378137.0
 
 LABELS = {"Person_sitting": "pedestrian", "Misc": "object"}
 SHARE = {"licence": "CC BY-NC-SA 3.0", "attribution": "KITTI by Geiger, Lenz, Stiller and Urtasun"}
+CAMERA_FROM_FLU = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 SUFFIXES = (".png", ".jpg")
 FRONT = ("image_02", "image_2", "image_00", "image_0")
 
@@ -101,8 +102,9 @@ def read_kitti_odometry(path: Path) -> Log:
     camera_world = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
     camera_world[:, :3] = torch.from_numpy(rows)
     calib = _numbers(path / "calib.txt")
-    cam_from_body = _padded(_named(calib, "Tr", 12, path / "calib.txt"))
-    # the poses' world is the first rectified camera; ours is the first lidar pose, whose z is up
+    blind = "Tr" not in calib and not (path / "velodyne").is_dir()  # the calibration that comes with grey pictures knows no lidar
+    cam_from_body = CAMERA_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
+    # the poses' world is the first rectified camera; ours is the first body pose, whose z is up
     poses = inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body
     ego = lengthened(times, poses)
     cameras = {}
@@ -118,7 +120,7 @@ def read_kitti_odometry(path: Path) -> Log:
     )
     meta = {
         "name": f"kitti-odometry-{number}", "source": f"KITTI odometry sequence {number}", **SHARE,
-        "body": "lidar, x forward, y left, z up",
+        "body": f"{'first camera' if blind else 'lidar'}, x forward, y left, z up",
     }  # fmt: skip
     return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3, dtype=torch.float64))
 

@@ -136,6 +136,20 @@ def test_boxes_are_read_without_the_lidar_they_were_drawn_by(raw, own):
         assert np.array_equal(a.times_us, b.times_us) and torch.equal(a.world_from_box, b.world_from_box)
 
 
+def test_pictures_whose_calibration_knows_no_lidar_are_read_from_the_camera(odometry, own_sequence):
+    calib = own_sequence / "calib.txt"
+    calib.write_text("".join(line for line in calib.read_text().splitlines(True) if not line.startswith("Tr")))
+    with pytest.raises(ValueError, match=r"calib.txt must give 12 numbers as Tr"):
+        open_log(own_sequence)
+    shutil.rmtree(own_sequence / "velodyne")
+    whole, blind = open_log(odometry), open_log(own_sequence)
+    assert blind.meta["body"].startswith("first camera") and len(blind.sweeps) == 0
+    for name in ("image_2", "image_3"):
+        one, other = (log.camera(name).world_from_cam for log in (whole, blind))
+        assert (torch.linalg.inv(one[0]) @ one - torch.linalg.inv(other[0]) @ other).abs().max() < 1e-9
+        assert other[0, 2, 1] < -0.99  # the camera's y points down
+
+
 def test_a_piece_of_a_sequence_is_read_as_far_as_its_pictures_go(odometry, own_sequence, capsys):
     for file in ("image_2/000005.png", "image_3/000005.png", "velodyne/000005.bin"):
         (own_sequence / file).unlink()
