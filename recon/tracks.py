@@ -24,6 +24,11 @@ MOVED = 1.0
 """Metres that a box's middle goes before it counts as moving, where the log does not say: annotators' boxes wander by half of that."""
 
 
+FACES_US, LIMBED_US = 750_000, 150_000
+"""Between two boxes at most, for something to face in the second about as in the first: nuScenes annotates every half second, in which
+people do turn round."""
+
+
 @dataclass(frozen=True)
 class Boxes:
     """One object as a log annotates it: its identifier, class, times int64 us `[T]`, `world_from_box` `[T, 4, 4]` and sizes `[T, 3]`
@@ -72,14 +77,28 @@ def tracks_of(found: list[Boxes], ego: Trajectory, where: str) -> tuple[Track, .
 
 
 def named(tracks: list[Track], ego: Trajectory) -> tuple[Track, ...]:
-    """The tracks as `veh_1`, `ped_1`, `cyc_1`, `obj_1`, ..., each kind numbered by how near it came to the body."""
+    """The tracks as `veh_1`, `ped_1`, `cyc_1`, `obj_1`, ..., each kind numbered by how near it came to the body; none spins (`facing`)."""
     numbers: dict[str, int] = {}
     out = []
-    for _, track in sorted(((nearness(t, ego), t) for t in tracks), key=lambda pair: (pair[0], pair[1].sources)):
+    for _, track in sorted(((nearness(t, ego), facing(t)) for t in tracks), key=lambda pair: (pair[0], pair[1].sources)):
         kind = "veh" if track.label in VEHICLES else KINDS.get(track.label, "obj")
         numbers[kind] = numbers.get(kind, 0) + 1
         out.append(replace(track, name=f"{kind}_{numbers[kind]}"))
     return tuple(out)
+
+
+def facing(track: Track) -> Track:
+    """The track without turns on the spot: annotators, and networks more so, take a rear for a front now and then, and between two such
+    boxes a car would spin. Boxes that follow one another soon face as most of them do."""
+    ahead = track.world_from_box[:, :3, 0]
+    turned = ((ahead[1:] * ahead[:-1]).sum(1) < 0).numpy()
+    later = np.flatnonzero(np.diff(track.times_us) > (LIMBED_US if track.label in LIMBED else FACES_US)) + 1
+    poses = track.world_from_box.clone()
+    for run in np.split(np.arange(len(poses)), later):
+        back = np.cumsum([False, *turned[run[:-1]]]) % 2 > 0
+        wrong = torch.from_numpy(run[back if back.mean() <= 0.5 else ~back])
+        poses[wrong] = poses[wrong] @ torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
+    return replace(track, world_from_box=poses)
 
 
 def nearness(track: Track, ego: Trajectory) -> float:
