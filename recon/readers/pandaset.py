@@ -132,7 +132,7 @@ def _points(file: Path, origin: np.ndarray) -> LidarPoints:
     if missing:
         raise ValueError(f"{file} has no column {missing[0]!r}; it has {', '.join(table)}")
     xyz = np.stack([table[k].astype(np.float64) for k in "xyz"], 1) - origin
-    keep = np.isfinite(xyz).all(1)
+    keep = np.isfinite(xyz).all(1) & np.isfinite(table["t"].astype(np.float64))
     sensor = table["d"].astype(np.int64) if "d" in table else np.zeros(len(xyz), np.int64)
     return LidarPoints(xyz[keep], np.round(table["t"][keep].astype(np.float64) * 1e6).astype(np.int64), sensor[keep])
 

@@ -2,6 +2,7 @@ import json
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from made_drive import ABSENT, SCANNED_US
@@ -121,6 +122,16 @@ def test_a_sweep_without_its_columns_is_named_when_read(own_drive):
     log = open_log(own_drive)
     with pytest.raises(ValueError, match="00.pkl.gz has no column 'x'"):
         log.sweeps[0].read()
+
+
+def test_points_without_a_place_or_a_time_are_left_out(own_drive):
+    file = own_drive / "lidar" / "00.pkl.gz"
+    all_there = open_log(own_drive).sweeps[0].read()
+    table = pd.read_pickle(file)
+    table.loc[0, "x"], table.loc[1, "t"] = np.nan, np.nan
+    table.to_pickle(file)
+    points = open_log(own_drive).sweeps[0].read()
+    assert len(points.xyz) == len(all_there.xyz) - 2 and (points.times_us > 0).all()
 
 
 def test_a_drive_without_boxes_or_gps_is_a_drive(own_drive):
