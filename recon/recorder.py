@@ -1,15 +1,18 @@
-"""Lidar points on the recording car itself: a quarter of nuScenes' sweeps are its own roof, which goes wherever the car goes and would hold
-the sweeps, laid on one another, to a path along which the car stands still."""
+"""What a log shows of the recording car itself. Lidar points: a quarter of nuScenes' sweeps are its own roof, which goes wherever the car
+goes and would hold the sweeps, laid on one another, to a path along which the car stands still. And its box, where somebody drew one: it
+would hide the street from the cameras in it."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, Sweep
+from recon.log import LidarPoints, Log, Sweep, Track
 from scenes.poses import inverse
+from scenes.trajectory import Trajectory
 
 LENGTH, WIDTH = 5.2, 2.2
 """Metres of the box about the middle of the lidars on its roof that is the car's: bodies begin at the rear axle, under the lidar, or
@@ -21,9 +24,16 @@ ROOF = 0.5
 MOMENT_US = 5000
 """Microseconds in which the car is taken to stand."""
 
+ABOVE = 1.0
+"""Metres above and below a box within which the body's own place may be: a lidar on the roof, or the road under the rear axle."""
+
 
 def without_recorder(log: Log) -> Log:
-    """The log with sweeps that show nothing of the car that carries the lidar."""
+    """The log without the recording car: its sweeps show nothing of it, and no box is its own."""
+    own = [track.name for track in log.tracks if _is_recorder(track, log.ego)]
+    for name in own:
+        print(f"{log.path}: box {name} stands around the recording car, and is left out", file=sys.stderr)
+    log = replace(log, tracks=tuple(track for track in log.tracks if track.name not in own))
     top = max((float(place[2]) for place in log.lidars.values()), default=0.0)
     ahead = [float(place[0]) for place in log.lidars.values() if place[2] > top - ROOF] or [0.0]
     middle = (min(ahead) + max(ahead)) / 2
@@ -41,3 +51,12 @@ def without_recorder(log: Log) -> Log:
         return replace(sweep, read=read)
 
     return replace(log, sweeps=tuple(map(freed, log.sweeps)))
+
+
+def _is_recorder(track: Track, ego: Trajectory) -> bool:
+    """Whether a body's own place is in a track's box for more than half of the time that they share: others' boxes touch it at most."""
+    times = torch.from_numpy(track.times_us)
+    shared = ego.covers_each(times)
+    place = (inverse(track.world_from_box[shared]) @ ego.at_each(times[shared]))[:, :3, 3].numpy()
+    beside = (np.abs(place[:, :2]) > track.size[:2] / 2).any(1)
+    return bool(len(place)) and bool(((~beside) & (place[:, 2] > -ABOVE) & (place[:, 2] < track.size[2] + ABOVE)).mean() > 0.5)

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from recon import open_log
-from recon.log import LidarPoints, Log, Sweep
+from recon.log import LidarPoints, Log, Sweep, Track
 from recon.recorder import without_recorder
 from scenes import Trajectory
 from scenes.poses import translation, yaw
@@ -49,3 +49,19 @@ def test_its_points_stand_where_it_was_when_each_was_taken():
     bonnet = np.stack([3.3 + 20e-6 * times, np.full(60, 0.3), np.full(60, 0.9)], 1)
     log = Log("street", "street", {}, (Sweep(0, 100_000, lambda: LidarPoints(bonnet, times, 0 * times)),), (), ego, {}, lidars=ROOF)
     assert len(without_recorder(log).sweeps[0].read().xyz) == 0
+
+
+def test_a_box_around_the_recording_car_is_left_out(capsys):
+    """Cameras stand in it: all that they see would lie behind its nearest corner."""
+    times = np.arange(4) * 100_000
+    poses = torch.stack([translation(2.0 * i, 0, 0) @ yaw(0.3) for i in range(4)])
+    ego = Trajectory(torch.from_numpy(times), poses @ translation(0.5, 0.1, 1.8))
+
+    def box(name, place):
+        return Track(name, "car", True, np.array([4.8, 2.0, 1.6]), times, place, np.full(4, -1), (name,))
+
+    ahead = poses @ translation(6.0, 0, 0)
+    brushes = torch.cat([poses[:1], ahead[1:]])
+    log = Log("street", "street", {}, (), (box("own", poses), box("ahead", ahead), box("brushes", brushes)), ego, {})
+    assert [t.name for t in without_recorder(log).tracks] == ["ahead", "brushes"]
+    assert "box own stands around the recording car" in capsys.readouterr().err
