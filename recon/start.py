@@ -15,7 +15,7 @@ from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.frames import Frames
 from recon.ground import estimate_ground
-from recon.log import Log, Track
+from recon.log import Log, Sweep, Track
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
@@ -94,7 +94,7 @@ def prepare(
         beyond = Cloud.cat([])
     else:
         ground = estimate_ground(split.static, log.ego)
-        seen = colours(log, frames, split.static, split.static_sweep, list(split.tracks))
+        seen = colours(log, frames, split.static, _began(sweeps, split.static_sweep), list(split.tracks))
         gains = first_exposures(seen) if told is None else told
         rgb = merged_colours(seen, gains)
         known = np.isfinite(rgb[:, 0])
@@ -115,7 +115,7 @@ def prepare(
     most = even_limit([len(points) for points, _ in split.actors.values()], int(budget * ACTORS_PART))
     for track in split.tracks:
         points, index = split.actors.get(track.name, (np.zeros((0, 3)), np.zeros(0, np.int64)))
-        made = _actor(log, frames, track, points, index, gains, sh_count, min(most, MOST_OF_ONE))
+        made = _actor(log, frames, track, points, _began(sweeps, index), gains, sh_count, min(most, MOST_OF_ONE))
         if len(made):
             groups.append(made)
             tracks.append(track)
@@ -169,16 +169,18 @@ def even_limit(counts: Sequence[int], total: int) -> int:
 
 
 def _actor(
-    log: Log, frames: Frames, track: Track, points: np.ndarray, sweep: np.ndarray, gains: np.ndarray, sh_count: int, most: int
+    log: Log, frames: Frames, track: Track, points: np.ndarray, taken_us: np.ndarray, gains: np.ndarray, sh_count: int, most: int
 ) -> Gaussians:
-    """Seeds of a mover in its box frame, about `most`: its own lidar points, and where they are few, the skin of its box."""
+    """Seeds of a mover in its box frame, about `most`: its own lidar points, of sweeps at these times `[N]`, and where they are few, the
+    skin of its box."""
     trajectory = track.trajectory()
     if len(points) < 100:
         skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
-        points, sweep = np.concatenate([points, skin]), np.concatenate([sweep, np.full(len(skin), _nearest(log, track, frames.of(0)))])
+        moment = _nearest(log, track, frames.of(0))
+        points, taken_us = np.concatenate([points, skin]), np.concatenate([taken_us, np.full(len(skin), moment)])
     times = sorted({v.time_us for v in frames.training() if trajectory.covers(v.time_us)})
     poses = dict(zip(times, trajectory.at_each(torch.tensor(times, dtype=torch.int64)), strict=True))
-    seen = colours(log, frames, points, sweep, [], lambda view: poses.get(view.time_us))
+    seen = colours(log, frames, points, taken_us, [], lambda view: poses.get(view.time_us))
     rgb = merged_colours(seen, gains)
     known = np.isfinite(rgb[:, 0])
     if not known.any():
@@ -187,15 +189,22 @@ def _actor(
     return splats_from(cloud, sides, sh_count, 0.15)
 
 
+def _began(sweeps: Sequence[Sweep], index: np.ndarray) -> np.ndarray:
+    """When the sweeps with indices `[N]` were taken, int64 us `[N]`: frames of cameras have other numbers, and others each."""
+    times = np.zeros(max((s.index for s in sweeps), default=0) + 1, dtype=np.int64)
+    times[[s.index for s in sweeps]] = [s.time_us for s in sweeps]
+    return times[index]
+
+
 def _nearest(log: Log, track: Track, views: list[View]) -> int:
-    """Index of the view during which a box is nearest to the body, of those in whose time there is one; the first where there is none."""
+    """Time of the view during which a box is nearest to the body, of those in whose time there is one; the first where there is none."""
     trajectory = track.trajectory()
     there = [v for v in views if trajectory.covers(v.time_us)]
     if not there:
-        return views[0].index if views else 0
+        return views[0].time_us if views else 0
     times = torch.tensor([v.time_us for v in there])
     apart = (trajectory.at_each(times) - log.ego.at_each(times))[:, :3, 3].norm(dim=1)
-    return there[int(apart.argmin())].index
+    return there[int(apart.argmin())].time_us
 
 
 def box_skin(size: np.ndarray, step: float) -> np.ndarray:

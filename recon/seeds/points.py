@@ -40,19 +40,20 @@ class Cloud:
         return Cloud(np.concatenate([nothing, *(c.xyz for c in clouds)]), np.concatenate([nothing, *(c.rgb for c in clouds)]))
 
 
-def colours(log: Log, frames: Frames, points: np.ndarray, sweep: np.ndarray, movers: list[Track], local_pose=None) -> np.ndarray:
-    """Colours `[C, N, 3]` of points as each camera's training frame nearest to the point's sweep shows them; NaN where it does not.
+def colours(log: Log, frames: Frames, points: np.ndarray, taken_us: np.ndarray, movers: list[Track], local_pose=None) -> np.ndarray:
+    """Colours `[C, N, 3]` of points as each camera's training frame shows them that is nearest to when their sweeps were taken, int64 us
+    `[N]`; NaN where it does not.
 
     `local_pose(view)` gives world_from_local of points that move; the world otherwise. Points behind the boxes of `movers` are not
     seen: the lidar stands higher than the cameras and looks over cars that hide the road from them.
     """
     out = np.full((len(frames.names), len(points), 3), np.nan, dtype=np.float32)
+    moments, of_moment = np.unique(taken_us, return_inverse=True)  # sweeps are few and points many
     for c, name in enumerate(frames.names):
         camera, views = log.camera(name), frames.of(c)
-        places = np.array([v.index for v in views])
-        # sweeps are few and points many: each sweep is asked once, and the points are sorted by the view that shows them
-        of_sweep = np.abs(np.arange(sweep.max(initial=0) + 1)[:, None] - places[None]).argmin(1).astype(np.int32)
-        nearest = of_sweep[sweep]
+        times = np.array([v.time_us for v in views])
+        # the points are sorted by the view that shows them
+        nearest = np.abs(moments[:, None] - times[None]).argmin(1).astype(np.int32)[of_moment]
         order = np.argsort(nearest, kind="stable")
         begins = np.searchsorted(nearest[order], np.arange(len(views) + 1))
         for view, mine in zip(views, np.split(order, begins[1:-1]), strict=True):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -18,9 +20,24 @@ def test_points_take_the_colour_of_the_pixel_they_fall_on(drive):
     camera = log.camera("front_camera").camera(view.index)
     ray = camera.lens.unproject(torch.tensor([40.5, 30.5], dtype=torch.float64)) * 7
     point = (camera.world_from_cam[:3, :3] @ ray + camera.world_from_cam[:3, 3]).numpy()[None]
-    seen = colours(log, frames, np.concatenate([point, -100 * point]), np.full(2, view.index), [])
+    seen = colours(log, frames, np.concatenate([point, -100 * point]), np.full(2, view.time_us), [])
     np.testing.assert_allclose(seen[0, 0], view.image[30, 40].numpy() / 255, atol=1e-6)
     assert np.isnan(seen[0, 1]).all()
+
+
+def test_points_take_it_from_the_picture_of_their_time_whatever_its_number(drive):
+    """A camera that lacks half of its frames has other numbers than the sweeps."""
+    log = open_log(drive)
+    camera = log.camera("front_camera")
+    few = replace(camera, files=camera.files[::2], times_us=camera.times_us[::2], world_from_cam=camera.world_from_cam[::2])
+    frames = load_frames(replace(log, cameras={"front_camera": few}), ["front_camera"], ALL, (96, 54), 0)
+    view = frames.training()[-1]
+    eye = few.camera(view.index)
+    ray = eye.lens.unproject(torch.tensor([40.5, 30.5], dtype=torch.float64)) * 7
+    point = (eye.world_from_cam[:3, :3] @ ray + eye.world_from_cam[:3, 3]).numpy()[None]
+    taken = min(log.sweeps, key=lambda s: abs(s.time_us - view.time_us)).time_us
+    seen = colours(replace(log, cameras={"front_camera": few}), frames, point, np.array([taken]), [])
+    np.testing.assert_allclose(seen[0, 0], view.image[30, 40].numpy() / 255, atol=1e-6)
 
 
 def test_points_behind_a_mover_are_not_seen(drive):
@@ -32,7 +49,7 @@ def test_points_behind_a_mover_are_not_seen(drive):
     eye = log.camera("front_camera").world_from_cam[view.index, :3, 3].numpy()
     middle = pose + [0, 0, 0.7]
     behind, before = eye + 1.4 * (middle - eye), eye + 0.5 * (middle - eye)
-    seen = colours(log, frames, np.stack([behind, before]), np.full(2, view.index), [mover])
+    seen = colours(log, frames, np.stack([behind, before]), np.full(2, view.time_us), [mover])
     assert np.isnan(seen[0, 0]).all() and np.isfinite(seen[0, 1]).all()
     box = nearest_box(log.camera("front_camera").camera(view.index), [mover])
     assert np.isfinite(box).any() and not np.isfinite(box).all()
