@@ -94,7 +94,8 @@ def load_frames(
         for i, image in images.items():
             views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, coarse_sky(image, ego), ego))
         if not any(v.camera == c and not v.held_out for v in views):
-            raise ValueError(f"camera {name} has no frame to train on in the chosen span: {len(chosen)} of its {len(camera)} lie there")
+            there = f"{len(chosen)} of its {len(camera)} lie there" + (f", held out as one of every {held_out}" if chosen else "")
+            raise ValueError(f"camera {name} has no frame to train on in the chosen span: {there}; choose a longer one")
     views, under = under_their_sky(log, names, views)
     if log.points is not None:
         views = balanced(log, names, views)

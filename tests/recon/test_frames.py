@@ -3,6 +3,7 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -106,3 +107,10 @@ def test_a_camera_of_sixteen_bits_of_grey_is_seen_as_one_of_eight():
     Image.fromarray((eight * 257).astype(np.uint16)).save(buffer, "png")
     camera = replace(log.camera("front"), files=(Packed("grey", buffer.getvalue),) * 3)
     assert np.array_equal(camera.image(0), np.repeat(eight[..., None], 3, 2))
+
+
+def test_a_span_of_one_frame_that_is_held_out_is_refused_saying_so(drive):
+    log = open_log(drive)
+    time = int(log.camera("front_camera").times_us[0])
+    with pytest.raises(ValueError, match="1 of its 8 lie there, held out as one of every 8; choose a longer one"):
+        load_frames(log, ["front_camera"], (time, time), (96, 54), 8)
