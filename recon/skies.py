@@ -66,9 +66,11 @@ def like_sky(image: np.ndarray, sky: np.ndarray, reach: int = 40) -> np.ndarray:
 
 
 class SkyPicture:
-    """Running sums of sky colours by direction, in the reference exposure, on an equirectangular grid `[H, 2H]`."""
+    """Running sums of sky colours by direction, in the reference exposure, on an equirectangular grid `[H, 2H]`; `otherwise` `[3]` is that
+    of a sky of which nothing is seen."""
 
-    def __init__(self, height: int):
+    def __init__(self, height: int, otherwise: np.ndarray):
+        self.otherwise = otherwise
         self.sum = np.zeros((height, 2 * height, 3))
         self.count = np.zeros((height, 2 * height))
 
@@ -80,9 +82,9 @@ class SkyPicture:
 
     def picture(self) -> torch.Tensor:
         """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too
-        little; grey without any sample."""
+        little; all as `otherwise` without any sample."""
         if not self.count.any():
-            return torch.full((*self.count.shape, 3), 0.7)
+            return torch.from_numpy(np.broadcast_to(self.otherwise, self.sum.shape).copy()).float()
         out = np.full(self.sum.shape, np.nan)
         sigma = 0.0
         while np.isnan(out).any() and sigma < len(out):
@@ -144,7 +146,7 @@ def seen_sky(scene: Scene, hidden: torch.Tensor) -> Sky:
         place = _cells(camera, len(own))
         np.add.at(looks, place, 1)
         np.add.at(free, place, sky)
-    picture = SkyPicture(len(own))
+    picture = SkyPicture(len(own), np.median(own, axis=(0, 1)))  # where nothing shows it, the fit has left it as it began
     picture.count = np.where((free > FREE * looks) & ~finer(hidden, len(own)).cpu().numpy(), free, 0)
     picture.sum = own * picture.count[..., None]
     return Sky(linear_from_srgb(picture.picture().clamp_min(0)))

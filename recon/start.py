@@ -215,9 +215,16 @@ def box_skin(size: np.ndarray, step: float) -> np.ndarray:
     return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
 
 
+def _usual(frames: Frames, gains: np.ndarray) -> np.ndarray:
+    """The colour `[3]` that training pictures have in the median, in the reference exposure: what stands in for a sky that none of them
+    surely shows, at night or by a camera that looks down, is seen beyond their borders from aside, and must not shine there."""
+    some = [v.evenly()[::4, ::4].reshape(-1, 3) / gains[v.camera] for v in frames.training()]
+    return np.median(np.concatenate(some), axis=0)
+
+
 def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussians], tracks: list[Track], gains, sh_count, ground: Ground):
     """Background with splats added where views show neither splats nor sky, and the sky `[H, 2H, 3]`."""
-    picture = SkyPicture(SKY_HEIGHT)
+    picture = SkyPicture(SKY_HEIGHT, _usual(frames, gains))
     world = torch.eye(4, dtype=torch.float64)
     for c, name in enumerate(frames.names):
         views = frames.of(c)

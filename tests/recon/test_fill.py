@@ -9,6 +9,8 @@ from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sk
 from recon.view import View
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 
+GREY = np.full(3, 0.5)
+
 
 def house_under_sky():
     image = np.full((60, 80, 3), (140, 160, 200), np.uint8)
@@ -24,7 +26,7 @@ def camera():
 
 
 def test_a_sky_of_which_hardly_anything_was_seen_takes_that_everywhere():
-    sky = SkyPicture(64)
+    sky = SkyPicture(64, GREY)
     sky.count[20, 30], sky.sum[20, 30] = 1, (0.2, 0.4, 0.6)
     np.testing.assert_allclose(sky.picture(), np.broadcast_to(np.float32([0.2, 0.4, 0.6]), (64, 128, 3)), atol=1e-4)
 
@@ -56,13 +58,14 @@ def test_gaps_that_look_like_the_sky_beside_them_are_sky():
 
 
 def test_the_sky_picture_shows_what_was_seen_and_spreads_it():
-    sky = SkyPicture(32)
+    sky = SkyPicture(32, GREY)
     image = house_under_sky()
     sky.add(image / 255, sky_mask(image), camera(), np.array([0.5, 1.0, 1.0]))
     picture = sky.picture()
     assert picture.shape == (32, 64, 3) and torch.isfinite(picture).all()
     np.testing.assert_allclose(picture[0, 0], [140 / 255 / 0.5, 160 / 255, 200 / 255], atol=1e-3)
-    assert SkyPicture(8).picture().shape == (8, 16, 3)
+    dark = SkyPicture(8, np.array([0.1, 0.2, 0.3])).picture()
+    torch.testing.assert_close(dark, torch.tensor([0.1, 0.2, 0.3]).expand(8, 16, 3))
 
 
 def test_the_upper_part_of_a_house_stands_where_its_foot_stands():

@@ -279,6 +279,17 @@ def test_what_the_sky_stands_in_for_comes_back(drive):
     fit.step()
 
 
+def test_at_night_a_sky_that_nothing_shows_does_not_shine(own_drive):
+    """From aside it is seen beyond the pictures' borders."""
+    for file in own_drive.glob("camera/*/*.jpg"):
+        Image.fromarray((np.asarray(Image.open(file)) * 0.1).astype(np.uint8)).save(file, quality=95)
+    log = open_log(own_drive)
+    names, span = choose(log)
+    start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    assert max(float(v.image.float().mean()) for v in fit.training) / 255 < 0.1
+    assert start.sky.max() < 0.15
+
+
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):
     log = open_log(drive)
     names, span = choose(log)
