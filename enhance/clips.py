@@ -5,15 +5,17 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
 from enhance.shards import to_bytes
+from recon.album import at_once
 from recon.egomask import at_size
 from recon.log import LogCamera
 from render import render_frame
 from render.frame_types import Frame
+from render.video import from_bytes
 from render.warp import visible
+from scenes.camera import Camera
 from scenes.scene import Scene
 
 SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
@@ -58,7 +60,7 @@ class Clip:
         # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
         times = [scene_time(scene, camera.name, int(camera.times_us[i])) for i in self.indices]
         self.cameras = [scene.camera(camera.name, t).resized(config.width, height) for t in times]
-        self.photos = torch.stack([torch.from_numpy(np.array(camera.image(i, config.width, height))) for i in self.indices])
+        self.photos = torch.stack([self._photo(camera, i, there) for i, there in zip(self.indices, self.cameras, strict=True)])
         if camera.ego_mask is not None and camera.ego_mask.any():
             self._leave_out(at_size(camera.ego_mask, height, config.width))
         # Seeded by name: a clip is the same whichever others are made beside it.
@@ -67,6 +69,12 @@ class Clip:
         times = [c.time_us for c in self.cameras]
         self.meta = {"camera": camera.name, "start": start, "times_us": times, "seed": seed} | meta
         self._geometry: dict[str, torch.Tensor] | None = None
+
+    def _photo(self, camera: LogCamera, index: int, there: Camera) -> torch.Tensor:
+        """A photo as if its rows had been read at once, as the scene's cameras do: else nothing that moves in the picture would lie where
+        renders have it."""
+        photo = from_bytes(camera.image(index, there.width, there.height))
+        return to_bytes(at_once(self.scene, there, camera, photo))
 
     def _leave_out(self, ego: torch.Tensor) -> None:
         """What the scene shows where the photos show the recording car itself, bool `[H, W]`."""

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from enhance.clips import scene_time
+from recon.album import at_once
 from recon.align import as_aligned
 from recon.build import assemble, begin, choose
 from recon.fit.config import FitConfig
@@ -25,7 +26,7 @@ from recon.log import Log, LogCamera, Track
 from render import render_frame
 from render.progress import Progress
 from render.references import References, Shot
-from render.video import write_image
+from render.video import from_bytes, to_bytes, write_image
 from scenes.files import load, save
 from scenes.scene import Scene
 from scenes.usd_scene import is_scene
@@ -98,12 +99,22 @@ def exposed_as(scene: Scene, config: FitConfig) -> FitConfig:
 
 
 def shots_of(log: Log, scene: Scene) -> list[Shot]:
-    """The pictures of a recording that `as_reconstructed` brought to the poses of a `scene`, with that scene's exposures."""
+    """The pictures of a recording that `as_reconstructed` brought to the poses of a `scene`, with that scene's exposures, as if their rows
+    had been read at once, by that scene's depth."""
     return [
-        Shot(replace(camera.camera(i), exposure=scene.rig_camera(name).exposure_at(int(t))), partial(camera.image, i), camera.ego_mask)
+        Shot(
+            replace(camera.camera(i), exposure=scene.rig_camera(name).exposure_at(int(t))),
+            partial(_read, scene, camera, i),
+            camera.ego_mask,
+        )
         for name, camera in log.cameras.items()
         for i, t in enumerate(camera.times_us)
     ]
+
+
+def _read(scene: Scene, camera: LogCamera, index: int, width: int, height: int) -> np.ndarray:
+    photo = from_bytes(camera.image(index, width, height))
+    return to_bytes(at_once(scene, camera.camera(index, width, height), camera, photo))
 
 
 def as_reconstructed(log: Log, scene: Scene) -> Log:
@@ -174,7 +185,8 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
             lens = camera.lens.scaled(size[0] / camera.width, size[1] / camera.height)
             poses = torch.stack([v.world_from_cam for v in views])
             own = replace(camera, lens=lens, width=size[0], height=size[1], files=files, world_from_cam=poses)
-            cameras[name] = replace(own, ego_mask=np.zeros((1, 1), bool))
+            # renders take all rows at once, and show nothing of the car
+            cameras[name] = replace(own, shutter="global", readout_us=0, ego_mask=np.zeros((1, 1), bool))
     return replace(log, ego=ego, cameras=cameras)
 
 

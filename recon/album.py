@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from recon.fit.shutter import readout_shift
 from recon.frames import Frames
+from recon.log import LogCamera
 from recon.report import readout_ends
 from render import render_frame
 from render.album import keep_photos
@@ -51,7 +52,7 @@ def without_ego(scene: Scene, camera: Camera, photo: torch.Tensor, ego: torch.Te
 
 
 @torch.no_grad()
-def at_once(scene: Scene, camera: Camera, rig: RigCamera, photo: torch.Tensor) -> torch.Tensor:
+def at_once(scene: Scene, camera: Camera, rig: RigCamera | LogCamera, photo: torch.Tensor) -> torch.Tensor:
     """A photo `[H, W, 3]` whose rows `rig`'s shutter read one after the other, as `camera` takes it at one go: each pixel looks where the
     surface that it shows was when its row was read. As it is where the shutter is global."""
     if not rig.readout_us:

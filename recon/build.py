@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from recon.adjust import adjusted
 from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
@@ -104,7 +105,7 @@ def reconstruct(
     checkpoint = checkpoint_path(output)
     saved = load_checkpoint(checkpoint, options) if resume else None
 
-    log = readied(log, fitted(log, held_out).sweeps_within(span), config)
+    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size)
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])
@@ -163,11 +164,16 @@ def fitted(log: Log, held_out: int) -> Log:
     return replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
 
 
-def readied(log: Log, sweeps: Sequence[Sweep], config: FitConfig) -> Log:
-    """The log with its path corrected where `sweeps` do not meet by it, and the movers that they show where it has no boxes."""
-    if "path" in config.refine:
+def readied(
+    log: Log, sweeps: Sequence[Sweep], config: FitConfig, names: Sequence[str], span: tuple[int, int], size: tuple[int, int]
+) -> Log:
+    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and the movers that sweeps show
+    where it has no boxes."""
+    if "path" in config.refine and sweeps:
         with Progress("sweeps") as steps:
             log = aligned(log, sweeps, steps.step)
+    elif "path" in config.refine and log.points is None:  # else the poses come from the pictures
+        log = adjusted(log, names[0], span, size)
     places = {s.index for s in sweeps}
     return annotated(log, [s for s in log.sweeps if s.index in places])
 

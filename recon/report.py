@@ -8,6 +8,7 @@ import torch
 
 from recon.fit.shutter import as_read
 from recon.frames import Frames
+from recon.log import LogCamera
 from recon.view import View
 from render import render_frame
 from render.compare import psnr, ssim
@@ -67,7 +68,7 @@ def read_out(scene: Scene, camera: Camera, rig: RigCamera) -> Scene:
     return replace(scene, background=background, actors=tuple(actors))
 
 
-def readout_ends(scene: Scene, camera: Camera, rig: RigCamera) -> tuple[tuple[int, int], tuple[torch.Tensor, torch.Tensor]]:
+def readout_ends(scene: Scene, camera: Camera, rig: RigCamera | LogCamera) -> tuple[tuple[int, int], tuple[torch.Tensor, torch.Tensor]]:
     """When the first and the last row (column) are read if the middle one is at `camera`'s moment, and cam_from_world `[4, 4]` then."""
     first, last = (camera.time_us + sign * rig.readout_us // 2 for sign in (-1, 1))
     mount = inverse(scene.ego.at(camera.time_us)) @ camera.world_from_cam

@@ -156,41 +156,93 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     return count
 
 
-def triangulate(
-    workspace: Path, lenses: dict[str, tuple[str, tuple[float, ...]]], poses: dict[str, np.ndarray], pairs: list[tuple[str, str]]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Points `[N, 3]` that the pictures in `workspace`/images show at their poses, and by name which of them each shows.
+@dataclass(frozen=True)
+class Posed:
+    """Pictures of known poses, in `workspace`/images. lenses: by folder of pictures COLMAP's name of their lens model, and its parameters;
+    poses: by a picture's name, as camera/000001.png, `cam_from_world` float64 `[4, 4]`; pairs: of pictures that show the same."""
 
-    lenses: by folder of pictures COLMAP's name of their lens model, and its parameters; poses: by a picture's name, as camera/000001.png,
-    `cam_from_world` float64 `[4, 4]`. SIFT features, matched between `pairs`, and triangulated with the poses held (Schönberger and Frahm
-    2016), all on the CPU.
+    workspace: Path
+    lenses: dict[str, tuple[str, tuple[float, ...]]]
+    poses: dict[str, np.ndarray]
+    pairs: list[tuple[str, str]]
+
+
+def triangulate(posed: Posed) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Points `[N, 3]` that pictures show at their poses, and by name which of them each shows.
+
+    SIFT features, matched between pairs, and triangulated with the poses held (Schönberger and Frahm 2016), all on the CPU.
     """
     colmap = pycolmap()
-    database, images = workspace / "database.db", workspace / "images"
-    cpu, extraction = colmap.Device.cpu, colmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = FEATURES
     with Progress("points from pictures") as steps:
-        for folder, (lens, params) in lenses.items():
-            steps.step(note=f"features of {folder}")
-            names = [name for name in poses if name.startswith(f"{folder}/")]
-            reader = colmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
-            colmap.extract_features(
-                database, images, names, colmap.CameraMode.SINGLE, reader_options=reader,
-                extraction_options=extraction, device=cpu,
-            )  # fmt: skip
-        steps.step(note="matches")
-        listed = workspace / "pairs.txt"
-        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
-        colmap.match_image_pairs(database, pairing_options=colmap.ImportedPairingOptions(match_list_path=str(listed)), device=cpu)
+        _follow(colmap, posed, steps)
         steps.step(note="depths")
-        found = _at_poses(colmap, database, poses)
-        if len(found.images) > 1:
-            (workspace / "found").mkdir()
-            found = colmap.triangulate_points(found, database, images, workspace / "found")
+        found = _at_poses(colmap, posed.workspace, posed.poses)
     place = {key: i for i, key in enumerate(sorted(found.points3D))}
     xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
-    nothing = dict.fromkeys(poses, np.zeros(0, np.int64))
+    nothing = dict.fromkeys(posed.poses, np.zeros(0, np.int64))
     return xyz, nothing | {image.name: _shown(image, place) for image in found.images.values()}
+
+
+def adjust(posed: Posed, spread: float) -> tuple[dict[str, np.ndarray], float, float]:
+    """Poses by which pictures meet in the points that they show, by name; how far off these points are seen by the poses given, and by
+    those, in the mean in pixels.
+
+    Bundle adjustment (Triggs et al. 2000) with a robust loss, points and poses free, from and about the poses given, whose places are
+    likely to be off by `spread` metres. Pictures that match no other are left out. spread holds the world: of its turn, which on a
+    straight path places do not tell, the turn by which poses differ in the mean is taken out.
+    """
+    colmap = pycolmap()
+    with Progress("poses from pictures") as steps:
+        _follow(colmap, posed, steps)
+        steps.step(note="poses")
+        found = _at_poses(colmap, posed.workspace, posed.poses)
+        before = found.compute_mean_reprojection_error()
+        options, config, priors = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig(), []
+        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+        options.refine_sensor_from_rig = options.print_summary = False
+        options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+        for image in found.images.values():
+            config.add_image(image.image_id)
+            place = np.linalg.inv(posed.poses[image.name])[:3, 3]
+            prior = colmap.PosePrior(position=place, position_covariance=np.eye(3) * spread**2)
+            prior.corr_data_id, prior.coordinate_system = image.data_id, colmap.PosePriorCoordinateSystem.CARTESIAN
+            priors.append(prior)
+        if len(priors) > 2:
+            told = colmap.PosePriorBundleAdjustmentOptions()
+            colmap.create_pose_prior_bundle_adjuster(options, told, config, priors, found).solve()
+        found.update_point_3d_errors()
+    after = {image.name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in found.images.values()}
+    return _unturned(after, posed.poses), before, found.compute_mean_reprojection_error()
+
+
+def _unturned(poses: dict[str, np.ndarray], as_given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Poses `cam_from_world`, turned and moved as a whole to lie as those given do in the mean."""
+    if not poses:
+        return poses
+    new, old = (np.linalg.inv(np.stack([of[name] for name in poses])) for of in (poses, as_given))
+    u, _, v = np.linalg.svd((old[:, :3, :3] @ new[:, :3, :3].transpose(0, 2, 1)).sum(0))
+    back = np.eye(4)
+    back[:3, :3] = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    back[:3, 3] = old[:, :3, 3].mean(0) - back[:3, :3] @ new[:, :3, 3].mean(0)
+    return dict(zip(poses, np.linalg.inv(back @ new), strict=True))
+
+
+def _follow(colmap, posed: Posed, steps: Progress) -> None:
+    """Find the pictures' features and match them; `workspace`/database.db holds both."""
+    database, cpu, extraction = posed.workspace / "database.db", colmap.Device.cpu, colmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = FEATURES
+    for folder, (lens, params) in posed.lenses.items():
+        steps.step(note=f"features of {folder}")
+        names = [name for name in posed.poses if name.startswith(f"{folder}/")]
+        reader = colmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
+        colmap.extract_features(
+            database, posed.workspace / "images", names, colmap.CameraMode.SINGLE, reader_options=reader,
+            extraction_options=extraction, device=cpu,
+        )  # fmt: skip
+    steps.step(note="matches")
+    listed = posed.workspace / "pairs.txt"
+    listed.write_text("".join(f"{a} {b}\n" for a, b in posed.pairs))
+    colmap.match_image_pairs(database, pairing_options=colmap.ImportedPairingOptions(match_list_path=str(listed)), device=cpu)
 
 
 def _match_following(colmap, database: Path, names: list[str]) -> None:
@@ -208,14 +260,17 @@ def _match_following(colmap, database: Path, names: list[str]) -> None:
     rename({number: name for name, number in in_order.items()})
 
 
-def _at_poses(colmap, database: Path, poses: dict[str, np.ndarray]):
-    """COLMAP's reconstruction of those of the database's pictures that match any other, at their poses, without points."""
-    found = colmap.Reconstruction()
+def _at_poses(colmap, workspace: Path, poses: dict[str, np.ndarray]):
+    """COLMAP's reconstruction of those of the database's pictures that match any other, at their poses, and of what they show."""
+    found, database = colmap.Reconstruction(), workspace / "database.db"
     with colmap.Database.open(database) as opened:
         found.load(colmap.DatabaseCache.create(opened, colmap.DatabaseCacheOptions()))
     for image in found.images.values():
         image.frame.set_cam_from_world(image.camera_id, colmap.Rigid3d(poses[image.name][:3]))
         found.register_frame(image.frame_id)
+    if len(found.images) > 1:
+        (workspace / "found").mkdir()
+        found = colmap.triangulate_points(found, database, workspace / "images", workspace / "found")
     return found
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from recon.frames import Frames
 from recon.log import Log, SparsePoints
 from recon.readers.colmap import colmap_lens
-from recon.readers.sfm import triangulate
+from recon.readers.sfm import Posed, triangulate
 from recon.view import View
 from scenes.poses import inverse
 
@@ -40,7 +40,7 @@ def triangulated(log: Log, frames: Frames) -> SparsePoints:
             lenses[file.parent.name] = colmap_lens(camera.lens, log.path)
             poses[name] = inverse(camera.world_from_cam).numpy()
         pairs = [(names[i], names[j]) for i, j in matched(views)]
-        xyz, shown = triangulate(Path(folder), lenses, poses, pairs)
+        xyz, shown = triangulate(Posed(Path(folder), lenses, poses, pairs))
     seen = {camera: [np.zeros(0, np.int64)] * len(log.camera(camera)) for camera in frames.names}
     for view, name in zip(views, names, strict=True):
         seen[frames.names[view.camera]][view.index] = shown[name]

@@ -168,7 +168,7 @@ def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: dict[st
 def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float, Log]:
     """The fitted scene, the frames, the log's cameras, CPU seconds of the fit, and the log by its corrected path."""
     _, span = choose(log, names)
-    log = readied(log, log.sweeps_within(span), config)
+    log = readied(log, log.sweeps_within(span), config, names, span, size)
     start, fit = begin(log, names, span, size, config)
     began = time.process_time()
     while fit.step_count < config.steps:

@@ -9,16 +9,18 @@ import torch
 from PIL import Image
 from street import car
 
-from enhance.clips import PairConfig
+from enhance.clips import Clip, PairConfig
 from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
 from enhance.pairs import held_out_camera, kinds_for, make_pairs, prepare_sources
 from enhance.photo_pairs import make_photo_pairs
-from enhance.refits import REFITS, Refit, shots_of
+from enhance.refits import REFITS, Refit, as_reconstructed, shots_of
 from enhance.shards import KINDS, PairSet
 from recon.assets.extract import FEWEST_SPLATS, Candidate
+from recon.log import LogCamera
 from render import render_frame
+from render.compare import psnr
 from render.references import References
 from render.video import write_image
 from scenes.databank import Databank
@@ -160,6 +162,26 @@ def test_the_front_camera_is_held_out_whatever_it_is_called_where_there_are_othe
     both = replace(street, rig={"CAM_LEFT": rig["left_camera"], "CAM_FRONT": rig["front_camera"]})
     assert held_out_camera(both, renamed) == "CAM_FRONT" and held_out_camera(street, recording) == "front_camera"
     assert held_out_camera(replace(both, rig={"CAM_FRONT": rig["front_camera"]}), renamed) is None
+
+
+def test_photos_whose_rows_were_read_one_by_one_lie_where_renders_do(street, recording, tmp_path):
+    """Of them clips and references are made; the scene's cameras take all rows at once."""
+    name, readout = "left_camera", 60_000
+    rig = replace(street.rig[name], shutter="rows", readout_us=readout)
+    scene = replace(street, rig={name: street.rig[name]})
+    times = scene.frame_times(name)[2:5]
+    files = [tmp_path / f"{i}.png" for i in range(3)]
+    for file, t in zip(files, times.tolist(), strict=True):
+        write_image(file, render_frame(scene, rig.along(scene.ego, t - readout // 2)).rgb)
+    poses = torch.stack([scene.camera(name, int(t)).world_from_cam for t in times])
+    camera = LogCamera(name, rig.lens, rig.width, rig.height, tuple(files), times, poses, "rows", readout)
+    log = replace(recording, cameras={name: camera})
+    clip = Clip(scene, camera, 0, PairConfig(width=rig.width, frames=3), 0, {})
+    shots = shots_of(as_reconstructed(log, scene), scene)
+    for i, t in enumerate(times.tolist()):
+        instant, read = render_frame(scene, scene.camera(name, t)).rgb, torch.from_numpy(camera.image(i).copy()).float() / 255
+        shot = torch.from_numpy(shots[i].read(rig.width, rig.height)).float() / 255
+        assert psnr(clip.photo(i), instant) > psnr(read, instant) + 3 and psnr(shot, instant) > psnr(read, instant) + 3
 
 
 def test_the_recording_car_is_no_target(street, recording, tmp_path):

@@ -59,8 +59,10 @@ def test_a_refit_gives_frames_exposures_of_their_own_where_its_scene_does(street
 
 
 def test_the_cycles_pictures_are_taken_from_beside_the_path(log, street, tmp_path):
-    aside = rendered_aside(street, as_reconstructed(log, street), tmp_path, 1.5, SIZE)
+    rolling = {name: replace(camera, shutter="rows", readout_us=30_000) for name, camera in log.cameras.items()}
+    aside = rendered_aside(street, as_reconstructed(replace(log, cameras=rolling), street), tmp_path, 1.5, SIZE)
     for name, camera in aside.cameras.items():
+        assert (camera.shutter, camera.readout_us) == ("global", 0)  # as renders are
         there = street.camera(name, int(camera.times_us[2]))
         body = street.ego.at(int(camera.times_us[2]))
         moved = inverse(body)[:3, :3] @ (camera.world_from_cam[2] - there.world_from_cam)[:3, 3]

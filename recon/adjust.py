@@ -1,0 +1,65 @@
+"""A posed drive without lidar whose pictures do not meet by its recorded poses: the path is bent until they do.
+
+Poses by GPS jitter by centimetres from picture to picture (KITTI), which is pixels of what is near, and splats of such pictures are
+blurred. Features are followed through the pictures of one camera, and poses and points are found together (bundle adjustment); far apart,
+where pictures share nothing, the recorded places hold.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from recon.align import MOVED, as_aligned
+from recon.log import Log
+from recon.readers.colmap import colmap_lens
+from recon.readers.sfm import Posed, adjust
+from scenes.poses import inverse
+
+AHEAD = (1, 2, 4, 8)
+"""By how many pictures those that are matched follow each other."""
+
+SPREAD = 0.1
+"""Metres by which recorded places are likely to be off."""
+
+WORTH = 0.8
+"""Part of what points were seen off by the recorded poses that may be left for corrections to be made."""
+
+FEWEST = 8
+"""Pictures that are corrected."""
+
+
+def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int]) -> Log:
+    """The log with its body's path and cameras moved to where the pictures of the camera `name` in a span meet; as it is where they do
+    already, and where there are too few. size: width and height at which they are looked at.
+
+    All pictures of the span count, also those that a fit holds out, as where structure from motion has found the poses. Corrections are
+    interpolated between them. ValueError for a lens that COLMAP has not.
+    """
+    camera = log.camera(name)
+    chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
+    if len(chosen) < FEWEST:
+        return log
+    names = [f"{name}/{i:06d}.png" for i in chosen]
+    given = inverse(camera.world_from_cam[chosen]).numpy()
+    pairs = [(names[k], names[k + ahead]) for ahead in AHEAD for k in range(len(names) - ahead)]
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "images", name).mkdir(parents=True)
+        for i, file in zip(chosen, names, strict=True):
+            Image.fromarray(camera.image(i, *size)).save(Path(folder, "images", file), compress_level=1)
+        lens = colmap_lens(camera.camera(chosen[0], *size).lens, log.path)
+        found, before, after = adjust(Posed(Path(folder), {name: lens}, dict(zip(names, given, strict=True)), pairs), SPREAD)
+    known = [k for k, file in enumerate(names) if file in found]
+    if len(known) < FEWEST or after > WORTH * before:
+        return log
+    moves = np.linalg.inv(np.stack([found[names[k]] for k in known])) @ given[known]
+    print(f"{log.path}: its pictures meet within {before:.2f} pixels by its recorded poses, and {after:.2f} corrected", file=sys.stderr)
+    path = {"times_us": camera.times_us[[chosen[k] for k in known]].tolist(), "poses": torch.from_numpy(moves).flatten(1).tolist()}
+    log = replace(log, meta={**log.meta, MOVED: path})
+    return as_aligned(log, log.meta)

@@ -1,0 +1,52 @@
+"""Poses by which pictures meet, where there is no lidar."""
+
+import numpy as np
+import pytest
+import torch
+from painted import SIZE, drive
+
+from recon.adjust import adjusted
+from recon.align import MOVED, about, as_aligned, moved
+from scenes.poses import inverse
+from scenes.trajectory import Trajectory
+
+pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+ALL = (0, 10**18)
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return drive([0.0] + [0.6] * 11)
+
+
+@pytest.fixture(scope="module")
+def jittered(bare):
+    """By 3 cm and a tenth of a degree from picture to picture, as GPS does."""
+    deltas = np.random.default_rng(0).normal(0, [2e-3] * 3 + [0.03] * 3, (len(bare.ego), 6))
+    return moved(bare, Trajectory(bare.ego.times_us, about(bare.ego.world_from_body[:, :3, 3].numpy(), deltas)))
+
+
+def steps_off(log, truth) -> tuple[float, float]:
+    """Metres and degrees, in the mean, by which a camera's steps differ from those of another log."""
+    a, b = (inverse(p[:-1]) @ p[1:] for p in (next(iter(of.cameras.values())).world_from_cam for of in (log, truth)))
+    off = inverse(a) @ b
+    angle = torch.acos(((off.diagonal(dim1=1, dim2=2)[:, :3].sum(1) - 1) / 2).clamp(-1, 1))
+    return float(off[:, :3, 3].norm(dim=1).mean()), float(torch.rad2deg(angle).mean())
+
+
+def test_poses_that_jitter_are_put_where_pictures_meet(bare, jittered, capsys):
+    name = next(iter(bare.cameras))
+    better = adjusted(jittered, name, ALL, SIZE)
+    assert "its pictures meet within" in capsys.readouterr().err
+    (far, turned), (nearer, less) = steps_off(jittered, bare), steps_off(better, bare)
+    assert nearer < 0.2 * far and less < 0.2 * turned
+    there, was = (log.ego.world_from_body[:, :3, 3] for log in (better, jittered))
+    assert (there - was).mean(0).norm() < 0.01, "the world stays where it is"
+    again = as_aligned(jittered, {MOVED: better.meta[MOVED]})
+    assert torch.equal(again.ego.world_from_body, better.ego.world_from_body)
+
+
+def test_poses_by_which_pictures_meet_stay_as_they_are(bare, jittered):
+    name = next(iter(bare.cameras))
+    assert adjusted(bare, name, ALL, SIZE) is bare
+    assert adjusted(jittered, name, (0, 600_000), SIZE) is jittered, "too few to tell"
