@@ -15,7 +15,6 @@ from render import render_frame
 from render.frame_types import Frame
 from render.video import from_bytes
 from render.warp import visible
-from scenes.camera import Camera
 from scenes.scene import Scene
 
 SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
@@ -54,13 +53,14 @@ class Clip:
     def __init__(
         self, scene: Scene, camera: LogCamera, start: int, config: PairConfig, seed: int, meta: dict, device: torch.device | str = "cpu"
     ):
-        self.scene, self.start, self.device = scene, start, device
+        self.scene, self.recorded, self.start, self.device = scene, camera, start, device
         height = round(config.width * camera.height / camera.width)
         self.indices = range(start, min(start + config.frames, len(camera)))
         # The scene's own camera, not the recording's: reconstruction corrects poses, and only its poses match its splats.
         times = [scene_time(scene, camera.name, int(camera.times_us[i])) for i in self.indices]
         self.cameras = [scene.camera(camera.name, t).resized(config.width, height) for t in times]
-        self.photos = torch.stack([self._photo(camera, i, there) for i, there in zip(self.indices, self.cameras, strict=True)])
+        pictures = [from_bytes(camera.image(i, config.width, height)) for i in self.indices]
+        self.photos = torch.stack([to_bytes(self.at_once(picture, t)) for t, picture in enumerate(pictures)])
         if camera.ego_mask is not None and camera.ego_mask.any():
             self._leave_out(at_size(camera.ego_mask, height, config.width))
         # Seeded by name: a clip is the same whichever others are made beside it.
@@ -70,11 +70,10 @@ class Clip:
         self.meta = {"camera": camera.name, "start": start, "times_us": times, "seed": seed} | meta
         self._geometry: dict[str, torch.Tensor] | None = None
 
-    def _photo(self, camera: LogCamera, index: int, there: Camera) -> torch.Tensor:
-        """A photo as if its rows had been read at once, as the scene's cameras do: else nothing that moves in the picture would lie where
-        renders have it."""
-        photo = from_bytes(camera.image(index, there.width, there.height))
-        return to_bytes(at_once(self.scene, there, camera, photo))
+    def at_once(self, picture: torch.Tensor, t: int) -> torch.Tensor:
+        """A picture `[H, W, 3]` as the recording's camera took frame `t`, as if its rows had been read at once, as the scene's cameras do:
+        else nothing that moves in it would lie where renders have it."""
+        return at_once(self.scene, self.cameras[t], self.recorded, picture)
 
     def _leave_out(self, ego: torch.Tensor) -> None:
         """What the scene shows where the photos show the recording car itself, bool `[H, W]`."""

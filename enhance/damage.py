@@ -152,9 +152,9 @@ def _relit(clip: Clip, rng: np.random.Generator, relit: Relit, region: torch.Ten
     if not lights:
         raise ValueError(f"{relit.folder} has no photos of {clip.label} under another sky; run make_pairs, which says what is to be done")
     light = lights[int(rng.integers(len(lights)))]
-    seen = relit.read(light, clip.label, count, (width, height))
-    photos = clip.photos.float() / 255
-    damaged = torch.lerp(photos, seen.float() / 255, region[..., None])
+    pictures = relit.read(light, clip.label, count, (width, height)).float() / 255
+    seen = torch.stack([clip.at_once(picture, t) for t, picture in enumerate(pictures)])
+    damaged = torch.lerp(clip.photos.float() / 255, seen, region[..., None])
     return Damage(to_bytes(damaged), clip.photos, region, {"instances": chosen, "light": light})
 
 
