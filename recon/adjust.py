@@ -31,13 +31,16 @@ SPREAD = 0.1
 WORTH = 0.8
 """Part of what points were seen off by the recorded poses that may be left for corrections to be made."""
 
+FARTHEST = 1.0
+"""Metres that a camera is moved at most: pictures of what moves, and little else, may meet anywhere."""
+
 FEWEST = 8
 """Pictures that are corrected."""
 
 
 def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int]) -> Log:
     """The log with its body's path and cameras moved to where the pictures of the camera `name` in a span meet; as it is where they do
-    already, and where there are too few. size: width and height at which they are looked at.
+    already, and where too few show the same. size: width and height at which they are looked at.
 
     All pictures of the span count, also those that a fit holds out, as where structure from motion has found the poses. Corrections are
     interpolated between them. ValueError for a lens that COLMAP has not.
@@ -58,7 +61,10 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
     known = [k for k, file in enumerate(names) if file in found]
     if len(known) < FEWEST or after > WORTH * before:
         return log
-    moves = np.linalg.inv(np.stack([found[names[k]] for k in known])) @ given[known]
+    better = np.linalg.inv(np.stack([found[names[k]] for k in known]))
+    moves = better @ given[known]
+    if np.linalg.norm(better[:, :3, 3] - np.linalg.inv(given[known])[:, :3, 3], axis=1).max() > FARTHEST:
+        return log
     print(f"{log.path}: its pictures meet within {before:.2f} pixels by its recorded poses, and {after:.2f} corrected", file=sys.stderr)
     path = {"times_us": camera.times_us[[chosen[k] for k in known]].tolist(), "poses": torch.from_numpy(moves).flatten(1).tolist()}
     log = replace(log, meta={**log.meta, MOVED: path})
