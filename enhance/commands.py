@@ -27,7 +27,7 @@ class Pairs:
     """Which damage, of sparse, cycle, crossref, underfit, isp (on instances, and as isp_frame on whole frames), relight, shadow, reinsert,
     clean; the reconstructions from less that the first four take are fitted once, some minutes each."""
     cameras: Names = None
-    """Cameras to use; the front camera's pairs are never trained on."""
+    """Cameras to use; the front camera's pairs are never trained on, where there are others."""
     skies: tuple[Path, ...] = ()
     """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
     relit: Annotated[Path | None, arg(metavar="FOLDER")] = None
