@@ -18,6 +18,7 @@ from render.rays import camera_rays
 from scenes.camera import Camera, RigCamera
 from scenes.poses import inverse
 from scenes.scene import Scene
+from scenes.trajectory import Trajectory
 
 FAR = 1000.0
 """Metres at which the sky is taken to be."""
@@ -60,24 +61,28 @@ def at_once(scene: Scene, camera: Camera, rig: RigCamera | LogCamera, photo: tor
     (first, last), backs = readout_ends(scene, camera, rig)
     frame = render_frame(scene, camera, ("depth", "instance"))
     assert frame.depth is not None and frame.instance is not None
-    depth, instance = frame.depth.cpu(), frame.instance.cpu()
+    depth, instance = frame.depth.cpu().flatten(), frame.instance.cpu().flatten()
     sky = depth.isinf() | (instance < 0)
-    rays = camera_rays(camera)
-    points = rays * torch.where(sky, FAR, depth)[..., None]
-    moved = points.clone()
-    instance = torch.where(sky, 0, instance)
-    seen = set(instance.unique().tolist())
-    for p in (p for p in scene.placed(camera.time_us) if p.instance in seen):
-        mine = instance == p.instance
-        still = p.world_from_local
-        path = scene.actors[p.instance - 1].trajectory if p.instance else None
+    points = camera_rays(camera).reshape(-1, 3) * torch.where(sky, FAR, depth)[:, None]
+
+    def as_seen(some: torch.Tensor, still: torch.Tensor, path: Trajectory | None) -> torch.Tensor:
+        """Points of one instance where they were when their row was read."""
         poses = [still if path is None else path.near(t) for t in (first, last)]
         local = inverse(camera.world_from_cam) @ still
         back = inverse(local).float()
-        at = points[mine] @ back[:3, :3].T + back[:3, 3]
+        at = some @ back[:3, :3].T + back[:3, 3]
         at = at + readout_shift(at, backs[0] @ poses[0], backs[1] @ poses[1], camera, rig.shutter)
-        moved[mine] = at @ local[:3, :3].T.float() + local[:3, 3].float()
-    grid = camera.lens.project(moved) / torch.tensor([camera.width, camera.height]) * 2 - 1
+        return at @ local[:3, :3].T.float() + local[:3, 3].float()
+
+    background, *actors = scene.placed(camera.time_us)
+    moved = as_seen(points, background.world_from_local, None)
+    seen = (instance > 0).nonzero()[:, 0]  # actors are few pixels, of which each is asked once
+    seen = seen[instance[seen].argsort()]
+    ids, counts = instance[seen].unique_consecutive(return_counts=True)
+    there = {p.instance: p.world_from_local for p in actors}
+    for id, mine in zip(ids.tolist(), seen.split(counts.tolist()), strict=True):
+        moved[mine] = as_seen(points[mine], there[id], scene.actors[id - 1].trajectory)
+    grid = camera.lens.project(moved.view(camera.height, camera.width, 3)) / torch.tensor([camera.width, camera.height]) * 2 - 1
     grid = torch.nan_to_num(grid, nan=-1.0)[None].float()
     whole = F.grid_sample(photo.permute(2, 0, 1)[None], grid, mode="bicubic", padding_mode="border", align_corners=False)
     return whole[0].permute(1, 2, 0).clamp(0, 1)
