@@ -95,7 +95,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
         keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
         for track, smooth in retimed:
             at = stamps[track.name].get(sweep.time_us)
-            if at is None and not _between(track, sweep.time_us):
+            if at is None and not _placed(track, sweep.time_us):
                 continue
             path = track.trajectory()
             which = near.of(track, path.near(sweep.time_us), REACH)
@@ -142,10 +142,15 @@ def _own(local: np.ndarray, track: Track) -> np.ndarray:
     return inside(local, track.size, MARGIN, below=-0.08)
 
 
-def _between(track: Track, time_us: int) -> bool:
-    """Whether a track's boxes shortly before and after a moment tell where it is then."""
-    later = int(np.searchsorted(track.times_us, time_us))
-    return 0 < later < len(track.times_us) and track.times_us[later] - track.times_us[later - 1] <= APART_US
+def _placed(track: Track, time_us: int) -> bool:
+    """Whether a track's boxes shortly before and after a moment tell where it is then; also half a step beyond its ends, where it is drawn:
+    a car that is annotated every half second drives on in five sweeps after its last box."""
+    times = track.times_us
+    if len(times) < 2:
+        return False
+    later = int(np.searchsorted(times, time_us).clip(1, len(times) - 1))
+    step = int(times[later] - times[later - 1])
+    return step <= APART_US and times[0] - step // 2 <= time_us <= times[-1] + step // 2
 
 
 def _retimed(track: Track, scanned: np.ndarray, usual: float) -> tuple[Track, np.ndarray]:

@@ -8,7 +8,7 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import Split, _between, inside, split_points
+from recon.actors import Split, _placed, inside, split_points
 from recon.log import LidarPoints, Log, Sweep, Track
 from scenes.poses import translation, yaw
 from scenes.trajectory import Trajectory
@@ -88,8 +88,23 @@ def test_boxes_far_apart_in_time_tell_nothing_between_them(split):
     ends = [0, len(mover.times_us) - 1]
     rare = replace(mover, times_us=mover.times_us[ends] * [1, 2], world_from_box=mover.world_from_box[ends], sensor=mover.sensor[ends])
     moment = int(mover.times_us[1]) + 50_000
-    assert _between(mover, moment) and not _between(rare, moment)
-    assert not _between(mover, int(mover.times_us[0]) - 1) and not _between(mover, int(mover.times_us[-1]) + 1)
+    assert _placed(mover, moment) and not _placed(rare, moment)
+    first, last = mover.trajectory().span_us()
+    assert _placed(mover, first) and not _placed(mover, first - 1) and not _placed(mover, last + 1)
+    assert not _placed(rare, int(rare.times_us[0]))
+
+
+def test_a_mover_drives_on_beyond_its_ends_as_far_as_it_is_drawn(split):
+    """Of nuScenes' sweeps one in ten is annotated: those shortly before and after its boxes would leave it on the road, standing."""
+    log, whole = split
+    mover = next(t for t in log.tracks if t.moving)
+    kept = [2, 5]
+    few = replace(mover, times_us=mover.times_us[kept], world_from_box=mover.world_from_box[kept], sensor=mover.sensor[kept])
+    found = split_points(log, list(log.sweeps), [few])
+    for k in (1, 6):
+        same, wanted = (s.actors[mover.name][0][s.actors[mover.name][1] == k] for s in (found, whole))
+        assert len(same) == len(wanted) and np.abs(same.max(0) - wanted.max(0)).max() < 0.05
+        assert (found.static_sweep == k).sum() == (whole.static_sweep == k).sum()
 
 
 def test_what_moves_is_where_it_is_at_a_moment():
