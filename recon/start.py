@@ -84,6 +84,7 @@ def prepare(
     told = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
+    taken = _began(sweeps, split.static_sweep)
     report("colouring points")
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
@@ -94,7 +95,7 @@ def prepare(
         beyond = Cloud.cat([])
     else:
         ground = estimate_ground(split.static, log.ego)
-        seen = colours(log, frames, split.static, _began(sweeps, split.static_sweep), list(split.tracks))
+        seen = colours(log, frames, split.static, taken, list(split.tracks))
         gains = first_exposures(seen) if told is None else told
         rgb = merged_colours(seen, gains)
         known = np.isfinite(rgb[:, 0])
@@ -124,7 +125,7 @@ def prepare(
             reaches.append(torch.full((len(made),), spanned(rig.values()) * near))
 
     standing = [t for t in log.tracks if not t.moving]
-    swept = Swept.by([*split.tracks, *standing], span_us, ground, split.static, split.static_sweep)
+    swept = Swept.by([*split.tracks, *standing], span_us, ground, split.static, taken)
 
     report("filling what lidar missed")
     filled, sky = _fill(log, frames, background, groups, tracks, gains, sh_count, ground)

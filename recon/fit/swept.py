@@ -27,6 +27,9 @@ STOOD = 8
 """Sweeps, of twice as many in a row, whose points in a column say that something stood there at another time: a car that waited before it
 was found, or after it was lost. What only passes is seen there in fewer."""
 
+SWEEP_US = 75_000
+"""What begins within so much time is one sweep: of nuScenes' 20 a second, or of two lidars, what passes is seen in twice as many."""
+
 LAYERS = 2**20
 """Voxels along each axis that keys tell apart: 200 km."""
 
@@ -41,15 +44,15 @@ class Swept:
     keys: torch.Tensor
 
     @staticmethod
-    def by(tracks: Sequence[Track], span_us: tuple[int, int], ground: Ground, static: np.ndarray, sweep: np.ndarray) -> Swept:
+    def by(tracks: Sequence[Track], span_us: tuple[int, int], ground: Ground, static: np.ndarray, taken_us: np.ndarray) -> Swept:
         """What the boxes of moving `tracks` passed through within a span of time, but where those of the others stand, and where lidar's
-        `static` points `[N, 3]`, of sweeps `[N]`, show that something stood."""
+        `static` points `[N, 3]`, of sweeps at these times int64 us `[N]`, show that something stood."""
         swept = _union(_voxels(_poses(t, span_us), t.size, -CLOSE, ABOVE) for t in tracks if t.moving)
         middles = (_cells(swept) + 0.5) * CELL
         swept = swept[middles[:, 2] > ground.height(torch.from_numpy(middles[:, :2])).numpy() + ABOVE]
         standing = _union(_voxels(t.world_from_box.numpy(), t.size, CLOSE, -CLOSE) for t in tracks if not t.moving)
         swept = np.setdiff1d(swept, standing, assume_unique=True)
-        return Swept(torch.from_numpy(swept[~np.isin(swept // LAYERS, _stood(swept, static, sweep))]))
+        return Swept(torch.from_numpy(swept[~np.isin(swept // LAYERS, _stood(swept, static, _numbered(taken_us)))]))
 
     def to(self, device: torch.device | str) -> Swept:
         """The same on a device."""
@@ -124,6 +127,15 @@ def _voxels(poses: np.ndarray, size: np.ndarray, more: float, above: float) -> n
     lowest, longer = np.divmod(_union(runs), 2)
     layers = np.arange(fewest + 2)
     return np.unique((lowest[:, None] + layers)[layers <= fewest + longer[:, None]])
+
+
+def _numbered(taken_us: np.ndarray) -> np.ndarray:
+    """Numbers `[N]`, rising with time, of the sweeps at these times, of which those within `SWEEP_US` are one."""
+    began: list[int] = []
+    for time in np.unique(taken_us).tolist():
+        if not began or time - began[-1] >= SWEEP_US:
+            began.append(time)
+    return np.searchsorted(began, taken_us, side="right")
 
 
 def _stood(swept: np.ndarray, static: np.ndarray, sweep: np.ndarray) -> np.ndarray:

@@ -113,13 +113,17 @@ def test_what_lidar_saw_standing_there_at_another_time_stays():
     track = car([0, 700_000], (-10.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     side = np.array([[x, -0.7, 0.9] for x in np.arange(-1.5, 1.5, 0.05)])
 
-    def seen(sweeps):
-        return np.tile(side, (sweeps, 1)), np.repeat(np.arange(sweeps), len(side))
+    def seen(sweeps, every_us=100_000):
+        return np.tile(side, (sweeps, 1)), np.repeat(np.arange(sweeps) * every_us, len(side))
 
     asked = [(0, -0.7, 0.6), (0, -0.7, 1.2), (0, -0.7 + CELL, 1), (0, 0.5, 1), (-8, -0.7, 1)]
     assert held([track], *asked, static=seen(STOOD)) == [False, False, False, True, True]
     assert held([track], *asked, static=seen(STOOD - 1)) == [True] * 5, "something passed"
-    points, sweeps = seen(3 * STOOD)
-    assert held([track], *asked, static=(points, 3 * sweeps)) == [True] * 5, "now and then"
-    road = np.tile([[0.0, 0.0, 0.05]], (50, 1)), np.arange(50)
+    assert held([track], *asked, static=seen(2 * STOOD - 2, 50_000)) == [True] * 5, "as fast before a lidar that turns faster"
+    assert held([track], *asked, static=seen(2 * STOOD, 50_000)) == [False, False, False, True, True]
+    points, times = seen(3 * STOOD)
+    elsewhere = np.full((9 * STOOD, 3), 99.0), np.arange(9 * STOOD) * 100_000
+    now_and_then = np.concatenate([points, elsewhere[0]]), np.concatenate([3 * times, elsewhere[1]])
+    assert held([track], *asked, static=now_and_then) == [True] * 5
+    road = np.tile([[0.0, 0.0, 0.05]], (50, 1)), np.arange(50) * 100_000
     assert held([track], (0, 0, 1), static=road) == [True]
