@@ -33,6 +33,7 @@ from scenes.usd_scene import is_scene
 
 REFITS = ("sparse", "cycle", "crossref")
 NEVER = 2.0
+TENTH_US = 100_000
 SHORT = FitConfig(steps=1500, budget=80_000, poses_from=NEVER)
 SIZE = (480, 270)
 
@@ -42,7 +43,7 @@ class Less:
     """How much less is fitted, and how."""
 
     every: int = 5
-    """Of sparse: every how many frames one is kept; cars drive some 3 metres meanwhile."""
+    """Of sparse: every how many tenths of a second a frame is kept, or frames of a slower camera; cars drive some 3 metres meanwhile."""
     aside: float = 1.5
     """Of cycle: metres to the left of the recorded path from which its pictures are rendered."""
     fit: FitConfig = SHORT
@@ -150,8 +151,9 @@ def _parts(kind: str, scene: Scene, log: Log, folder: Path, less: Less, size: tu
 
 
 def thinned(camera: LogCamera, every: int) -> LogCamera:
-    """Every `every`th frame of a camera."""
-    kept = slice(None, None, every)
+    """Every `every`th frame of a camera, where it takes no more than ten a second; as rarely of a faster one."""
+    step = float(camera.times_us.diff().double().median()) if len(camera) > 1 else TENTH_US
+    kept = slice(None, None, every * max(1, round(TENTH_US / step)))
     return replace(camera, files=camera.files[kept], times_us=camera.times_us[kept], world_from_cam=camera.world_from_cam[kept])
 
 

@@ -28,6 +28,9 @@ def test_every_fifth_frame_is_kept_with_its_moment(log):
     camera = log.camera("front_camera")
     few = thinned(camera, 5)
     assert len(few) == 2 and few.times_us.tolist() == camera.times_us[::5].tolist() and few.files == camera.files[::5]
+    fast, slow = (replace(camera, times_us=camera.times_us[0] + step * torch.arange(len(camera))) for step in (33_333, 500_000))
+    assert thinned(fast, 2).files == camera.files[::6], "as far apart on the way"
+    assert thinned(slow, 2).files == camera.files[::2]
 
 
 def test_neighbouring_cameras_fall_into_different_halves(log):
