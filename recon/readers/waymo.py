@@ -3,7 +3,8 @@
 `waymo/training/<segment>`: the folder that has camera_image/, camera_calibration/, vehicle_pose/, and lidar/, lidar_calibration/,
 lidar_pose/, lidar_box/ where lidar and boxes are wanted, then the segment's name, a parquet file in each of them. The body is the
 vehicle frame; cameras look along their own x, with y left and z up, through OpenCV's lens. Lidar comes as range images: of the top lidar
-with a pose a pixel, since it turns while the car drives.
+with a pose a pixel, since it turns while the car drives. A frame's stamp is that of its first lidar column, and its pose that of its front
+picture, some 50 ms later (waymo-open-dataset, issues 464 and 541).
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], 
 IMAGE = "[CameraImageComponent].image"
 WHEN = "key.frame_timestamp_micros"
 BODY = "[VehiclePoseComponent].world_from_vehicle.transform"
+STAMP, POSE = "[CameraImageComponent].pose_timestamp", "[CameraImageComponent].pose.transform"
+READ = tuple(f"[CameraImageComponent].rolling_shutter_params.{k}" for k in ("shutter", "camera_trigger_time", "camera_readout_done_time"))
+TAKEN = ("key.camera_name", WHEN, STAMP, POSE, *READ)
 RANGES, PIXELS = "[LiDARComponent].range_image_return1", "[LiDARPoseComponent].range_image_return1"
 SWEPT = {
     "lidar": ("key.laser_name", f"{RANGES}.values", f"{RANGES}.shape"),
@@ -40,6 +44,15 @@ SHUTTERS = {1: ("rows", 1), 2: ("columns", 1), 3: ("rows", -1), 4: ("columns", -
 """How an image is read out and which way, by the data set's number of the direction; others take all at once."""
 LENS = tuple(f"[CameraCalibrationComponent].intrinsic.{k}" for k in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"))
 BOX = tuple(f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading"))
+
+SAME = 1e-6
+"""Metres, and sines, by which two poses may differ that are one."""
+
+AROUND_US, STEP_US = (-50_000, 150_000), 5_000
+"""The time around a frame's stamp in which its lidar column by column took its points, and by which steps the car's path is looked at."""
+
+DRIVING = 1.0
+"""Metres a second from which on the path tells when a column was taken; a standing car's columns count as taken at the frame's pose."""
 
 
 def is_waymo(path: Path) -> bool:
@@ -61,15 +74,18 @@ def read_waymo(path: Path) -> Log:
     bodies = torch.stack([_matrix(table[BODY][i], component("vehicle_pose")) for i in order])
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())
-    ego = lengthened(times, home @ bodies)
-    cameras = _cameras(component, home, ego)
+    taken = read_table(component("camera_image"), TAKEN, others=False)  # without the pictures themselves
+    moments = _moments(times, bodies, taken)
+    ego = lengthened(moments, home @ bodies)
+    cameras = _cameras(component, home, ego, taken)
     meta: dict = {
         "name": f"waymo-{segment}", "source": f"Waymo Open Dataset segment {segment}", "licence": "Waymo Dataset License Agreement",
         "attribution": "Waymo Open Dataset by Waymo", "body": "vehicle frame, x forward, y left, z up", "world_origin": origin.tolist(),
     }  # fmt: skip
+    late = dict(zip(times.tolist(), moments.tolist(), strict=True))
     parts = {kind: Rows(component(kind), WHEN, columns) for kind, columns in SWEPT.items()}
-    sweeps = tuple(Sweep(i, t, partial(_points, component, parts, t, home)) for i, t in enumerate(_swept(component)))
-    tracks = _tracks(component("lidar_box"), ego)
+    sweeps = tuple(Sweep(i, t, partial(_points, component, parts, t, late.get(t, t), home, ego)) for i, t in enumerate(_swept(component)))
+    tracks = _tracks(component("lidar_box"), ego, times, home @ bodies)
     front = tuple(n for n in FRONT if n in cameras)
     return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars=_mounts(component) if sweeps else {})
 
@@ -93,32 +109,40 @@ def _matrix(values, path: Path) -> torch.Tensor:
     return torch.from_numpy(flat.reshape(4, 4).copy())
 
 
-def _cameras(component, home: torch.Tensor, ego: Trajectory) -> dict[str, LogCamera]:
+def _moments(times: np.ndarray, bodies: torch.Tensor, taken: dict[str, np.ndarray]) -> np.ndarray:
+    """When the car stood at the frames' poses `[F, 4, 4]`, int64 us `[F]`: when the picture was taken that has the same pose, the front one
+    if several do; frames without one are as late after their stamps `[F]` as others are."""
+    late = np.full(len(times), np.nan)
+    for i in np.argsort(-taken["key.camera_name"], kind="stable"):
+        frame = int(np.searchsorted(times, taken[WHEN][i]).clip(max=len(times) - 1))
+        if np.abs(np.asarray(taken[POSE][i], np.float64).ravel() - bodies[frame].numpy().ravel()).max() < SAME:
+            late[frame] = taken[STAMP][i] * 1e6 - times[frame]
+    known = np.isfinite(late)
+    usual = np.median(late[known]) if known.any() else 0.0
+    return times + np.round(np.where(known, late, usual)).astype(np.int64)
+
+
+def _cameras(component, home: torch.Tensor, ego: Trajectory, taken: dict[str, np.ndarray]) -> dict[str, LogCamera]:
     where, mount = component("camera_calibration"), "[CameraCalibrationComponent].extrinsic.transform"
     width, height = (f"[CameraCalibrationComponent].{k}" for k in ("width", "height"))
     direction = "[CameraCalibrationComponent].rolling_shutter_direction"
     table = read_table(where, ("key.camera_name", mount, width, height, direction, *LENS))
     images = component("camera_image")
-    stamp, pose = "[CameraImageComponent].pose_timestamp", "[CameraImageComponent].pose.transform"
-    exposure, began, ended = (
-        f"[CameraImageComponent].rolling_shutter_params.{k}" for k in ("shutter", "camera_trigger_time", "camera_readout_done_time")
-    )
-    columns = ("key.camera_name", WHEN, stamp, pose, exposure, began, ended)
-    taken = read_table(images, columns, others=False)  # without the pictures themselves
+    exposure, began, ended = READ
     cameras = {}
     for row, number in enumerate(table["key.camera_name"].tolist()):
         mine = np.flatnonzero(taken["key.camera_name"] == number)
         mine = mine[np.argsort(taken[WHEN][mine])]
         if not len(mine):
             continue
-        stamps, middles = (np.round(t[mine] * 1e6).astype(np.int64) for t in (taken[stamp], (taken[began] + taken[ended]) / 2))
+        stamps, middles = (np.round(t[mine] * 1e6).astype(np.int64) for t in (taken[STAMP], (taken[began] + taken[ended]) / 2))
         shutter, way = SHUTTERS.get(int(table[direction][row]), ("global", 0))
         # a row is exposed for a while: from the middle of the first's exposure to that of the last's
         readout = way * round(float(np.median((taken[ended] - taken[began] - taken[exposure])[mine])) * 1e6)
         name = CAMERAS.get(int(number), f"camera_{number}")
         lens = OpenCV(*(float(table[k][row]) for k in LENS))
         body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
-        bodies = home @ torch.stack([_matrix(taken[pose][i], images) for i in mine])
+        bodies = home @ torch.stack([_matrix(taken[POSE][i], images) for i in mine])
         moved = inverse(ego.near_each(torch.from_numpy(stamps))) @ ego.near_each(torch.from_numpy(middles))
         poses = bodies @ moved @ body_from_cam
         files = tuple(Packed(f"{images}, {name} at {taken[WHEN][i]}", partial(read_cell, images, IMAGE, int(i))) for i in mine)
@@ -147,8 +171,20 @@ def _mounts(component) -> dict[int, np.ndarray]:
     return {int(laser): _matrix(m, component("lidar_calibration"))[:3, 3].numpy() for laser, m in pairs}
 
 
-def _points(component, parts: dict[str, Rows], stamp: int, home: torch.Tensor) -> LidarPoints:
-    """First returns of all lidars at a stamp, in the world."""
+def _passed(places: np.ndarray, ego: Trajectory, stamp: int, otherwise: int) -> np.ndarray:
+    """When the body passed by places `[N, 3]` of its path around a stamp, int64 us `[N]`; `otherwise` where it hardly moves."""
+    times = stamp + np.arange(*AROUND_US, STEP_US)
+    path = ego.near_each(torch.from_numpy(times))[:, :3, 3].numpy()
+    ahead = path[-1] - path[0]
+    length = float(np.linalg.norm(ahead))
+    if length < DRIVING * (times[-1] - times[0]) / 1e6:
+        return np.full(len(places), otherwise)
+    along = np.maximum.accumulate((path - path[0]) @ ahead / length)
+    return np.round(np.interp((places - path[0]) @ ahead / length, along, times - stamp)).astype(np.int64) + stamp
+
+
+def _points(component, parts: dict[str, Rows], stamp: int, moment: int, home: torch.Tensor, ego: Trajectory) -> LidarPoints:
+    """First returns of all lidars at a stamp, in the world; those without a pose a pixel count as taken at the `moment` of the frame's."""
     table, turning, vehicle = (parts[kind].read(stamp) for kind in SWEPT)
     body = _matrix(vehicle[BODY][0], component("vehicle_pose"))
     prefix = "[LiDARCalibrationComponent]."
@@ -156,7 +192,7 @@ def _points(component, parts: dict[str, Rows], stamp: int, home: torch.Tensor) -
         component("lidar_calibration"),
         ("key.laser_name", f"{prefix}extrinsic.transform", *(f"{prefix}beam_inclination.{k}" for k in ("min", "max"))),
     )
-    xyz, sensor = [], []
+    xyz, times, sensor = [], [], []
     for row, laser in enumerate(table["key.laser_name"].tolist()):
         at = int(np.flatnonzero(calibration["key.laser_name"] == laser)[0])
         image = _image(table[f"{RANGES}.values"][row], table[f"{RANGES}.shape"][row], component("lidar"))
@@ -170,12 +206,15 @@ def _points(component, parts: dict[str, Rows], stamp: int, home: torch.Tensor) -
             pixels = _image(turning[f"{PIXELS}.values"][own[0]], turning[f"{PIXELS}.shape"][own[0]], component("lidar_pose"))
             pixel = pixels[hit].astype(np.float64)
             placed = np.einsum("nij,nj->ni", _rotations(pixel[:, :3]), placed) + pixel[:, 3:]
+            times.append(_passed(pixel[:, 3:] + home[:3, 3].numpy(), ego, stamp, moment))
         else:
             placed = placed @ body[:3, :3].numpy().T + body[:3, 3].numpy()
+            times.append(np.full(len(placed), moment))
         xyz.append(placed + home[:3, 3].numpy())
         sensor.append(np.full(len(placed), laser))
-    points = np.concatenate(xyz) if xyz else np.zeros((0, 3))
-    return LidarPoints(points, np.full(len(points), stamp), np.concatenate(sensor) if sensor else np.zeros(0, np.int64))
+    if not xyz:
+        return LidarPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    return LidarPoints(np.concatenate(xyz), np.concatenate(times), np.concatenate(sensor))
 
 
 def _image(values, shape, path: Path) -> np.ndarray:
@@ -213,15 +252,18 @@ def _rotations(angles: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(r, -1) for r in rows], -2)
 
 
-def _tracks(path: Path, ego: Trajectory) -> tuple:
-    """Tracks of the boxes, which stand in the vehicle frame by their middles; signs are no objects that move."""
+def _tracks(path: Path, ego: Trajectory, stamps: np.ndarray, bodies: torch.Tensor) -> tuple:
+    """Tracks of the boxes, which stand in the vehicle frame by their middles; signs are no objects that move.
+
+    bodies: `world_from_body` `[F, 4, 4]` of the frames with these stamps `[F]`, whose boxes get their frame's stamp, as its sweep has."""
     if not path.is_file():
         return ()
     kind = "[LiDARBoxComponent].type"
     table = read_table(path, ("key.laser_object_id", WHEN, kind, *BOX))
     times = table[WHEN].astype(np.int64)
     rows = np.stack([table[k] for k in BOX], 1).astype(np.float64)
-    poses = ego.near_each(torch.from_numpy(times)) @ from_middles(upright(rows[:, :3], rows[:, 6]), rows[:, 5])
+    frames = torch.from_numpy(np.searchsorted(stamps, times).clip(max=len(stamps) - 1))
+    poses = bodies[frames] @ from_middles(upright(rows[:, :3], rows[:, 6]), rows[:, 5])
     found = []
     for name in dict.fromkeys(table["key.laser_object_id"].tolist()):
         mine = np.flatnonzero(table["key.laser_object_id"] == name)
