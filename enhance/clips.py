@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from enhance.shards import to_bytes
 from recon.album import at_once
 from recon.egomask import at_size
-from recon.log import LogCamera
+from recon.log import Log, LogCamera
 from render import render_frame
 from render.frame_types import Frame
 from render.video import from_bytes
@@ -39,6 +39,22 @@ def scene_time(scene: Scene, camera: str, time_us: int) -> int:
     known = scene.frame_times(camera)
     nearest = int(known[(known - time_us).abs().argmin()])
     return nearest if abs(nearest - time_us) <= CLOCKS_DIFFER else time_us
+
+
+def of_scene(log: Log, scene: Scene) -> Log:
+    """A recording with no other pictures of a scene's cameras than it was reconstructed from: it may be a part of the drive, and cameras
+    may have begun before its first one did."""
+
+    def known(camera: LogCamera) -> LogCamera:
+        times = scene.rig_camera(camera.name).times_us if camera.name in scene.rig else camera.times_us
+        apart = (camera.times_us[:, None] - times).abs()
+        kept = (apart.amin(1) <= CLOCKS_DIFFER).nonzero()[:, 0].tolist() if len(times) else []
+        if not kept:  # the scene does not say, or is another drive's
+            return camera
+        part = slice(kept[0], kept[-1] + 1)
+        return replace(camera, files=camera.files[part], times_us=camera.times_us[part], world_from_cam=camera.world_from_cam[part])
+
+    return replace(log, cameras={name: known(camera) for name, camera in log.cameras.items()})
 
 
 def clip_label(camera: str, start: int) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from enhance.clips import Clip, PairConfig, clip_label
+from enhance.clips import Clip, PairConfig, clip_label, of_scene
 from enhance.damage import Damage, Sources, make
 from enhance.diffusion_renderer import Relit
 from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed_as, refits, shots_of
@@ -63,7 +63,7 @@ def make_pairs(
     """
     config, sources = config or PairConfig(), sources or Sources()
     scene = open_reconstruction(scene_path)
-    log = log_path if isinstance(log_path, Log) else open_log(log_path)
+    log = of_scene(log_path if isinstance(log_path, Log) else open_log(log_path), scene)
     kinds = check_kinds(kinds)
     chosen, kept = check_cameras(scene, log, cameras), held_out_camera(scene, log)
     out = claim_pairs(out, scene, log, seed, config)
@@ -122,7 +122,7 @@ def prepare_sources(
     check_kinds(kinds or ())
     folder = Path(folder)
     names = [name for name in log.cameras if name in scene.rig]
-    log = with_ego_masks(log, names, PairConfig.width)
+    log = with_ego_masks(of_scene(log, scene), names, PairConfig.width)
     found = list(candidates(scene)) if kinds is None or {"shadow", "reinsert"} & set(kinds) else []
     kinds = kinds_for(scene, log, found, databank) if kinds is None else kinds
     bank = Databank(databank) if databank is not None else None

@@ -52,6 +52,20 @@ def test_every_clip_of_every_camera_has_every_kind_and_a_sheet(folder):
     assert all((folder / f"{kind}.png").stat().st_size > 1000 for kind in KINDS)
 
 
+def test_a_scene_of_a_part_of_a_drive_makes_pairs_of_that_part(street, recording, tmp_path):
+    """Cameras may begin before its first one, too."""
+    part = slice(2, 7)
+    rig = {name: replace(c, times_us=c.times_us[part]) for name, c in street.rig.items()}
+    scene = replace(
+        street, rig=rig, ego=replace(street.ego, times_us=street.ego.times_us[part], world_from_body=street.ego.world_from_body[part])
+    )
+    made = PairSet(make_pairs(scene, recording, tmp_path / "pairs", ("clean",), config=PairConfig(width=96, frames=3, every=2)))
+    for name, camera in scene.rig.items():
+        shown = {t for shard in made.of() if shard.meta["camera"] == name for t in shard.meta["times_us"]}
+        assert shown == set(camera.times_us.tolist())
+    assert prepare_sources(scene, recording, tmp_path, ("reinsert",)).shots, "at poses that the scene knows"
+
+
 def test_damage_falls_inside_the_region_only(folder):
     for shard in PairSet(folder).shards:
         w = shard.window()
