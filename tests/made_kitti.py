@@ -87,7 +87,10 @@ def write_kitti_raw(folder: Path, tape: Tape) -> Path:
 def _tracklet(label: str, size: np.ndarray, poses: list, tape: Tape) -> str:
     rows = []
     for t, pose in zip(STAMPS.tolist(), poses, strict=True):
-        local = inverse(tape.ego.at(t) @ BODY_FROM_LIDAR) @ pose
+        looked = float(t)
+        for _ in range(4):  # where the lidar was depends on when it looked there
+            local = inverse(tape.ego.near(round(looked)) @ BODY_FROM_LIDAR) @ pose
+            looked = t + STEP_US * float(torch.atan2(local[1, 3], local[0, 3])) / (2 * np.pi)
         x, y, z = local[:3, 3].tolist()
         rows.append(f"<item><tx>{x}</tx><ty>{y}</ty><tz>{z}</tz><rx>0</rx><ry>0</ry><rz>{float(yaw_of(local))}</rz><state>2</state></item>")
     length, width, height = size.tolist()

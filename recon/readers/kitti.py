@@ -246,12 +246,17 @@ def _mercator(packets: list[list[float]]) -> torch.Tensor:
     return out
 
 
+def _turn_us(stamps: np.ndarray) -> int:
+    """How long the lidar takes to turn once, by its stamps."""
+    return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000
+
+
 def _spinning(folder: Path, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[tuple[Sweep, ...], np.ndarray]:
     """The sweeps of a raw drive, some of which may be missing, and all their stamps, as far as the body's path is known."""
     if not folder.is_dir():
         return (), np.zeros(0, np.int64)
     times = _stamps(folder / "timestamps.txt")
-    turn = int(np.median(np.diff(times))) if len(times) > 1 else 100_000
+    turn = _turn_us(times)
     times = times[times <= int(ego.times_us[-1])]
     sweeps = tuple(
         Sweep(i, int(t), partial(_turn, file, int(t), turn, body_from_lidar, ego))
@@ -270,9 +275,14 @@ def _read_scan(file: Path) -> np.ndarray:
     return xyz[np.isfinite(xyz).all(1)]
 
 
+def _looked(places: np.ndarray, stamps: np.ndarray | int, turn: int) -> np.ndarray:
+    """When the lidar looked at places `[N, 3]` in its own frame, int64 us `[N]`, in turns of a length in us that look ahead at `stamps`."""
+    return stamps + np.round(np.arctan2(places[:, 1], places[:, 0]) / (2 * np.pi) * turn).astype(np.int64)
+
+
 def _turn(file: Path, stamp: int, turn: int, body_from_lidar: torch.Tensor, ego: Trajectory) -> LidarPoints:
     xyz = _read_scan(file)
-    times = stamp + np.round(np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) * turn).astype(np.int64)
+    times = _looked(xyz, stamp, turn)
     return LidarPoints(untwisted(xyz, times, body_from_lidar, ego), times, np.zeros(len(xyz), np.int64))
 
 
@@ -282,7 +292,8 @@ def _scan(file: Path, world_from_lidar: torch.Tensor, stamp: int) -> LidarPoints
 
 
 def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[Track, ...]:
-    """Tracks of tracklet_labels.xml: h, w, l, and from first_frame on base centres and rz in the lidar's frame."""
+    """Tracks of tracklet_labels.xml: h, w, l, and from first_frame on base centres and rz in the lidar's frame. They are drawn around
+    points as they came, so each stands before the lidar where that was when it looked there: beside the car 25 ms off the stamp."""
     if not path.is_file():
         return ()
     try:
@@ -296,7 +307,8 @@ def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego
             stamps = times[first : first + count]
             if count > 0:
                 placed = np.array(rows[:count])
-                poses = ego.near_each(torch.from_numpy(stamps)) @ body_from_lidar @ upright(placed[:, :3], placed[:, 3])
+                looked = torch.from_numpy(_looked(placed, stamps, _turn_us(times)))
+                poses = ego.near_each(looked) @ body_from_lidar @ upright(placed[:, :3], placed[:, 3])
                 label = slug(item.findtext("objectType", ""), LABELS)
                 found.append(Boxes(str(number), label, stamps, poses, np.tile(size, (count, 1))))
     except (ElementTree.ParseError, ValueError) as problem:
