@@ -114,7 +114,7 @@ def read_kitti_odometry(path: Path) -> Log:
         world = poses @ inverse(_beside(projection) @ cam_from_body)
         cameras[folder.name] = _camera(folder.name, projection, files, times, world)
     sweeps = tuple(
-        Sweep(i, int(t), partial(_scan, file, poses[i], int(t)))
+        Sweep(i, int(t), partial(_scan, file, poses[i], int(t), _turn_us(times)))
         for i, t in enumerate(times)
         if (file := path / "velodyne" / f"{i:06d}.bin").is_file()
     )
@@ -286,9 +286,11 @@ def _turn(file: Path, stamp: int, turn: int, body_from_lidar: torch.Tensor, ego:
     return LidarPoints(untwisted(xyz, times, body_from_lidar, ego), times, np.zeros(len(xyz), np.int64))
 
 
-def _scan(file: Path, world_from_lidar: torch.Tensor, stamp: int) -> LidarPoints:
-    xyz = _read_scan(file) @ world_from_lidar[:3, :3].numpy().T + world_from_lidar[:3, 3].numpy()
-    return LidarPoints(xyz, np.full(len(xyz), stamp), np.zeros(len(xyz), np.int64))
+def _scan(file: Path, world_from_lidar: torch.Tensor, stamp: int, turn: int) -> LidarPoints:
+    """An untwisted sweep: what drives was where it stands in it when the lidar looked there."""
+    local = _read_scan(file)
+    xyz = local @ world_from_lidar[:3, :3].numpy().T + world_from_lidar[:3, 3].numpy()
+    return LidarPoints(xyz, _looked(local, stamp, turn), np.zeros(len(xyz), np.int64))
 
 
 def _tracklets(path: Path, times: np.ndarray, body_from_lidar: torch.Tensor, ego: Trajectory) -> tuple[Track, ...]:

@@ -65,6 +65,9 @@ def test_a_sequence_reads_as_it_was_recorded(odometry, recorded):
     home = torch.linalg.inv(lead.world_from_cam[0]).numpy()
     ours = sweep.xyz @ home[:3, :3].T + home[:3, 3]
     assert abs(ours - (late.points @ away[:3, :3].T + away[:3, 3])).max() < 1e-3
+    back = torch.linalg.inv(log.ego.at(500_000)).numpy()
+    x, y = back[:2, :3] @ sweep.xyz.T + back[:2, 3:]
+    np.testing.assert_allclose(sweep.times_us, 500_000 + np.arctan2(y, x) / (2 * np.pi) * 100_000, atol=2)  # untwisted, not taken at once
 
 
 def test_a_spinning_lidars_points_stand_still_though_the_car_moves(raw, recorded):
