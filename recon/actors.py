@@ -23,6 +23,10 @@ FEW = 5
 REACH = 1.5
 """Metres that an object may be from where it is at a sweep's stamp when its points are taken."""
 
+ALIKE_US = 250_000
+"""Before and after a box, within which others of its track are scanned at nearly the same phase of a sweep: the lidar turns, and in a
+second a car may come from ahead to beside it."""
+
 APART_US = 750_000
 """Between a track's boxes at most, for it to be known between them: nuScenes annotates every half second."""
 
@@ -161,7 +165,7 @@ def _retimed(track: Track, scanned: np.ndarray, usual: float) -> tuple[Track, np
     places = np.arange(len(offset))
     offset = np.interp(places, places[known], offset[known]) if known.any() else np.full(len(offset), usual)
     # one odd median must not make a car jump: neighbours in time are scanned at nearly the same phase of the sweep
-    smooth = np.array([np.median(offset[max(0, i - 2) : i + 3]) for i in places])
+    smooth = np.array([np.median(offset[np.abs(track.times_us - time) <= ALIKE_US]) for time in track.times_us])
     times = np.round(track.times_us + smooth).astype(np.int64)
     rising = np.concatenate([[True], np.diff(times) > 1000])
     poses = track.world_from_box[torch.from_numpy(rising)]

@@ -8,7 +8,7 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import Split, _placed, inside, split_points
+from recon.actors import Split, _placed, _retimed, inside, split_points
 from recon.log import LidarPoints, Log, Sweep, Track
 from scenes.poses import translation, yaw
 from scenes.trajectory import Trajectory
@@ -105,6 +105,15 @@ def test_a_mover_drives_on_beyond_its_ends_as_far_as_it_is_drawn(split):
         same, wanted = (s.actors[mover.name][0][s.actors[mover.name][1] == k] for s in (found, whole))
         assert len(same) == len(wanted) and np.abs(same.max(0) - wanted.max(0)).max() < 0.05
         assert (found.static_sweep == k).sum() == (whole.static_sweep == k).sum()
+
+
+def test_a_date_is_smoothed_by_those_of_neighbours_in_time(split):
+    """Where boxes are half a second apart, the lidar comes by at another phase of its turn each time."""
+    mover = next(t for t in split[0].tracks if t.moving)
+    late = np.array([-10_000, -20_000, -45_000, -30_000, -40_000, -40_000, -40_000, -40_000])
+    often, rare = (replace(mover, times_us=step * np.arange(8)) for step in (100_000, 500_000))
+    assert (_retimed(rare, rare.times_us + late, 0.0)[1] == rare.times_us + late).all()
+    assert (_retimed(often, often.times_us + late, 0.0)[1] - often.times_us)[2] == -30_000
 
 
 def test_what_moves_is_where_it_is_at_a_moment():
