@@ -29,6 +29,8 @@ NAMES = {"front": "camera_front_wide_120fov", "right": "camera_cross_right_120fo
 LIDAR = "lidar_top_360fov"
 MAP = translation(310.0, -45.0, 2.0) @ yaw(0.7)
 READOUT_US = 20_000
+LOST: int | slice = 2
+"""Which of the lidar's turns."""
 SHUTTERS = {"front": ShutterType.ROLLING_TOP_TO_BOTTOM, "right": ShutterType.ROLLING_BOTTOM_TO_TOP}
 EGO = Image.fromarray(np.arange(54)[:, None].repeat(96, 1) >= 50)
 
@@ -95,7 +97,7 @@ def pinhole(lens, size: tuple[int, int], shutter: ShutterType) -> OpenCVPinholeC
 
 
 def write_ncore(folder: Path, tape: Tape, annotated: bool = True) -> Path:
-    """The tape, with what is known of its pictures or without; the lidar turns once before each stamp, and the third turn is lost."""
+    """The tape, with what is known of its pictures or without; the lidar turns once before each stamp, and one turn is lost."""
 
     def pictures(name: str):
         for t in STAMPS.tolist():
@@ -104,7 +106,7 @@ def write_ncore(folder: Path, tape: Tape, annotated: bool = True) -> Path:
             yield t - READOUT_US // 2, t + READOUT_US // 2, packed.getvalue()
 
     def turns():
-        for t in np.delete(STAMPS, 2).tolist():
+        for t in np.delete(STAMPS, LOST).tolist():
             taken = t - STEP_US // 3
             xyz = np.concatenate([tape.scan(taken), [[1.0, 0.0, 0.0]]])
             far = np.linalg.norm(xyz, axis=1)
@@ -112,7 +114,7 @@ def write_ncore(folder: Path, tape: Tape, annotated: bool = True) -> Path:
             yield t - STEP_US, t, (directions, np.full(len(far), taken), far)
 
     seen = []
-    for t in np.delete(STAMPS, 2).tolist():
+    for t in np.delete(STAMPS, LOST).tolist():
         for track, pose, size in (("mover", tape.mover(t), MOVER), ("parked", tape.parked(), PARKED)):
             seen.append(cuboid(track, "automobile", t, (inverse(tape.ego.at(t)) @ pose).numpy(), size))
     lens = tape.street.rig["front_camera"].lens

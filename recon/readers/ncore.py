@@ -62,7 +62,9 @@ def read_ncore(path: Path) -> Log:
     sensors = {name: loader.get_camera_sensor(name) for name in loader.camera_ids}
     lidars = {name: loader.get_lidar_sensor(name) for name in loader.lidar_ids}
     stamps = [np.asarray(s.frames_timestamps_us, dtype=np.int64).ravel() for s in (*lidars.values(), *sensors.values())]
-    times = np.unique(stamps[0])
+    # lidars may begin after cameras do, and turn more rarely than these take pictures
+    middles = [stamp.reshape(-1, 2).sum(1) // 2 for stamp in stamps[len(lidars) :]]
+    times = np.unique(np.concatenate([stamps[0], *middles]))
     bodies = _poses(loader, "rig", times, file)
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())

@@ -4,13 +4,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_tape import check, tape
+import torch
+from made_tape import STAMPS, check, tape
 
 from recon import open_log
 from recon.readers.ncore import lens_of
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
 
 pytest.importorskip("ncore", reason="needs nvidia-ncore, which Python 3.14 cannot install: pip install 'sidestep[ncore]'")
+import made_ncore  # noqa: E402
 from made_ncore import EGO, NAMES, READOUT_US, write_ncore  # noqa: E402
 
 
@@ -61,6 +63,17 @@ def test_a_sequence_need_not_have_masks_and_cuboids(tmp_path, recorded):
     log = open_log(write_ncore(tmp_path / "bare", recorded, annotated=False))
     assert not log.tracks and log.cameras[NAMES["front"]].ego_mask is None
     check(log, recorded, NAMES)
+
+
+def test_cameras_may_begin_before_the_lidar(tmp_path, recorded, monkeypatch):
+    """And the body's path is known at their pictures, not at the lidar's turns alone."""
+    monkeypatch.setattr(made_ncore, "LOST", slice(4))
+    log = open_log(write_ncore(tmp_path / "sequence", recorded))
+    assert len(log.sweeps) == 2
+    for name, camera in log.cameras.items():
+        assert len(camera) == len(STAMPS) and log.ego.covers_each(camera.times_us).all()
+        offsets = log.offsets(name)
+        torch.testing.assert_close(offsets, offsets[:1].expand(len(offsets), 4, 4), atol=1e-6, rtol=0)
 
 
 def test_without_the_package_the_fix_is_named(sequence, monkeypatch):
