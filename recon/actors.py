@@ -21,7 +21,7 @@ FEW = 5
 """Points by whose times a box is dated, at least."""
 
 REACH = 1.5
-"""Metres that an object may be from where it is at a sweep's stamp when its points are taken."""
+"""Metres that an object may be from where it is in the middle of a sweep when its points are taken."""
 
 ALIKE_US = 250_000
 """Before and after a box, within which others of its track are scanned at nearly the same phase of a sweep: the lidar turns, and in a
@@ -97,12 +97,14 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
     for sweep, (xyz, times) in zip(sweeps, points, strict=True):
         keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
+        # some stamp a sweep as it begins, others as it ends
+        middle = (int(times.min()) + int(times.max())) // 2 if len(times) else sweep.time_us
         for track, smooth in retimed:
             at = stamps[track.name].get(sweep.time_us)
-            if at is None and not _placed(track, sweep.time_us):
+            if at is None and not _placed(track, middle):
                 continue
             path = track.trajectory()
-            which = near.of(track, path.near(sweep.time_us), REACH)
+            which = near.of(track, path.near(middle), REACH)
             if not len(which):
                 continue
             taken, of = np.unique(times[which], return_inverse=True)

@@ -82,6 +82,17 @@ def test_boxes_of_moments_between_sweeps_find_their_points(split, street):
         assert len(same) == len(wanted) and np.abs(same.max(0) - wanted.max(0)).max() < 0.08
 
 
+def test_sweeps_may_be_stamped_when_they_end(split):
+    """NCore's are, and its boxes are of the moments at which the lidar passed over them: the last stamp is after the last box."""
+    log, whole = split
+    mover = next(t for t in log.tracks if t.moving)
+    dated = replace(mover, times_us=mover.times_us + SCANNED_US)
+    found = split_points(log, [replace(s, time_us=s.time_us + 50_000) for s in log.sweeps], [dated])
+    for k in (s.index for s in log.sweeps):
+        same, wanted = (s.actors[mover.name][0][s.actors[mover.name][1] == k] for s in (found, whole))
+        assert len(same) == len(wanted) and (found.static_sweep == k).sum() == (whole.static_sweep == k).sum()
+
+
 def test_boxes_far_apart_in_time_tell_nothing_between_them(split):
     log, _ = split
     mover = next(t for t in log.tracks if t.moving)
