@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from scipy import ndimage
 
 from render import render_frame
+from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb, srgb_from_linear
@@ -99,7 +100,7 @@ class SkyPicture:
 
 def _cells(camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Row and column `[H, W]` of the equirectangular grid `[height, 2 height]` that each pixel looks at."""
-    row, column = cells(camera.lens.unproject(camera.pixel_centres()) @ camera.world_from_cam[:3, :3].T, height)
+    row, column = cells(camera_rays(camera).double() @ camera.world_from_cam[:3, :3].T, height)
     return row.numpy(), column.numpy()
 
 

@@ -14,6 +14,7 @@ from recon.project import project
 from recon.seeds.dense import AGREE, OTHERS, Depths, believed, measured_by
 from recon.seeds.measured import Measured, grid_of
 from recon.seeds.points import Cloud
+from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
@@ -57,7 +58,7 @@ def _points(log: Log, frames: Frames, struck: Measured, grids: dict[tuple[int, i
     seen = {name: [np.zeros(0, np.int64)] * len(log.camera(name)) for name in frames.names}
     for (c, index), measured in struck.views.items():
         camera, there = grids[c, index], measured.isfinite()
-        rays = camera.lens.unproject(camera.pixel_centres())
+        rays = camera_rays(camera).double()
         local = (rays * (measured.double() / camera.lens.depth(rays))[..., None])[there]
         xyz.append((local @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]).numpy())
         seen[frames.names[c]][index] = np.arange(count, count + len(local))

@@ -17,7 +17,7 @@ from recon.project import project
 from recon.seeds.points import nearest_box
 from recon.seeds.stereo import WIDTH, Plate
 from recon.view import View
-from render.rays import world_directions
+from render.rays import camera_rays, world_directions
 from scenes.camera import Camera
 from scenes.poses import inverse
 
@@ -130,7 +130,7 @@ def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np
 def by_pictures(plate: Plate, depth: np.ndarray, camera: Camera) -> torch.Tensor:
     """A plate's depth `[h, w]`, NaN where it is not believed, on the grid of its `camera`."""
     grid = grid_of(camera)
-    rays = grid.lens.unproject(grid.pixel_centres()).numpy()
+    rays = camera_rays(grid).double().numpy()
     with np.errstate(invalid="ignore", divide="ignore"):
         at = rays[..., :2] / rays[..., 2:] * plate.focal + plate.centre
         # the plate's is z; the lens may mean the distance

@@ -15,6 +15,7 @@ from recon.log import Log, Track
 from recon.seeds.measured import Measured, as_known, grid_of, nearest_points
 from recon.seeds.points import Cloud, nearest_box, thin
 from recon.view import View
+from render.rays import camera_rays
 from scenes.camera import Camera
 
 POINTS = 300_000
@@ -43,7 +44,7 @@ def by_all_sweeps(log: Log, frames: Frames, split: Split, movers: list[Track]) -
     found = {}
     for view in frames.training():
         camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
-        local = camera.lens.unproject(camera.pixel_centres())
+        local = camera_rays(camera).double()
         rays = (local @ camera.world_from_cam[:3, :3].T).numpy()
         level = np.hypot(rays[..., 0], rays[..., 1])
         rise, away = rays[..., 2] / level, level / camera.lens.depth(local).numpy()  # metres over the ground in one of depth

@@ -13,7 +13,7 @@ from recon.actors import split_points
 from recon.frames import load_frames
 from recon.seeds.measured import grid_of
 from recon.seeds.standing import BESIDE, CLOSE, FURTHER, RISES, by_all_sweeps, upwards
-from scenes.lenses import Fisheye, Pinhole
+from scenes.lenses import Fisheye, OpenCV, Pinhole
 
 RISE = np.repeat(np.linspace(0.4, -0.2, 60)[:, None], 30, 1)  # 0.01 a row, the uppermost first
 
@@ -91,3 +91,17 @@ def test_other_sweeps_tell_how_far_a_wall_is_above_the_horizon():
     rows = known.any(1).nonzero()[:, 0]
     assert rows.max() < depth.shape[0] / 2 + 1, "below the horizon the sweep of the moment decides"
     assert torch.equal(measured.views[0, 1].isfinite(), measured.views[0, 1] > 0)
+
+
+def test_a_lens_is_undone_once_for_all_its_pictures(monkeypatch):
+    """Waymo's takes a second of iterations: picture by picture they took minutes of a short drive."""
+    log, asked = drive([0.0, 0.5, 0.5], ("front",)), []
+    camera = log.camera("front")
+    bent = replace(camera, lens=OpenCV(*camera.lens.params().tolist(), -0.031, 0.01))
+    log = replace(log, cameras={"front": bent})
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 0)
+    sweeps = [sweep_of(240_000, wall_points(12.0, -3, 3))]
+    undone = OpenCV.unproject
+    monkeypatch.setattr(OpenCV, "unproject", lambda lens, pixels: asked.append(len(pixels)) or undone(lens, pixels))
+    by_all_sweeps(log, frames, split_points(log, sweeps, []), [])
+    assert len(asked) == 1
