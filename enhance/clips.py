@@ -48,7 +48,8 @@ def of_scene(log: Log, scene: Scene) -> Log:
     def known(camera: LogCamera) -> LogCamera:
         times = scene.rig_camera(camera.name).times_us if camera.name in scene.rig else camera.times_us
         apart = (camera.times_us[:, None] - times).abs()
-        kept = (apart.amin(1) <= CLOCKS_DIFFER).nonzero()[:, 0].tolist() if len(times) else []
+        step = int(camera.times_us.diff().median()) if len(camera) > 1 else 2 * CLOCKS_DIFFER
+        kept = (apart.amin(1) <= min(CLOCKS_DIFFER, step // 2)).nonzero()[:, 0].tolist() if len(times) else []
         if not kept:  # the scene does not say, or is another drive's
             return camera
         part = slice(kept[0], kept[-1] + 1)

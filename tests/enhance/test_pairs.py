@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from street import car
 
-from enhance.clips import Clip, PairConfig
+from enhance.clips import Clip, PairConfig, of_scene
 from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
@@ -64,6 +64,14 @@ def test_a_scene_of_a_part_of_a_drive_makes_pairs_of_that_part(street, recording
         shown = {t for shard in made.of() if shard.meta["camera"] == name for t in shard.meta["times_us"]}
         assert shown == set(camera.times_us.tolist())
     assert prepare_sources(scene, recording, tmp_path, ("reinsert",)).shots, "at poses that the scene knows"
+
+
+def test_of_sixty_pictures_a_second_no_more_are_the_scenes_than_it_has(street, recording):
+    left = recording.camera("left_camera")
+    times = left.times_us[0] + 16_667 * torch.arange(len(left))
+    log = replace(recording, cameras={"left_camera": replace(left, times_us=times)})
+    scene = replace(street, rig={"left_camera": replace(street.rig["left_camera"], times_us=times[2:5] + 3000)})
+    assert torch.equal(of_scene(log, scene).camera("left_camera").times_us, times[2:5])
 
 
 def test_damage_falls_inside_the_region_only(folder):
