@@ -184,7 +184,7 @@ def test_a_full_disk_is_called_that(pairs, trained, monkeypatch):
     def full(path):
         yield Path("/dev/full")
 
-    monkeypatch.setattr(sys.modules["enhance.run"], "atomic_file", full)
+    monkeypatch.setattr(sys.modules["scenes.state"], "atomic_file", full)
     with pytest.raises(OSError, match="No space left"):
         train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
 
@@ -208,7 +208,7 @@ def test_a_disk_that_fills_while_it_is_written_to_is_called_that_and_the_file_na
         def flush(self):
             pass
 
-    monkeypatch.setattr(sys.modules["enhance.run"], "open", lambda *_: Filling(), raising=False)
+    monkeypatch.setattr(sys.modules["scenes.state"], "open", lambda *_: Filling(), raising=False)
     with pytest.raises(OSError, match="No space left") as full:
         train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
     assert full.value.errno == 28 and full.value.filename == str(trained / "checkpoint.pt")
