@@ -50,10 +50,8 @@ def of_scene(log: Log, scene: Scene) -> Log:
         apart = (camera.times_us[:, None] - times).abs()
         step = int(camera.times_us.diff().median()) if len(camera) > 1 else 2 * CLOCKS_DIFFER
         kept = (apart.amin(1) <= min(CLOCKS_DIFFER, step // 2)).nonzero()[:, 0].tolist() if len(times) else []
-        if not kept:  # the scene does not say, or is another drive's
-            return camera
-        part = slice(kept[0], kept[-1] + 1)
-        return replace(camera, files=camera.files[part], times_us=camera.times_us[part], world_from_cam=camera.world_from_cam[part])
+        # where none is kept the scene does not say, or is another drive's
+        return camera.part(slice(kept[0], kept[-1] + 1)) if kept else camera
 
     return replace(log, cameras={name: known(camera) for name, camera in log.cameras.items()})
 

@@ -75,18 +75,11 @@ def demonstrate(data: Path, folder: Path, weights: str = "builtin") -> None:
         return _noting(enhance(_noting(frames, shown, before)), shown, after)
 
     facts = {"scene": str(data / "drive002"), "enhanced": weights}
+    stages = {**stages, "enhance": noted}
     record(
-        scene,
-        CAMERA,
-        folder / "out.mp4",
-        shift=SHIFT,
-        times_us=times,
-        width=WIDTH,
-        height=HEIGHT,
-        stages={**stages, "enhance": noted},
-        needs=needs,
-        facts=facts,
-    )
+        scene, CAMERA, folder / "out.mp4", shift=SHIFT, times_us=times, width=WIDTH, height=HEIGHT,
+        stages=stages, needs=needs, facts=facts,
+    )  # fmt: skip
 
     rows = []
     for i in shown:

@@ -153,8 +153,7 @@ def _parts(kind: str, scene: Scene, log: Log, folder: Path, less: Less, size: tu
 def thinned(camera: LogCamera, every: int) -> LogCamera:
     """Every `every`th frame of a camera, where it takes no more than ten a second; as rarely of a faster one."""
     step = float(camera.times_us.diff().double().median()) if len(camera) > 1 else TENTH_US
-    kept = slice(None, None, every * max(1, round(TENTH_US / step)))
-    return replace(camera, files=camera.files[kept], times_us=camera.times_us[kept], world_from_cam=camera.world_from_cam[kept])
+    return camera.part(slice(None, None, every * max(1, round(TENTH_US / step))))
 
 
 def by_turns(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:

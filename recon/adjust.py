@@ -14,16 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
 from recon.align import MOVED, as_aligned
 from recon.log import Log
-from recon.readers.colmap import colmap_lens
-from recon.readers.sfm import Posed, adjust
+from recon.readers.sfm import adjust
+from recon.seeds.triangulate import AHEAD, picture_name, posed
 from scenes.poses import inverse
-
-AHEAD = (1, 2, 4, 8)
-"""By how many pictures those that are matched follow each other."""
 
 SPREAD = 0.1
 """Metres by which recorded places are likely to be off."""
@@ -49,15 +45,12 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
     chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
     if len(chosen) < FEWEST:
         return log
-    names = [f"{name}/{i:06d}.png" for i in chosen]
+    names = [picture_name(name, i) for i in chosen]
     given = inverse(camera.world_from_cam[chosen]).numpy()
     pairs = [(names[k], names[k + ahead]) for ahead in AHEAD for k in range(len(names) - ahead)]
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "images", name).mkdir(parents=True)
-        for i, file in zip(chosen, names, strict=True):
-            Image.fromarray(camera.image(i, *size)).save(Path(folder, "images", file), compress_level=1)
-        lens = colmap_lens(camera.camera(chosen[0], *size).lens, log.path)
-        found, before, after = adjust(Posed(Path(folder), {name: lens}, dict(zip(names, given, strict=True)), pairs), SPREAD)
+        pictures = ((name, i, camera.image(i, *size)) for i in chosen)
+        found, before, after = adjust(posed(Path(folder), log, pictures, pairs), SPREAD)
     known = [k for k, file in enumerate(names) if file in found]
     if len(known) < FEWEST or after > WORTH * before:
         return log

@@ -92,8 +92,7 @@ def reconstruct(
 
     The folder keeps the photos that were fitted to, too: the enhancer looks detail up there.
 
-    Raises ValueError for data and options that do not fit, FileExistsError where `check_free` does,
-    KeyboardInterrupt passed on.
+    Raises ValueError for data and options that do not fit, FileExistsError where `check_free` does, KeyboardInterrupt passed on.
     """
     output = check_free(output, resume, overwrite)
     began = time.monotonic()
@@ -138,7 +137,7 @@ def reconstruct(
         scene.meta["off_path"] = off_path_table(there, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     with atomic_folder(output, overwrite) as whole, Progress("photos", total=len(fit.frames.training())) as steps:
-        whole.rmdir()
+        whole.rmdir()  # saving makes it; what is added is whole before anybody sees it
         save(scene, whole, half=half)
         keep_album(there, fit.frames, start.rig, whole, steps.step)
     checkpoint.unlink(missing_ok=True)

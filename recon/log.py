@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -57,6 +57,10 @@ class LogCamera:
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def part(self, frames: slice) -> LogCamera:
+        """The camera with these of its frames only."""
+        return replace(self, files=self.files[frames], times_us=self.times_us[frames], world_from_cam=self.world_from_cam[frames])
 
     def image(self, index: int, width: int | None = None, height: int | None = None) -> np.ndarray:
         """Frame `index` as uint8 sRGB `[H, W, 3]`, area-averaged to `width` x `height`. ValueError naming a file that does not decode."""

@@ -1,4 +1,4 @@
-"""A picture's pixels out of its file: 8-bit RGB, whatever the file holds, as every reader here takes them. PIL is loaded here alone."""
+"""A picture's pixels out of its file: 8-bit RGB, whatever the file holds, as every reader here takes them."""
 
 from __future__ import annotations
 

@@ -3,6 +3,9 @@
 import numpy as np
 import torch
 
+CAM_FROM_FLU = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+"""From axes that look forward, left and up to a camera's, which look right, down and forward."""
+
 
 def as_pose(value) -> torch.Tensor:
     """A float64 pose `[..., 4, 4]` from a tensor or anything numpy reads; that it is rigid is the caller's word."""

@@ -9,11 +9,10 @@ import torch
 from PIL import Image
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
-from recon.readers.colmap import CAM_FROM_BODY
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
-from scenes.poses import translation, yaw
+from scenes.poses import CAM_FROM_FLU, inverse, translation, yaw
 from scenes.trajectory import Trajectory
 
 SIZE = (320, 180)
@@ -70,7 +69,7 @@ def drive(steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bo
     bodies = torch.stack([translation(x, x / 12, HEIGHT) for x in np.cumsum(steps)])
     cameras = {}
     for name in names:
-        poses = bodies @ yaw(CAMERAS[name]) @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+        poses = bodies @ yaw(CAMERAS[name]) @ inverse(CAM_FROM_FLU)
         views = [Camera(lens, *SIZE, pose) for pose in poses]
         pictures = tuple(_picture(v, blotches, board_left(i) if board else None) for i, v in enumerate(views))
         cameras[name] = LogCamera(name, lens, *SIZE, pictures, times, poses)

@@ -20,10 +20,10 @@ from recon.readers.order import recorded
 from recon.readers.sfm import Model, ModelCamera, is_model, read_model
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
+from scenes.poses import CAM_FROM_FLU
 from scenes.trajectory import Trajectory
 
 STEP_US = 500_000
-CAM_FROM_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 def find_model(folder: Path) -> Path | None:
@@ -53,7 +53,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
 
     mine = [k for k, i in enumerate(model.images) if i.camera == lead]
     order = sorted(mine, key=lambda k: moments[k])
-    ego = Trajectory(torch.tensor([moments[k] for k in order]), placed[order] @ torch.from_numpy(CAM_FROM_BODY))
+    ego = Trajectory(torch.tensor([moments[k] for k in order]), placed[order] @ CAM_FROM_FLU)
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
     for key in sorted(names, key=lambda k: (k != lead, names[k])):

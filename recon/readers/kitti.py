@@ -23,7 +23,7 @@ from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, lea
 from recon.readers.spin import untwisted
 from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.lenses import Pinhole
-from scenes.poses import inverse, translation, yaw
+from scenes.poses import CAM_FROM_FLU, inverse, translation, yaw
 from scenes.trajectory import Trajectory
 
 EARTH = 6378137.0
@@ -31,7 +31,6 @@ EARTH = 6378137.0
 
 LABELS = {"Person_sitting": "pedestrian", "Misc": "object"}
 SHARE = {"licence": "CC BY-NC-SA 3.0", "attribution": "KITTI by Geiger, Lenz, Stiller and Urtasun"}
-CAMERA_FROM_FLU = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 SUFFIXES = (".png", ".jpg")
 FRONT = ("image_02", "image_2", "image_00", "image_0")
 
@@ -103,7 +102,7 @@ def read_kitti_odometry(path: Path) -> Log:
     camera_world[:, :3] = torch.from_numpy(rows)
     calib = _numbers(path / "calib.txt")
     blind = "Tr" not in calib and not (path / "velodyne").is_dir()  # the calibration that comes with grey pictures knows no lidar
-    cam_from_body = CAMERA_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
+    cam_from_body = CAM_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
     # the poses' world is the first rectified camera; ours is the first body pose, whose z is up
     poses = inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body
     ego = lengthened(times, poses)

@@ -20,13 +20,12 @@ from recon.readers.arrow import Rows, read_cell, read_table
 from recon.tracks import Boxes, from_middles, tracks_of, upright
 from scenes.lenses import OpenCV
 from scenes.names import unknown
-from scenes.poses import inverse, translation
+from scenes.poses import CAM_FROM_FLU, inverse, translation
 from scenes.trajectory import Trajectory
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 LABELS = {1: "car", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 FRONT = ("front", "front_left", "front_right")
-OPENCV_FROM_WAYMO = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 IMAGE = "[CameraImageComponent].image"
 WHEN = "key.frame_timestamp_micros"
 BODY = "[VehiclePoseComponent].world_from_vehicle.transform"
@@ -141,7 +140,7 @@ def _cameras(component, home: torch.Tensor, ego: Trajectory, taken: dict[str, np
         readout = way * round(float(np.median((taken[ended] - taken[began] - taken[exposure])[mine])) * 1e6)
         name = CAMERAS.get(int(number), f"camera_{number}")
         lens = OpenCV(*(float(table[k][row]) for k in LENS))
-        body_from_cam = _matrix(table[mount][row], where) @ inverse(OPENCV_FROM_WAYMO)
+        body_from_cam = _matrix(table[mount][row], where) @ inverse(CAM_FROM_FLU)
         bodies = home @ torch.stack([_matrix(taken[POSE][i], images) for i in mine])
         moved = inverse(ego.near_each(torch.from_numpy(stamps))) @ ego.near_each(torch.from_numpy(middles))
         poses = bodies @ moved @ body_from_cam

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 
@@ -29,22 +30,33 @@ def triangulated(log: Log, frames: Frames) -> SparsePoints:
     Rolling shutters count as global ones. ValueError for lenses that COLMAP has not.
     """
     views = sorted(frames.training(), key=lambda v: (v.camera, v.time_us))
-    names = [f"{frames.names[v.camera]}/{v.index:06d}.png" for v in views]
+    names = [picture_name(frames.names[v.camera], v.index) for v in views]
+    pairs = [(names[i], names[j]) for i, j in matched(views)]
     with tempfile.TemporaryDirectory() as folder:
-        lenses, poses = {}, {}
-        for view, name in zip(views, names, strict=True):
-            camera = log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height)
-            file = Path(folder, "images", name)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(view.image.numpy()).save(file, compress_level=1)
-            lenses[file.parent.name] = colmap_lens(camera.lens, log.path)
-            poses[name] = inverse(camera.world_from_cam).numpy()
-        pairs = [(names[i], names[j]) for i, j in matched(views)]
-        xyz, shown = triangulate(Posed(Path(folder), lenses, poses, pairs))
+        pictures = ((frames.names[v.camera], v.index, v.image.numpy()) for v in views)
+        xyz, shown = triangulate(posed(Path(folder), log, pictures, pairs))
     seen = {camera: [np.zeros(0, np.int64)] * len(log.camera(camera)) for camera in frames.names}
     for view, name in zip(views, names, strict=True):
         seen[frames.names[view.camera]][view.index] = shown[name]
     return SparsePoints(xyz, {camera: tuple(of) for camera, of in seen.items()})
+
+
+def picture_name(camera: str, index: int) -> str:
+    """What a camera's picture is called where COLMAP looks at it."""
+    return f"{camera}/{index:06d}.png"
+
+
+def posed(folder: Path, log: Log, pictures: Iterable[tuple[str, int, np.ndarray]], pairs: list[tuple[str, str]]) -> Posed:
+    """Pictures uint8 `[H, W, 3]` of cameras at indices, written to a folder, with the log's lenses at their size and poses. pairs: by
+    `picture_name`. ValueError for lenses that COLMAP has not."""
+    lenses, poses = {}, {}
+    for name, index, image in pictures:
+        camera, file = log.camera(name).camera(index, image.shape[1], image.shape[0]), folder / "images" / picture_name(name, index)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(file, compress_level=1)
+        lenses[name] = colmap_lens(camera.lens, log.path)
+        poses[picture_name(name, index)] = inverse(camera.world_from_cam).numpy()
+    return Posed(folder, lenses, poses, pairs)
 
 
 def matched(views: list[View]) -> list[tuple[int, int]]:

@@ -12,12 +12,12 @@ from recon import FitConfig, open_log, reconstruct
 from recon.egomask import ego_mask, with_ego_masks
 from recon.frames import load_frames
 from recon.log import Log, LogCamera, Packed
-from recon.readers.colmap import CAM_FROM_BODY
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
 from render.rays import camera_rays
 from scenes.lenses import Fisheye, Pinhole
+from scenes.poses import CAM_FROM_FLU, inverse
 from scenes.trajectory import Trajectory
 
 SIZE = W, H = 320, 180
@@ -37,7 +37,7 @@ def drive(count: int = 24, step: float = 1.0, turn: float = 0.0, lens=None) -> L
     poses[:, 1, 0] = torch.from_numpy(np.sin(angles))
     poses[:, 0, 1] = -poses[:, 1, 0]
     poses[:, :2, 3], poses[:, 2, 3] = torch.from_numpy(at), EYE
-    poses = poses @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+    poses = poses @ inverse(CAM_FROM_FLU)
     lens = lens or Pinhole(200, 200, W / 2, 80)
     return LogCamera("front", lens, *SIZE, (Path("none"),) * count, 100_000 * torch.arange(count), poses)
 

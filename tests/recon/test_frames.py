@@ -10,8 +10,8 @@ from PIL import Image
 from recon import open_log
 from recon.frames import load_frames
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
-from recon.readers.colmap import CAM_FROM_BODY
 from scenes.lenses import Pinhole
+from scenes.poses import CAM_FROM_FLU, inverse
 from scenes.trajectory import Trajectory
 
 ALL = (0, 2**62)
@@ -33,7 +33,7 @@ def _log(
     Image.fromarray(image).save(buffer, "png")
     times = torch.arange(3) * 100_000
     bodies = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
-    poses = bodies @ torch.from_numpy(np.linalg.inv(CAM_FROM_BODY))
+    poses = bodies @ inverse(CAM_FROM_FLU)
     camera = LogCamera("front", Pinhole(120, 120, 120, 60), *SIZE, (Packed("street", buffer.getvalue),) * 3, times, poses)
     # ten metres ahead: to the right and up to 5 m, or below
     y, z = np.meshgrid(np.linspace(-10.5, -1.0, 80), np.linspace(*((0.0, up_to) if strikes else (-4.0, -1.0)), 60))
