@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.assets.closing import closed
+from recon.assets.closing import closed, lets_through
 from scenes import Asset, Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 
@@ -28,6 +28,13 @@ def sedan(label="car", sectors=BACK, seed=0) -> Asset:
     return Asset(splats, SIZE, label, meta={"sectors": dict(sectors)})
 
 
+def two_tailed() -> Asset:
+    """A car with two backs, whole and seen from everywhere."""
+    one = sedan(sectors={"front": 9, "rear": 9, "left": 9, "right": 9})
+    turned = replace(one.gaussians, means=one.gaussians.means * torch.tensor([-1.0, 1, 1]))
+    return replace(one, gaussians=Gaussians.cat([one.gaussians, turned]))
+
+
 def test_a_front_that_nobody_saw_is_closed_where_the_sides_end():
     hollow = sedan()
     made = closed(hollow)
@@ -36,7 +43,7 @@ def test_a_front_that_nobody_saw_is_closed_where_the_sides_end():
     torch.testing.assert_close(made.gaussians.means[:n], hollow.gaussians.means, atol=0, rtol=0)
     added = made.gaussians.select(torch.arange(n, len(made.gaussians)))
     x, y, z = added.means.unbind(1)
-    assert x.min() > 0.3 and x.max() < 2.25 and z.max() < 1.5 and y.abs().max() < 0.95
+    assert x.min() > 0.2 and x.max() < 2.25 and z.max() < 1.5 and y.abs().max() < 0.95
     # a grille at the nose, a bonnet behind it, a windscreen behind that
     for part in ((x > 1.9) & (z < 0.8), (x > 0.9) & (x < 1.8) & (z > 0.75) & (z < 1.0), (x < 0.85) & (z > 1.0)):
         cells = np.unique((y[part] / 0.1).floor().numpy())
@@ -49,7 +56,7 @@ def test_a_front_that_nobody_saw_is_closed_where_the_sides_end():
 @pytest.mark.parametrize(
     "asset",
     [
-        sedan(sectors={"front": 9, "rear": 9, "left": 9, "right": 9}),
+        two_tailed(),
         sedan(sectors={}),
         sedan(label="pedestrian"),
         replace(sedan(), gaussians=sedan().gaussians.select(torch.arange(12))),
@@ -77,3 +84,26 @@ def test_what_is_closed_already_stays_as_it_is():
     made = closed(sedan())
     again = closed(replace(made, gaussians=Gaussians.cat([made.gaussians, closed(made).gaussians])))
     assert again.meta["closed"] == [] and len(again.gaussians) == len(made.gaussians) + len(closed(made).gaussians)
+
+
+def test_a_hole_in_an_end_that_photos_show_is_closed_in_the_colour_around_it():
+    whole = sedan()
+    x, y, z = whole.gaussians.means.unbind(1)
+    hidden = (x < -2.1) & (y.abs() < 0.5) & (z < 0.75)  # behind the bonnet of the next car
+    holed = replace(whole, gaussians=whole.gaussians.select(~hidden))
+    made = closed(holed)
+    added = made.gaussians.select(torch.arange(len(holed.gaussians), len(made.gaussians)))
+    patch = added.select(added.means[:, 0] < -1)
+    assert made.meta["closed"] == ["front"], "what was seen is no guess as a whole"
+    assert patch.means[:, 1].abs().max() < 0.6 and patch.means[:, 2].max() < 0.85
+    assert lets_through(made.gaussians, SIZE.numpy(), -1.0, whole.gaussians.means[hidden].double().numpy()).mean() < 0.05
+    assert (rgb_from_sh(patch.sh[:, 0])[:, 2] > 0.7).all()
+
+
+def test_a_front_does_not_get_the_colour_of_tail_lamps():
+    car = sedan()
+    x, _, z = car.gaussians.means.unbind(1)
+    sh = car.gaussians.sh.clone()
+    sh[(x < -2.1) & (z > 0.5) & (z < 0.8), 0] = sh_from_rgb(torch.tensor([1.0, 0.0, 0.0]))
+    made = closed(replace(car, gaussians=replace(car.gaussians, sh=sh)))
+    assert (rgb_from_sh(made.gaussians.sh[len(car.gaussians) :, 0])[:, 0] < 0.5).all()
