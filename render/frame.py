@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -12,7 +13,7 @@ from render.need import need_of, support_fields
 from render.outputs import check_scene_outputs
 from render.rasterize import rasterize
 from render.room import Room
-from render.shadow import cast, shadow_casters
+from render.shadow import cast, caster_fields, shadow_casters
 from render.sky import over_sky
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -50,21 +51,30 @@ def render_frame(
 
     needed = set(outputs) - {"need"}
     if "need" in outputs:
-        needed |= {"rgb", "alpha", "depth", "instance", "features"}
+        needed |= {"rgb", "alpha", "depth", "instance"}
     casters = shadow_casters(scene, camera) if shadows and "rgb" in needed else []
     if "rgb" in needed and scene.sky is not None:
         needed.add("alpha")
     if casters:
-        needed |= {"depth", "instance"}
+        needed |= {"alpha", "depth", "instance"}
     placed = scene.placed(camera.time_us, camera.readout_us)
-    features = support_fields(placed, camera) if "need" in outputs else None
+    fields = {"casters": caster_fields(casters, placed)} if casters else {}
+    if "need" in outputs:
+        fields["need"] = support_fields(placed, camera)
+    features = [torch.cat(parts, 1) for parts in zip(*fields.values(), strict=True)] if fields else None
+    needed |= {"features"} if fields else set()
     frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model, config, features, room=room)
 
-    rgb = cast(frame, casters) if casters else frame.rgb
+    rgb = frame.rgb
+    support = frame.features
+    if casters:
+        assert frame.features is not None and frame.alpha is not None
+        shares, support = frame.features.tensor_split([fields["casters"][0].shape[1]], -1)
+        rgb = cast(frame, casters, shares / frame.alpha[..., None].clamp_min(1e-6))
     need = None
     if "need" in outputs:
         assert rgb is not None and frame.rgb is not None
-        need = need_of(scene, frame, rgb.ne(frame.rgb).any(-1))
+        need = need_of(scene, replace(frame, features=support), rgb.ne(frame.rgb).any(-1))
     if "rgb" in outputs:
         assert rgb is not None
         if scene.sky is not None:

@@ -11,7 +11,7 @@ Inserted assets are those with `inserted` in their meta, or `edited`; other reco
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,12 +20,13 @@ import warp as wp
 
 from render.frame_types import Frame
 from render.kernels.shadow import Falling, fall
-from render.launch import run, stage, view
+from render.launch import run, stage, upload, view
 from render.occlusion import Box, Field, shadow_box, squares, trace_field
 from render.rays import camera_rays, on_device
 from render.tracer import Blockers
 from scenes.asset import Actor
 from scenes.camera import Camera
+from scenes.gaussians import Placed
 from scenes.light import light_of
 from scenes.poses import inverse, yaw, yaw_of
 from scenes.scene import Scene
@@ -42,6 +43,9 @@ TURN = math.radians(3)
 
 STEP = 6.0
 """Metres of its way from which it is asked anew what houses and trees keep off."""
+
+TOLD = 16
+"""Casters of which is asked how much of each pixel they are: each costs a channel."""
 
 AROUND = 80.0
 """Metres within which houses and trees keep light off."""
@@ -60,7 +64,7 @@ class Caster:
 
 
 def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
-    """The inserted assets whose shadow can fall into the view."""
+    """The inserted assets whose shadow can fall into the view, first those into most of it."""
     found = []
     for i, actor in enumerate(scene.actors):
         if not actor.anew or not actor.trajectory.covers(camera.time_us):
@@ -73,15 +77,26 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
         if window is not None:
             field = partial(shade.field, actor, box, directions, weights)
             found.append(Caster(i + 1, asset_from_cam, window, actor.asset.size[:2] / 2, field))
-    return found
+    return sorted(found, key=lambda c: (c.window[0] - c.window[2]) * (c.window[3] - c.window[1]))
 
 
-def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
-    """The frame's rgb `[H, W, 3]`, darkened by the casters; needs rgb, depth and instance. Only what is in shadow is touched."""
+def caster_fields(casters: list[Caster], placed: Sequence[Placed]) -> list[torch.Tensor]:
+    """By placed instance `[N, C]`: 1 of the splats of each of the first `TOLD` casters. Summed up over a pixel: how much of it that is."""
+    which = torch.tensor([caster.instance for caster in casters[:TOLD]])
+    return [upload((which == p.instance).float(), p.gaussians.device).expand(len(p.gaussians), -1) for p in placed]
+
+
+def cast(frame: Frame, casters: list[Caster], shares: torch.Tensor | None = None) -> torch.Tensor:
+    """The frame's rgb `[H, W, 3]`, darkened by the casters; needs rgb, depth and instance. Only what is in shadow is touched.
+
+    shares: `[H, W, C]`, the part of each pixel's alpha that each of the first C casters is; of the others all or nothing, by instance.
+    """
     assert frame.rgb is not None and frame.depth is not None and frame.instance is not None
     rgb = frame.rgb.clone()
-    for caster in casters:
-        light = _light(frame, caster)
+    for i, caster in enumerate(casters):
+        told = shares is not None and i < shares.shape[-1]
+        own = shares[..., i] if shares is not None and told else (frame.instance == caster.instance).float()
+        light = _light(frame, caster, own)
         y, x = (light < 1).nonzero().unbind(1)
         light = light[y, x, None]
         y, x = y + caster.window[1], x + caster.window[0]
@@ -89,8 +104,8 @@ def cast(frame: Frame, casters: list[Caster]) -> torch.Tensor:
     return rgb
 
 
-def _light(frame: Frame, caster: Caster) -> torch.Tensor:
-    """What a caster leaves of the light that falls on what each pixel of its window shows."""
+def _light(frame: Frame, caster: Caster, own: torch.Tensor) -> torch.Tensor:
+    """What a caster leaves of the light that falls on what each pixel of its window shows. own: `[H, W]`, how much of that it is itself."""
     assert frame.depth is not None and frame.instance is not None
     x0, y0, x1, y1 = caster.window
     field, device = caster.field(), frame.depth.device
@@ -102,7 +117,15 @@ def _light(frame: Frame, caster: Caster) -> torch.Tensor:
     blocked, rays = field.blocked.to(device).contiguous(), on_device(camera_rays(frame.camera), device)
     depth, instance = frame.depth.detach().contiguous(), frame.instance.contiguous()
     with stage(device):
-        seen = [view(rays, wp.vec3), view(depth, float), view(instance, int), x0, y0, view(light, float)]
+        seen = [
+            view(rays, wp.vec3),
+            view(depth, float),
+            view(instance, int),
+            view(own.detach().contiguous(), float),
+            x0,
+            y0,
+            view(light, float),
+        ]
         run(fall, light.numel(), [told, view(blocked, float), *seen], device)
     return light
 

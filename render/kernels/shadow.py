@@ -41,10 +41,11 @@ def share(blocked: wp.array3d[float], at: wp.vec3):
 @wp.kernel
 def fall(
     shadow: Falling, blocked: wp.array3d[float], rays: wp.array2d[wp.vec3], depth: wp.array2d[float], instance: wp.array2d[int],
-    left: int, top: int, light: wp.array2d[float],
+    own: wp.array2d[float], left: int, top: int, light: wp.array2d[float],
     first: int,
 ):  # fmt: skip
-    """light: of a window whose first pixel is at left, top; 1 where no shadow falls."""
+    """own: the part of what a pixel shows that is the asset itself. light: of a window whose first pixel is at left, top; 1 where no
+    shadow falls."""
     v, u = pixel_of(first + wp.tid(), light.shape[1])
     row = top + v
     column = left + u
@@ -58,8 +59,7 @@ def fall(
     height = point[2]
     # within the footprint the depth mixes the asset with the ground that shows through it
     inside = wp.abs(point[0]) < shadow.half[0] and wp.abs(point[1]) < shadow.half[1] and height > 0.1
-    own = inside or instance[row, column] == shadow.instance
-    if own or height < shadow.ground:
+    if inside or instance[row, column] == shadow.instance or height < shadow.ground:
         # rays that rise never meet the plane: their point lies far off, where no shadow is
         point = eye - (eye[2] / wp.min(ray[2], -1.0e-6)) * ray
     sides = shadow.high - shadow.low
@@ -69,8 +69,7 @@ def fall(
         return
     if not at[2] < float(blocked.shape[0]):
         return
-    receives = float(1.0)
-    if own:
-        s = wp.clamp(1.0 - height / shadow.skirt, 0.0, 1.0)
-        receives = s * s * (3.0 - 2.0 * s)
+    # at its rim the asset lets the ground through, on which the shadow lies as beside it
+    s = wp.clamp(1.0 - height / shadow.skirt, 0.0, 1.0)
+    receives = 1.0 - own[row, column] * (1.0 - s * s * (3.0 - 2.0 * s))
     light[v, u] = 1.0 - receives * share(blocked, at)

@@ -118,6 +118,30 @@ def test_only_what_the_light_would_reach_is_darkened(street):
     assert light["roof"] == light["nothing"] == light["door"] == 1
 
 
+def test_a_shadow_has_no_edge_where_the_asset_begins_to_hide_the_ground(street):
+    """Through the rim of an asset the ground shows, in shadow: as much as it is seen, whichever of both is more."""
+    camera = street.camera("front_camera", START_US)
+    scene = insert(replace(open_street(street), sky=None), CAR, Placement("car", 9, 0)).scene
+    (caster,) = shadow_casters(scene, camera)
+    depth, light = torch.full((54, 96), 1.22 * 57.6 / 13.5), {}  # 0.28 m above the ground
+    for share in (0.0, 0.49, 0.51, 1.0):
+        instance = torch.full((54, 96), caster.instance if share > 0.5 else 0, dtype=torch.int32)
+        frame = Frame(camera, rgb=torch.full((54, 96, 3), 0.5), depth=depth, instance=instance)
+        light[share] = cast(frame, [caster], torch.full((54, 96, 1), share))[40, 48, 0]
+    assert light[1.0] == 0.5 > light[0.51] + 0.05
+    assert light[0.51] - light[0.49] < 0.02
+    assert light[0.0] < light[0.49] - 0.05
+
+
+def test_what_shows_through_an_asset_stands_in_its_shadow(street):
+    low = CAR.gaussians.means[:, 2] < 1.1  # a roof on thin air
+    thin = replace(CAR, gaussians=replace(CAR.gaussians, logit_opacities=torch.where(low, -2.5, CAR.gaussians.logit_opacities)))
+    scene = insert(replace(open_street(street), sky=None), thin, Placement("car", 9, 0)).scene
+    camera = scene.camera("front_camera", START_US)
+    lit, shaded = (render_frame(scene, camera, shadows=on).rgb[37:40, 44:52] for on in (False, True))
+    assert (shaded < 0.85 * lit).all()
+
+
 def test_assets_out_of_view_cost_nothing(street):
     camera = street.camera("front_camera", START_US)
     street = replace(street, sky=None)
