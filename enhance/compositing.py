@@ -120,13 +120,17 @@ def _alone(actor: Actor, camera: Camera, scene: Scene) -> tuple[torch.Tensor, to
 
 
 def light_left(frame: Frame, scene: Scene) -> torch.Tensor:
-    """The part of the light `[H, W]`, 0 to 1, that the scene's inserted and edited actors leave: of a frame with depth and instance."""
+    """The part of the light `[H, W]`, 0 to 1, that the scene's inserted and edited actors leave: of a frame with depth and instance, and
+    by its instance_alpha, if it has that, exact at their rims."""
     assert frame.depth is not None
     white = torch.ones(*frame.depth.shape, 3)
     casters = shadow_casters(scene, frame.camera)
     if not casters:
         return white[..., 0]
-    return linear_from_srgb(cast(replace(frame, rgb=white), casters)[..., 0]).clamp(0, 1)
+    each, shares = frame.instance_alpha, None
+    if each is not None:
+        shares = each[..., [caster.instance for caster in casters]] / each.sum(-1, keepdim=True).clamp_min(1e-6)
+    return linear_from_srgb(cast(replace(frame, rgb=white), casters, shares)[..., 0]).clamp(0, 1)
 
 
 @dataclass(frozen=True)

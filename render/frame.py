@@ -35,7 +35,7 @@ def render_frame(
     """Background and actors at `camera.time_us`, shadows of inserted assets, the sky, and last the camera's exposure.
 
     previous, following: the cameras that flow_prev and flow_next lead to, and visible_prev and visible_next; needed exactly where those
-    are asked for.
+    are asked for. instance_alpha has a channel for each id, `[H, W, 1 + actors]`, whichever of them are there at the time.
     Shadows and sky cost nothing where there is nothing to do. Differentiable as `rasterize` is, and in the sky. room: as of `rasterize`.
     Raises ValueError for an output that does not exist and for a flow without its other camera.
     """
@@ -82,8 +82,15 @@ def render_frame(
             rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
         if camera.exposure is not None:
             rgb = expose(rgb, camera.exposure)
+    if frame.instance_alpha is not None:
+        frame = replace(frame, instance_alpha=by_instance(frame.instance_alpha, placed, len(scene.actors)))
     wanted = {name: getattr(frame, name) for name in outputs}
     return Frame(camera, **wanted | {"need": need, "rgb": rgb if "rgb" in outputs else None})
+
+
+def by_instance(each: torch.Tensor, placed: Sequence[Placed], actors: int) -> torch.Tensor:
+    """What each of the placed adds, `[H, W, P]`, by instance id `[H, W, 1 + actors]`: 0 of actors that are not there at that time."""
+    return each.new_zeros(*each.shape[:2], 1 + actors).index_add(2, torch.tensor([p.instance for p in placed], device=each.device), each)
 
 
 def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:

@@ -56,7 +56,8 @@ class Frame:
     `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
     visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32; instance_alpha `[H, W, P]` what each
-    placed instance adds to alpha; need `[H, W]` 0 to 1, how badly the place is supported by photos (`render/need.py`).
+    placed instance adds to alpha, of a scene what each id does; need `[H, W]` 0 to 1, how badly the place is supported by photos
+    (`render/need.py`).
 
     No outputs, but added to frames that are to be enhanced (`render/references.py`): reference `[H, W, 3]`, what the drive's photos say the
     view looks like, and trust `[H, W]` 0 to 1, how far to go from rgb to it.

@@ -117,3 +117,14 @@ def test_an_exposure_that_changes_nothing_yet_has_a_gradient(street, camera):
     exposure = torch.eye(3, 4).requires_grad_()
     render_frame(street, replace(camera, exposure=exposure)).rgb.sum().backward()
     assert (exposure.grad.abs() > 0).all()
+
+
+def test_instance_alpha_has_a_channel_for_each_id_whoever_is_there(street):
+    """What left the street takes no channel along: those of who comes after it would be taken for its own."""
+    scene = insert(street, car(), Placement("car", 9, 2)).scene
+    gone = replace(scene.actors[0].trajectory, times_us=scene.actors[0].trajectory.times_us - 10_000_000)
+    scene = replace(scene, actors=(replace(scene.actors[0], trajectory=gone), *scene.actors[1:]))
+    frame = render_frame(scene, scene.camera("front_camera", START_US), ("alpha", "instance", "instance_alpha"))
+    assert frame.instance_alpha.shape == (54, 96, 3) and not frame.instance_alpha[..., 1].any()
+    assert (frame.instance_alpha.sum(-1) - frame.alpha).abs().max() < 1e-5
+    assert frame.instance_alpha[..., 2][frame.instance == 2].mean() > 0.9
