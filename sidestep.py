@@ -146,7 +146,7 @@ class Render:
         from render.record import record
         from scenes import Databank
         from scenes.insert import insert
-        from scenes.seen import seeing, unseen_warning
+        from scenes.seen import absence_warning, seeing, unseen_warning
 
         check_device(self.device)
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
@@ -157,8 +157,7 @@ class Render:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
             witnesses = seeing(result.actor, cameras)
-            if not witnesses:
-                warnings.append(f"{placement.asset} is never in view of {camera}: X is metres forward, Y metres to the left")
+            warnings += absence_warning(result.actor, cameras, witnesses)
             warnings += unseen_warning(result.actor, witnesses)
         warn(warnings)
         width, height = self.size or (None, None)

@@ -34,6 +34,22 @@ def seeing(actor: Actor, cameras: Sequence[Camera]) -> list[Camera]:
     return found
 
 
+def absence_warning(actor: Actor, cameras: Sequence[Camera], witnesses: Sequence[Camera]) -> list[str]:
+    """What to tell of an actor that a clip's cameras never see, or that comes or goes before their eyes since its path begins or ends: a
+    sentence, or nothing. witnesses: those of them that see it."""
+    there = [actor.trajectory.covers(camera.time_us) for camera in cameras]
+    id = actor.asset.meta.get("id", actor.track)
+    seconds = [(t - cameras[0].time_us) / 1e6 for t in (*actor.trajectory.times_us[[0, -1]].tolist(), cameras[-1].time_us)]
+    said = f"is there from {seconds[0]:g}s to {seconds[1]:g}s after the clip's first frame, and the clip lasts {seconds[2]:g}s"
+    if not any(there):
+        return [f"{id} {said}: none of its frames shows it"]
+    if not witnesses:
+        return [f"{id} is never in view: X is metres forward, Y metres to the left"]
+    sees = [any(camera is witness for witness in witnesses) for camera in cameras]
+    before_eyes = any(a != b and (s or t) for a, b, s, t in zip(there, there[1:], sees, sees[1:], strict=False))
+    return [f"{id} {said}: it comes or goes before the camera's eyes; let its trajectory begin earlier or end later"] if before_eyes else []
+
+
 def sector(ahead: float, beside: float) -> str:
     """The sector in which a point forward and left of an object lies."""
     return SECTORS[round(math.atan2(beside, ahead) / (2 * math.pi) * len(SECTORS)) % len(SECTORS)]

@@ -90,7 +90,7 @@ def test_the_main_job_makes_a_video_and_a_report(desk, tmp_path):
 def test_an_asset_that_nobody_sees_is_said(door, tmp_path):
     words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "--duration", "100ms", "--databank", "bank"]
     _, errors = door([*words, "--insert", "car/0001@-7m,0m"])
-    assert "car/0001 is never in view of front_camera" in errors
+    assert "car/0001 is never in view: X is metres forward" in errors
     assert "never in view" in json.loads((tmp_path / "out.json").read_text())["warnings"][0]
 
 

@@ -8,7 +8,7 @@ from street import car
 
 from scenes.insert import insert
 from scenes.placement import Placement
-from scenes.seen import SECTORS, sector, seeing, unseen_sides, unseen_warning
+from scenes.seen import SECTORS, absence_warning, sector, seeing, unseen_sides, unseen_warning
 
 
 def recorded(street):
@@ -24,6 +24,26 @@ def known(asset, mirrored=False, **sectors):
 def test_it_is_known_whether_an_actor_is_ever_in_view(street, x, y, seen):
     actor = insert(street, car(), Placement("car", x, y)).actor
     assert bool(seeing(actor, recorded(street))) == seen
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("0,12,0 1,14,0", None),
+        ("0,12,0 0.3,12.5,0", "from 0s to 0.3s after the clip's first frame, and the clip lasts 0.7s: it comes or goes"),
+        ("0.4,12,0 2,14,0", "from 0.4s to 2s after the clip's first frame, and the clip lasts 0.7s: it comes or goes"),
+        ("0,5,0 0.3,5,30", None),  # it is out of view when it goes
+        ("2,12,0 3,14,0", "none of its frames shows it"),
+        ("0,-12,0 1,-14,0", "never in view: X is metres forward"),
+    ],
+)
+def test_it_is_said_that_an_actor_comes_or_goes_before_ones_eyes(street, tmp_path, rows, said):
+    file = tmp_path / "t.csv"
+    file.write_text("\n".join(["time_s,x_m,y_m", *rows.split()]))
+    cameras = recorded(street)
+    actor = insert(street, car(), Placement("car", trajectory=file), cameras[0].time_us).actor
+    told = absence_warning(actor, cameras, seeing(actor, cameras))
+    assert told == [] if said is None else said in told[0]
 
 
 def test_sectors_go_round_to_the_left_from_the_nose():
