@@ -27,6 +27,16 @@ PARKED_FLOOR, PARKED_MARGIN = 0.08, 0.25
 """The same of parked vehicles, which are splats of the background: they stand on the street, and lidar boxes cut them close."""
 
 
+BELOW = 0.6
+"""Metres below the base of a parked vehicle's box down to which splats are the street that it stands on."""
+
+RIM, AROUND = 0.4, 2.5
+"""Metres from a box between which the street beside it shows how it looks below."""
+
+BESIDE = 16
+"""Splats of the street beside a box, the nearest, whose mean colour one below it gets."""
+
+
 @dataclass(frozen=True)
 class Edit:
     """Changes of actors by track name: tracks to remove; metres forward and left along the actor's own body; another asset on
@@ -77,13 +87,17 @@ def check_edit(edit: Edit, scene: Scene) -> None:
 
 
 def edited(scene: Scene, edit: Edit) -> Scene:
-    """The scene after an edit. Traces that the background holds of the actors where they were, and parked vehicles, are hidden."""
+    """The scene after an edit. Traces that the background holds of the actors where they were, and parked vehicles, are hidden, and the
+    street below those looks as beside them."""
     check_edit(edit, scene)
     tracks = edit.tracks()
     actors = tuple(edit.apply(a, scene) if a.track in tracks else a for a in scene.actors if a.track not in edit.remove)
     splats = scene.background.gaussians
     logits = torch.where(ghosts(scene, tracks), splats.logit_opacities.new_tensor(HIDDEN), splats.logit_opacities)
-    hidden = replace(scene.background, gaussians=replace(splats, logit_opacities=logits))
+    sh = splats.sh.clone()
+    painted, colours = bared(scene, edit.remove)
+    sh[painted] = colours
+    hidden = replace(scene.background, gaussians=replace(splats, logit_opacities=logits, sh=sh))
     left = [p for p in scene.meta.get("parked", []) if p["track"] not in edit.remove]
     return replace(scene, actors=actors, background=hidden, meta={**scene.meta, **({"parked": left} if "parked" in scene.meta else {})})
 
@@ -111,6 +125,41 @@ def ghosts(scene: Scene, tracks: Iterable[str]) -> torch.Tensor:
     for pose, size in (box for track, box in standing.items() if track in tracks):
         _mark(found, splats, inverse(pose) @ world_from_local, size, PARKED_FLOOR, PARKED_MARGIN)
     return found
+
+
+def bared(scene: Scene, tracks: Iterable[str]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices `[M]` of background splats that are the street below these parked vehicles, and their harmonics `[M, K, 3]` as it looks
+    beside them.
+
+    No photo shows that street, and the fit paints on it what it could not explain by the vehicle: tyres, doors, its shadow. How it looks
+    is taken from the side that the recorded path passed: what lies behind a parked vehicle was hidden, too.
+    """
+    splats, world_from_local, boxes = scene.background.gaussians, scene.background.world_from_local, parked(scene)
+    seen = torch.sigmoid(splats.logit_opacities) > 0.5
+    for pose, size in boxes.values():
+        seen &= ~_below(splats, inverse(pose) @ world_from_local, size, RIM)
+    path = inverse(world_from_local) @ scene.ego.world_from_body
+    indices, colours = [torch.zeros(0, dtype=torch.long)], [splats.sh[:0]]
+    for pose, size in (boxes[track] for track in tracks if track in boxes):
+        box_from_local = inverse(pose) @ world_from_local
+        below = _below(splats, box_from_local, size, PARKED_MARGIN).nonzero()[:, 0]
+        beside = (_below(splats, box_from_local, size, AROUND) & seen).nonzero()[:, 0]
+        middle = inverse(box_from_local)[:3, 3].float()
+        passed = path[(path[:, :3, 3].float() - middle).norm(dim=1).argmin(), :3, 3].float()
+        beside = beside[(splats.means[beside] - passed).norm(dim=1) < (middle - passed).norm()]
+        if len(beside) and len(below):
+            nearest = torch.cdist(splats.means[below], splats.means[beside]).topk(min(BESIDE, len(beside)), largest=False).indices
+            sh = torch.zeros_like(splats.sh[below])
+            sh[:, 0] = splats.sh[beside, 0][nearest].mean(1)
+            indices.append(below)
+            colours.append(sh)
+    return torch.cat(indices), torch.cat(colours)
+
+
+def _below(splats: Gaussians, box_from_local: torch.Tensor, size: torch.Tensor, margin: float) -> torch.Tensor:
+    """Mask `[N]` of splats below a box grown by `margin` metres: the street."""
+    at = splats.means @ box_from_local[:3, :3].T.float() + box_from_local[:3, 3].float()
+    return (at[:, :2].abs() <= size[:2].float() / 2 + margin).all(1) & (at[:, 2] <= PARKED_FLOOR) & (at[:, 2] > -BELOW)
 
 
 def _mark(found: torch.Tensor, splats: Gaussians, box_from_local: torch.Tensor, size: torch.Tensor, floor: float, margin: float) -> None:

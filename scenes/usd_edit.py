@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
 from scenes.atomic import atomic_folder
-from scenes.edit import Edit, check_edit, ghosts
+from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
 from scenes.usd import new_stage, open_stage, own_data, set_own_data, valid_names
@@ -23,6 +23,14 @@ from scenes.usd_deformation import author_weights, block_deformation
 from scenes.usd_root import RECORDED, add_sublayer, drop_sublayer
 from scenes.usd_scene import author_actor, author_path, defines, load_recorded, read_edits, read_metadata
 from scenes.usd_splats import only_splats, save_asset, to_json
+
+BUILDERS = {
+    Sdf.ValueTypeNames.FloatArray: Vt.FloatArrayEditBuilder,
+    Sdf.ValueTypeNames.HalfArray: Vt.HalfArrayEditBuilder,
+    Sdf.ValueTypeNames.Float3Array: Vt.Vec3fArrayEditBuilder,
+    Sdf.ValueTypeNames.Half3Array: Vt.Vec3hArrayEditBuilder,
+}
+"""What edits an array of a type."""
 
 
 def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, half: bool = False) -> None:
@@ -57,7 +65,8 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
 def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool = False) -> None:
     """Keep an edit of the actors of `scene`, as loaded from the folder `path`, as the layer edits/<name>.usda.
 
-    A removed actor becomes inactive, and the splats of a removed parked vehicle transparent; another one's path and asset are outweighed;
+    A removed actor becomes inactive, and the splats of a removed parked vehicle transparent, the street below it
+    as beside it; another one's path and asset are outweighed;
     `edited` in their asset's meta names the edit. An edit stands on what it found: of two that change the same actor, the later one counts.
     Raises as `add_edit` and `check_edit`.
     """
@@ -66,13 +75,15 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     origin, (prims, _) = int(read_metadata(path)["origin_us"]), _prims(path)
     changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
     # of what was recorded, whatever other edits say: any of them may be undone
-    hidden = ghosts(load_recorded(path), edit.tracks()).nonzero()[:, 0].tolist()
+    recorded = load_recorded(path)
+    hidden = ghosts(recorded, edit.tracks()).nonzero()[:, 0].tolist()
+    painted, colours = bared(recorded, edit.remove)
 
     def files(folder: Path) -> None:
         for track, asset in edit.replace.items():
             save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
-        if hidden:
-            _save_hidden(path, folder / "hidden.usda", hidden)
+        if hidden or len(painted):
+            _save_background(path, folder / "hidden.usda", hidden, painted.tolist(), colours.tolist())
 
     def author(layer: Usd.Stage) -> None:
         layer.OverridePrim("/World")
@@ -88,7 +99,7 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
             if actor.track in edit.replace:
                 block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
-        if hidden:
+        if hidden or len(painted):
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
     _write(path, name, meta, files, author)
@@ -183,16 +194,31 @@ def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], au
         raise
 
 
-def _save_hidden(scene: Path, file: Path, hidden: Iterable[int]) -> None:
-    """A layer that edits the background's opacities, 0 for these splats and no word of the rest: so each edit hides its own."""
+def _save_background(scene: Path, file: Path, hidden: Iterable[int], painted: Iterable[int], colours: Iterable[list]) -> None:
+    """A layer that edits the background, and says no word of the rest, so that each edit changes its own: opacities, 0 of the `hidden`
+    splats, and harmonics `[K, 3]` each of the `painted`."""
+    harmonics = [(splat * len(sh) + k, tuple(c)) for splat, sh in zip(painted, colours, strict=True) for k, c in enumerate(sh)]
     with open_stage(scene / "scene.usda") as stage:
         splats = UsdVol.ParticleField3DGaussianSplat(only_splats(stage.GetPrimAtPath("/World/Background"), scene))
-        full = splats.GetOpacitiesAttr()
-        attribute = full if full.HasAuthoredValue() else splats.GetOpacitieshAttr()
-        where, name, kind = splats.GetPath(), attribute.GetName(), attribute.GetTypeName()
-    builder = Vt.FloatArrayEditBuilder() if kind == Sdf.ValueTypeNames.FloatArray else Vt.HalfArrayEditBuilder()
-    for splat in hidden:
-        builder.Write(0.0, splat)
+        where = splats.GetPath()
+        changes = [
+            (*_array(splats.GetOpacitiesAttr(), splats.GetOpacitieshAttr()), [(splat, 0.0) for splat in hidden]),
+            (*_array(
+                splats.GetRadianceSphericalHarmonicsCoefficientsAttr(), splats.GetRadianceSphericalHarmonicsCoefficientshAttr()
+            ), harmonics),
+        ]  # fmt: skip
     with new_stage(file, "World") as layer:
         layer.OverridePrim("/World")
-        layer.OverridePrim(where).CreateAttribute(name, kind, False).Set(builder.FinalizeAndReset())
+        prim = layer.OverridePrim(where)
+        for name, kind, values in changes:
+            builder = BUILDERS[kind]()
+            for at, value in values:
+                builder.Write(value, at)
+            if values:
+                prim.CreateAttribute(name, kind, False).Set(builder.FinalizeAndReset())
+
+
+def _array(full: Usd.Attribute, half: Usd.Attribute) -> tuple[str, Sdf.ValueTypeName]:
+    """Name and type of which of two attributes holds an array: full or half precision."""
+    attribute = full if full.HasAuthoredValue() else half
+    return attribute.GetName(), attribute.GetTypeName()

@@ -10,6 +10,7 @@ from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
 from scenes.edit import HIDDEN, Edit, edited
+from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
@@ -129,6 +130,28 @@ def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path
     hidden = edited(scene, Edit(remove=("veh_7",))).background.gaussians.logit_opacities == HIDDEN
     own = torch.arange(len(hidden)) >= len(busy().background.gaussians)
     assert (hidden[own] | (scene.background.gaussians.means[own][:, 2] <= 0.08)).all() and not hidden[~own].any()
+    undo(tmp_path / "s1", "mine")
+    same(load(tmp_path / "s1"), scene)
+
+
+def test_the_street_below_a_removed_parked_vehicle_looks_as_beside_it(tmp_path):
+    """The fit paints there what it could not explain by the vehicle; red here."""
+    scene = parking()
+    g = scene.background.gaussians
+    at = g.means - torch.tensor([20.0, -7.0, 0.0])
+    street_there = (at[:, 0].abs() < 2.1) & (at[:, 1].abs() < 0.9) & (at[:, 2].abs() < 0.05)
+    sh = g.sh.clone()
+    sh[street_there, 0] = sh_from_rgb(torch.tensor([1.0, 0.0, 0.0]))
+    scene = replace(scene, background=replace(scene.background, gaussians=replace(g, sh=sh)))
+    save(scene, tmp_path / "s1")
+    add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(remove=("veh_7",)), {})
+    after = edited(scene, Edit(remove=("veh_7",)))
+    same(load(tmp_path / "s1"), after)
+    rgb = rgb_from_sh(after.background.gaussians.sh[:, 0])
+    assert street_there.sum() > 10 and (rgb[street_there] - rgb[street_there].mean(1, keepdim=True)).abs().max() < 0.05
+    changed = (after.background.gaussians.sh != sh).flatten(1).any(1)
+    assert (at[changed, :2].abs() <= torch.tensor([2.1, 0.9]) + 0.26).all() and (at[changed, 2] < 0.09).all()
+    assert torch.equal(edited(scene, Edit(remove=("veh_1",))).background.gaussians.sh, sh), "below what moves it is seen"
     undo(tmp_path / "s1", "mine")
     same(load(tmp_path / "s1"), scene)
 
