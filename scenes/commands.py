@@ -127,6 +127,7 @@ class Edit:
         told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
         name = self.name or free_name(self.scene, "edit")
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
+        warn(edits.absences(edit, scene))
         layer = self.scene / "edits" / f"{name}.usda"
         print(f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it")
 

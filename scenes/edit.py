@@ -86,6 +86,21 @@ def check_edit(edit: Edit, scene: Scene) -> None:
             raise ValueError(f"{track} stands still for all times, so it cannot be retimed; shift or remove it")
 
 
+def absences(edit: Edit, scene: Scene) -> list[str]:
+    """What to tell of actors that an edit takes, by their new times, out of a part of the drive: a sentence each."""
+    first, last = (int(t) for t in scene.ego.times_us[[0, -1]])
+    said = []
+    for actor in (a for a in scene.actors if a.track in edit.retime):
+        was, now = actor.trajectory.span_us(), edit.apply(actor, scene).trajectory.span_us()
+        if now[0] > max(first, was[0]) or now[1] < min(last, was[1]):
+            begin, end = ((t - first) / 1e6 for t in now)
+            said.append(
+                f"{actor.track} is now there from {begin:.1f}s to {end:.1f}s only, of a drive of {(last - first) / 1e6:.1f}s"
+                + (": never" if now[0] > last or now[1] < first else "; where it was before or after that nobody recorded")
+            )
+    return said
+
+
 def edited(scene: Scene, edit: Edit) -> Scene:
     """The scene after an edit. Traces that the background holds of the actors where they were, and parked vehicles, are hidden, and the
     street below those looks as beside them."""

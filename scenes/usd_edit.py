@@ -201,7 +201,7 @@ def _save_background(scene: Path, file: Path, hidden: Iterable[int], painted: It
     with open_stage(scene / "scene.usda") as stage:
         splats = UsdVol.ParticleField3DGaussianSplat(only_splats(stage.GetPrimAtPath("/World/Background"), scene))
         where = splats.GetPath()
-        changes = [
+        changes: list[tuple[str, Sdf.ValueTypeName, list]] = [
             (*_array(splats.GetOpacitiesAttr(), splats.GetOpacitieshAttr()), [(splat, 0.0) for splat in hidden]),
             (*_array(
                 splats.GetRadianceSphericalHarmonicsCoefficientsAttr(), splats.GetRadianceSphericalHarmonicsCoefficientshAttr()

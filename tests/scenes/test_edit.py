@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
-from scenes.edit import HIDDEN, Edit, edited
+from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
 from scenes.placement import Placement
@@ -132,6 +132,12 @@ def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path
     assert (hidden[own] | (scene.background.gaussians.means[own][:, 2] <= 0.08)).all() and not hidden[~own].any()
     undo(tmp_path / "s1", "mine")
     same(load(tmp_path / "s1"), scene)
+
+
+@pytest.mark.parametrize(("by", "said"), [(0, None), (300_000, "0.2s to 1.1s only"), (20_000_000, "of a drive of 0.8s: never")])
+def test_it_is_said_when_an_actor_leaves_the_drives_time(by, said):
+    told = absences(Edit(retime={"veh_2": by}), busy())
+    assert told == [] if said is None else said in told[0]
 
 
 def test_the_street_below_a_removed_parked_vehicle_looks_as_beside_it(tmp_path):
