@@ -154,7 +154,7 @@ class Render:
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)
         for placement in self.insert:
-            result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]))
+            result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
             witnesses = seeing(result.actor, cameras)
             warnings += absence_warning(result.actor, cameras, witnesses)

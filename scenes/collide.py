@@ -24,10 +24,12 @@ FEWEST = 12
 """Splats that make something: floaters come alone."""
 
 
-def collisions(scene: Scene, actor: Actor) -> list[str]:
-    """What an actor of the scene touches during the drive, a sentence each with the first moment; [] where its way is free."""
+def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> list[str]:
+    """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment; []
+    where its way is free."""
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
-    times = [t for t in range(first, last + 1, STEP_US) if actor.trajectory.covers(t)]
+    begin, end = during or (first, last)
+    times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
     found = []
     for other in scene.actors:
         if other.track == actor.track or not _meet(actor, other):

@@ -125,3 +125,17 @@ def test_what_is_never_there_during_the_drive_is_said(street, tmp_path):
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n-9,10,0\n-5,20,0\n")
     result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))
     assert "car is there from -9s to -5s only, and never during the drive" in result.warnings
+
+
+def test_what_an_asset_runs_into_is_looked_for_in_the_clip_alone(street):
+    """veh_1 stands 10 m ahead at first, and has left half a second later."""
+    other = street.actors[0]
+    path = other.trajectory
+    poses = path.world_from_body.clone()
+    poses[:, 0, 3], poses[:, 1, 3] = 10.0 + 5.0 * torch.arange(len(path)), 0.0
+    scene = replace(street, actors=(replace(other, trajectory=replace(path, world_from_body=poses)),))
+    late = int(path.times_us[5])
+    body = scene.ego.at(late)[0, 3]
+    place = Placement("car", 10.0 - float(body), 0.0)
+    assert any("runs into" in said for said in insert(scene, car(), place, late).warnings)
+    assert not any("runs into" in said for said in insert(scene, car(), place, late, int(path.times_us[-1])).warnings)
