@@ -104,12 +104,12 @@ def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
     background, ground = scene.background, scene.ground
     if ground is None or not scene.meta.get("parked"):
         return None
-    pose = background.world_from_local.float()
-    means = background.gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    pose, splats = background.world_from_local.float(), background.gaussians.detach().to("cpu")
+    means = splats.means @ pose[:3, :3].T + pose[:3, 3]
     low = (means[:, 2] - ground.height(means[:, :2]).float()).abs() < 0.3
-    low &= torch.sigmoid(background.gaussians.logit_opacities) > 0.3
+    low &= torch.sigmoid(splats.logit_opacities) > 0.3
     places = means[low, :2]
-    luminance = linear_from_srgb(rgb_from_sh(background.gaussians.sh[low, 0]).clamp(0, 1)).mean(1)
+    luminance = linear_from_srgb(rgb_from_sh(splats.sh[low, 0]).clamp(0, 1)).mean(1)
     away = -torch.nn.functional.normalize(sun[:2].float(), dim=0)
     lacking = []
     for vehicle in scene.meta["parked"]:
