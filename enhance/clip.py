@@ -18,6 +18,9 @@ from render.references import References
 from scenes.opening import warn
 from scenes.scene import Scene
 
+GUIDES = ("flow_prev", "instance", "need", "reference")
+"""What an enhancer may go by beside the picture."""
+
 HUGE = 50_000_000
 """Weights from which a model is no matter of milliseconds on a CPU."""
 
@@ -33,11 +36,14 @@ def load_saying(weights: str, device: str = "cpu") -> Steps:
 
 
 def enhance_frames(frames: Iterable[Frame], enhancer: Steps, scene: Scene | None = None) -> Iterator[Frame]:
-    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`. Of the
-    instances it is told those that are `anew` in the `scene`, all where None: recorded actors have their own light and shadow already."""
+    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`, which
+    alone it goes by: what else was rendered to be kept changes no picture. Of the instances it is told those that are `anew` in the
+    `scene`, all where None: recorded actors have their own light and shadow already."""
     memory, anew = None, None if scene is None else scene.anew()
+    hidden: dict[str, None] = {name: None for name in GUIDES if name not in enhancer.reads}
     for frame in frames:
-        better, memory = enhancer.step(frame if anew is None else telling(frame, anew), memory)
+        read = replace(frame, **hidden)
+        better, memory = enhancer.step(read if anew is None else telling(read, anew), memory)
         yield replace(frame, rgb=better)
 
 

@@ -96,9 +96,19 @@ def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     assert "was changed" not in capsys.readouterr().err
 
 
+def test_outputs_that_are_rendered_to_be_kept_change_no_picture(street, tmp_path):
+    save_net(Net(SMALL), tmp_path / "untrained.safetensors", {})
+    stages, reads = enhancement(str(tmp_path / "untrained.safetensors"))
+    (frame,) = render_clip(street, "front_camera", 0.5, times(street)[:1], outputs=("rgb", *reads))
+    referenced = replace(frame, reference=torch.ones_like(frame.rgb), trust=torch.ones_like(frame.rgb[..., 0]))
+    kept = replace(referenced, need=torch.zeros_like(referenced.trust))
+    without, beside = (next(stages["enhance"](iter([f]))) for f in (referenced, kept))
+    assert torch.equal(without.rgb, beside.rgb) and beside.need is kept.need and without.rgb.mean() > frame.rgb.mean() + 0.2
+
+
 def test_of_a_scenes_actors_those_that_were_put_in_or_edited_are_told(street):
     class Listening:
-        told = ()
+        told, reads = (), ("instance",)
 
         def step(self, frame, memory=None):
             self.told = (*self.told, frame.instance)
