@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -40,7 +41,7 @@ def enhance_frames(frames: Iterable[Frame], enhancer: Steps, scene: Scene | None
     alone it goes by: what else was rendered to be kept changes no picture. Of the instances it is told those that are `anew` in the
     `scene`, all where None: recorded actors have their own light and shadow already."""
     memory, anew = None, None if scene is None else scene.anew()
-    hidden: dict[str, None] = {name: None for name in GUIDES if name not in enhancer.reads}
+    hidden: dict[str, Any] = {name: None for name in GUIDES if name not in enhancer.reads}
     for frame in frames:
         read = replace(frame, **hidden)
         better, memory = enhancer.step(read if anew is None else telling(read, anew), memory)

@@ -1,11 +1,14 @@
 """Whole videos."""
 
+import io
 from dataclasses import replace
 from fractions import Fraction
 
+import av
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from small_net import SMALL, stirred
 
 from enhance.clip import enhance_frames, enhance_video, enhancement, telling
@@ -64,6 +67,28 @@ def test_an_undecodable_clip_is_refused_and_leaves_nothing(tmp_path, enhancer):
     with pytest.raises(ValueError, match="in.mp4"):
         enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer)
     assert [p.name for p in tmp_path.iterdir()] == ["in.mp4"]
+
+
+def test_a_clip_that_goes_on_in_another_size_is_refused_by_frame(tmp_path, enhancer):
+    """Each picture of motion JPEG has a size of its own."""
+    with av.open(tmp_path / "in.mkv", "w") as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for i, size in enumerate([(64, 48), (64, 48), (96, 64)]):
+            whole = io.BytesIO()
+            Image.new("RGB", size, "grey").save(whole, "JPEG")
+            packet = av.Packet(whole.getvalue())
+            packet.pts = packet.dts = i
+            packet.time_base, packet.stream = Fraction(1, 10), stream
+            container.mux(packet)
+    with pytest.raises(ValueError, match=r"in.mkv changes its size after frame 2, from 64x48 to 96x64; cut it there"):
+        enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", enhancer)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.mkv"]
+
+
+def test_a_folder_of_pictures_is_called_that(tmp_path, enhancer):
+    with pytest.raises(ValueError, match="is a folder, not a video; of pictures make one first"):
+        enhance_video(tmp_path, tmp_path / "out.mp4", enhancer)
 
 
 def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
