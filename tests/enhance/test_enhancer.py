@@ -100,11 +100,25 @@ def test_a_value_that_is_not_finite_is_refused_by_place(enhancer):
 
 @pytest.mark.parametrize(
     ("wrong", "says"),
-    [(torch.zeros(32, 48), "shape"), (torch.zeros(32, 48, 3, dtype=torch.uint8), "255"), (torch.zeros(0, 48, 3), "pixels")],
+    [
+        (torch.zeros(32, 48), "shape"),
+        (torch.zeros(32, 48, 3, dtype=torch.uint8), "255"),
+        (torch.full((32, 48, 3), 90.0), "its mean is 90; divide bytes by 255"),
+        (torch.zeros(0, 48, 3), "pixels"),
+    ],
 )
 def test_what_is_no_picture_is_refused(enhancer, wrong, says):
     with pytest.raises(ValueError, match=says):
         enhancer.step(wrong)
+
+
+def test_what_comes_back_may_be_written_to_and_learnt_through(enhancer):
+    better, memory = enhancer.step(picture().requires_grad_())
+    assert not better.requires_grad and not memory.past.latents.requires_grad
+    gain = torch.ones(3, requires_grad=True)
+    (better * gain).sum().backward()
+    better[:2] = 0
+    assert torch.isfinite(gain.grad).all()
 
 
 def test_flow_of_another_size_is_refused(enhancer):

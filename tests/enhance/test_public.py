@@ -386,6 +386,13 @@ def test_what_is_no_picture_is_refused(harmonizer):
         Enhancer.load(harmonizer, reference=picture())
 
 
+def test_what_is_drawn_on_a_result_is_not_remembered(harmonizer):
+    better, memory = Enhancer.load(harmonizer, bfloat16=False).step(picture())
+    before = better.clone()
+    better[:4] = 0
+    assert torch.equal(memory.frames[0], before)
+
+
 def test_a_huge_model_says_so_before_it_begins(harmonizer, monkeypatch, capsys):
     from enhance.clip import load_saying
 
