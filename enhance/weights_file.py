@@ -68,8 +68,8 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
     try:
         known = {f.name for f in fields(NetConfig)}
         net = Net(NetConfig(**{k: int(v) for k, v in json.loads(header["config"]).items() if k in known}))
-        about = json.loads(header.get("about", "{}"))
-    except (KeyError, TypeError, ValueError) as error:
+        about = dict(json.loads(header.get("about", "{}")))
+    except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:  # torch's own, of sizes that are none
         raise ValueError(f"{path} has a broken header ({error}); fetch or train it again") from error
     _check_state(path, net, state)
     net.load_state_dict(state)

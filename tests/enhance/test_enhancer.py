@@ -6,7 +6,7 @@ from small_net import SMALL, stirred
 
 from enhance.enhancer import Enhancer
 from enhance.net import Net
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
+from enhance.weights_file import BUILTIN, FORMAT, REPAIR_GAIN, WORTH, load_net, save_net
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -149,6 +149,16 @@ def test_broken_weights_say_what_is_wrong(tmp_path):
         load_net(file)
     with pytest.raises(FileNotFoundError, match="builtin"):
         load_net(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("header", [{"config": "null"}, {"config": '{"width": -8}'}, {"config": '{"looks": 3}'}, {"about": "[1]"}])
+def test_a_header_that_says_nonsense_is_called_broken(tmp_path, header):
+    from safetensors.torch import save_file
+
+    file = tmp_path / "w.safetensors"
+    save_file({"a": torch.zeros(1)}, file, {"format": FORMAT, "config": "{}", **header})
+    with pytest.raises(ValueError, match="w.safetensors has a broken header"):
+        load_net(file)
 
 
 def test_weights_with_a_value_that_is_not_finite_are_refused(tmp_path):
