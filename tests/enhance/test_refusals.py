@@ -158,6 +158,9 @@ def test_pairs_of_another_scene_do_not_go_into_the_same_folder(street, recording
         make_pairs(replace(street, actors=()), recording, out, ("clean",), config=config)
     note = out / "pairs.json"
     settings = json.loads(note.read_text())
+    note.write_text("")
+    with pytest.raises(ValueError, match=r"pairs.json does not say how these pairs were made"):
+        make_pairs(street, recording, out, ("clean",), config=config)
     note.write_text(json.dumps({k: v for k, v in settings.items() if k not in ("scene", "recording")}))  # as the code before wrote it
     make_pairs(street, recording, out, ("clean",), config=config)
 
@@ -188,6 +191,12 @@ def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street,
         replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
     with pytest.raises(UsageError, match="--cameras names none"):
         replace(one, cameras=()).run()
+    for size in (0, -5, 31):
+        with pytest.raises(ValueError, match=f"at least 32 pixels wide, got {size}"):
+            replace(one, cameras=None, size=size).run()
+        with pytest.raises(ValueError, match=f"at least 32 pixels wide, got {size}"):
+            make_photo_pairs([tmp_path], tmp_path / "out", width=size)
+    assert not (tmp_path / "out").exists()
     with pytest.raises(UsageError, match="--only names none"):
         Train((tmp_path,), tmp_path / "t", only=()).run()
     make_pairs(replace(street, actors=()), recording, tmp_path / "out", ("clean",), config=PairConfig(frames=2, width=32))
