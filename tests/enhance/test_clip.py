@@ -121,6 +121,17 @@ def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     assert "was changed" not in capsys.readouterr().err
 
 
+def test_it_is_said_where_a_scene_gives_nothing_to_go_by(street, capsys):
+    (actor, *_) = street.actors
+    put_in = replace(actor, asset=replace(actor.asset, meta={**actor.asset.meta, "inserted": True}), track="put_in")
+    for scene in (None, replace(street, actors=(actor, put_in))):
+        enhancement("builtin", scene=scene)
+    enhancement("builtin", references=References([], street), scene=street)
+    assert "nothing will be enhanced" not in capsys.readouterr().err
+    enhancement("builtin", scene=street)
+    assert "nothing will be enhanced: the scene keeps no photos" in capsys.readouterr().err
+
+
 def test_outputs_that_are_rendered_to_be_kept_change_no_picture(street, tmp_path):
     save_net(Net(SMALL), tmp_path / "untrained.safetensors", {})
     stages, reads = enhancement(str(tmp_path / "untrained.safetensors"))
