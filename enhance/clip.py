@@ -59,8 +59,8 @@ def telling(frame: Frame, ids: Sequence[int]) -> Frame:
 def enhancement(
     weights: str, device: str = "cpu", references: References | None = None, scene: Scene | None = None
 ) -> tuple[Stages, tuple[str, ...]]:
-    """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads; a warning where there
-    is nothing to go by. references: of the scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
+    """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads; it warns where
+    there is nothing to go by. references: of the scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
     enhancer = load_saying(weights, device)
     if isinstance(enhancer, Enhancer) and not any(enhancer.repairs) and references is None and scene is not None and not scene.anew():
         warn(["nothing will be enhanced: the scene keeps no photos to go by, nothing was put in, and these weights repair nothing else"])
