@@ -55,7 +55,8 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f'no weights at {path}; write "builtin" for the shipped ones, or train some: sidestep train PAIRS -o {path.parent}'
+            f'no weights at {path}; write "builtin" for the shipped ones, fetch a public model and give where it lies, '
+            f"or train some: sidestep train PAIRS -o {path.parent}"
         )
     try:
         with safe_open(path, "pt") as file:
