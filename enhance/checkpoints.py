@@ -7,7 +7,7 @@ import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -95,13 +95,14 @@ def _file(path: Path) -> Model | WhiteBox:
     state = read_state(path)
     transformer, vae = state.get("state_dict_unet"), state.get("state_dict_vae")
     if isinstance(transformer, Mapping) and isinstance(vae, Mapping):
+        transformer, vae = _named(transformer), _named(vae)
         if "rank_vae" in state:
             raise ValueError(f"{path} holds what Difix was trained by on top of SD-Turbo; give the folder nvidia/difix, which is whole")
-        beside = {str(name): value for name, value in state.items() if name not in ("state_dict_unet", "state_dict_vae")}
+        beside = {name: value for name, value in state.items() if name not in ("state_dict_unet", "state_dict_vae")}
         strange = sorted(n for n, v in beside.items() if n not in TRAINING and isinstance(v, Mapping | torch.Tensor))
         if strange:
             raise ValueError(f"{path} has the unknown part {strange[0]}; give {KNOWN}")
-        left_out = (*sorted(beside), *sorted({str(name).split(".")[0] + ".*" for name in transformer if "_ema." in str(name)}))
+        left_out = (*sorted(beside), *sorted({name.split(".")[0] + ".*" for name in transformer if "_ema." in name}))
         if "conv1.weight" in vae or "encoder.conv1.weight" in vae:
             return _without(read_cosmos(path, transformer, vae, "NVIDIA Harmonizer", 4), left_out)
         if part(vae, "encoder.") and part(vae, "decoder."):
@@ -109,11 +110,11 @@ def _file(path: Path) -> Model | WhiteBox:
             return _without(read_fixer(path, transformer, vae, tokenizer, read_state(tokenizer)), left_out)
     if "regressor.f.weight" in state:
         return WhiteBox.read(path, state)
-    if any(str(name).removeprefix("net.").startswith("blocks.") for name in state):
+    if any(name.removeprefix("net.").startswith("blocks.") for name in state):
         raise ValueError(f"{path} is the transformer of Cosmos-Predict2 alone; give its folder, with tokenizer/tokenizer.pth in it")
     if "encoder.conv1.weight" in state:
         raise ValueError(f"{path} is the Wan autoencoder alone; give the folder with model.pt in it, or a Harmonizer's .pkl")
-    first = ", ".join(map(str, list(state)[:3]))
+    first = ", ".join(list(state)[:3])
     raise ValueError(f"{path} is no enhancer that is known, it holds {first or 'nothing'}; give {KNOWN}")
 
 
@@ -171,4 +172,9 @@ def read_state(path: Path) -> dict:
         raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, not tensors by name; give {KNOWN}")
-    return dict(state)
+    return _named(state)
+
+
+def _named(state: Mapping) -> dict[str, Any]:
+    """With names that are text: foreign files have numbers, too, which are then refused as unknown like any other."""
+    return {str(name): value for name, value in state.items()}

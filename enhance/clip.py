@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,6 +18,9 @@ from render.references import READS as NEEDED
 from render.references import References
 from scenes.opening import warn
 from scenes.scene import Scene
+
+GUIDES = ("flow_prev", "instance", "need", "reference")
+"""What an enhancer may go by beside the picture."""
 
 HUGE = 50_000_000
 """Weights from which a model is no matter of milliseconds on a CPU."""
@@ -33,11 +37,14 @@ def load_saying(weights: str, device: str = "cpu") -> Steps:
 
 
 def enhance_frames(frames: Iterable[Frame], enhancer: Steps, scene: Scene | None = None) -> Iterator[Frame]:
-    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`. Of the
-    instances it is told those that are `anew` in the `scene`, all where None: recorded actors have their own light and shadow already."""
+    """The frames of one clip with their rgb enhanced, each as soon as it comes; best rendered with the outputs in `enhancer.reads`, which
+    alone it goes by: what else was rendered to be kept changes no picture. Of the instances it is told those that are `anew` in the
+    `scene`, all where None: recorded actors have their own light and shadow already."""
     memory, anew = None, None if scene is None else scene.anew()
+    hidden: dict[str, Any] = {name: None for name in GUIDES if name not in enhancer.reads}
     for frame in frames:
-        better, memory = enhancer.step(frame if anew is None else telling(frame, anew), memory)
+        read = replace(frame, **hidden)
+        better, memory = enhancer.step(read if anew is None else telling(read, anew), memory)
         yield replace(frame, rgb=better)
 
 
@@ -52,9 +59,11 @@ def telling(frame: Frame, ids: Sequence[int]) -> Frame:
 def enhancement(
     weights: str, device: str = "cpu", references: References | None = None, scene: Scene | None = None
 ) -> tuple[Stages, tuple[str, ...]]:
-    """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads. references: of the
-    scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
+    """What turns a stream of rendered frames into a stream of enhanced ones, in stages, and the outputs that it reads; it warns where
+    there is nothing to go by. references: of the scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
     enhancer = load_saying(weights, device)
+    if isinstance(enhancer, Enhancer) and not any(enhancer.repairs) and references is None and scene is not None and not scene.anew():
+        warn(["nothing will be enhanced: the scene keeps no photos to go by, nothing was put in, and these weights repair nothing else"])
     outputs = tuple(name for name in enhancer.reads if name != "reference")
     stages: dict[str, Callable] = {"enhance": partial(enhance_frames, enhancer=enhancer, scene=scene)}
     if references is None or "reference" not in enhancer.reads:

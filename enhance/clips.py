@@ -18,6 +18,7 @@ from render.warp import visible
 from scenes.scene import Scene
 
 SMALLEST = 0.004  # an instance must cover this share of the frame to be altered
+NARROWEST = 32  # pixels: training cuts no smaller crops
 NOWHERE = 255  # stored instance where nothing stands, or one beyond what a byte numbers
 CLOCKS_DIFFER = 20_000  # microseconds at most between a log's and a scene's time of one picture: far less than from picture to picture
 
@@ -32,6 +33,12 @@ class PairConfig:
     """Consecutive frames of a clip."""
     every: int = 6
     """Frames from one clip's start to the next's."""
+
+    def __post_init__(self):
+        if self.width < NARROWEST:
+            raise ValueError(f"pairs must be at least {NARROWEST} pixels wide, got {self.width}; 640 is usual")
+        if self.frames < 1 or self.every < 1:
+            raise ValueError(f"frames and every must be at least 1, got {self.frames} and {self.every}")
 
 
 def scene_time(scene: Scene, camera: str, time_us: int) -> int:

@@ -59,6 +59,7 @@ class Pairs:
         names = [path.resolve().name for path in self.scenes]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
+        config = PairConfig(width=self.size)
         check_kinds(self.kinds or ())
         check_names(self.photos)
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
@@ -68,7 +69,7 @@ class Pairs:
             scene, log = open_reconstruction(path), open_log(data)
             cameras = check_cameras(scene, log, self.cameras)
             out = self.output if len(self.scenes) == 1 else self.output / name
-            claim_pairs(out, scene, log, self.seed, PairConfig(width=self.size))
+            claim_pairs(out, scene, log, self.seed, config)
             relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
             sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
             with Progress(f"pairs {name}") as steps:
@@ -77,7 +78,7 @@ class Pairs:
                     steps.total = total
                     steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, PairConfig(width=self.size), self.device)
+                make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
         make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 

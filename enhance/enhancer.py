@@ -87,7 +87,7 @@ class Enhancer:
 
         return open_public(weights, device, **how)
 
-    @torch.inference_mode()
+    @torch.no_grad()  # not inference mode, whose tensors nobody may write to
     def step(self, frame: Frame | torch.Tensor, memory: Memory | None = None) -> tuple[torch.Tensor, Memory]:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 

@@ -216,26 +216,34 @@ def _written(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else "equal" if value > 0 else "-"
 
 
+def _count(word: str) -> int:
+    """A number of clips; argparse says what was wrong with the word."""
+    if not word.isdecimal() or int(word) == 0:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {word}")
+    return int(word)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m enhance.evaluate", description=__doc__)
     parser.add_argument("pairs", type=Path, nargs="+", help="folders that sidestep pairs made")
     parser.add_argument("--weights", default="builtin", help="builtin, a file that sidestep train wrote, or a public model's")
     parser.add_argument("--beside", default=[], action="append", help="a public model's checkpoint as a further row; may be repeated")
-    parser.add_argument("--limit", type=int, default=None, help="most clips of a kind")
+    parser.add_argument("--limit", type=_count, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="where to enhance")
     parser.add_argument("--rollout", type=Path, help="a video; it and told clean frames of the pairs, back and forth for 500: what drifts?")
     options = parser.parse_args(arguments)
     try:
         check_device(options.device)
+        rollout = of_video(options.rollout) if options.rollout else []  # now: a wrong one must not cost the wait for the table
         pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights, options.device)
         others = {Path(path).name: Enhancer.load(path, options.device) for path in options.beside}
         beside = {f"{one.about.get('model', 'weights')} ({name})": one for name, one in others.items()}
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
-        if options.rollout:
-            print(drift_text(options.rollout.name, drift(enhancer, of_video(options.rollout))))
+        if rollout:
+            print(drift_text(options.rollout.name, drift(enhancer, rollout)))
             print(drift_text("clean frames told their objects", drift(enhancer, _told(pairs.of("clean", options.split)))))
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)

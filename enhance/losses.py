@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from enhance.autoencoder import Encoder
+from enhance.checkpoints import read_state
 from render.warp import warp
 
 
@@ -71,7 +72,7 @@ class _EncoderFeatures(nn.Module):
 
 
 class Vgg(nn.Module):
-    """VGG-16 up to relu4_3 from a local file of torchvision's `vgg16` (safetensors or a state dict)."""
+    """VGG-16 up to relu4_3 from a local file of torchvision's `vgg16` (safetensors or a state dict). ValueError for another file."""
 
     WIDTHS = ((3, 64, 64), (64, 128, 128), (128, 256, 256, 256), (256, 512, 512, 512))
 
@@ -80,7 +81,7 @@ class Vgg(nn.Module):
 
     def __init__(self, path: str | Path):
         super().__init__()
-        state = _read_state(Path(path))
+        state = read_state(Path(path))
         self.stages = nn.ModuleList()
         index = 0
         for widths in self.WIDTHS:
@@ -90,7 +91,7 @@ class Vgg(nn.Module):
                 for name in ("weight", "bias"):
                     key = f"features.{index}.{name}"
                     if key not in state or state[key].shape != getattr(conv, name).shape:
-                        raise ValueError(f"{path} is not torchvision's vgg16: {key} is missing or has another shape")
+                        raise ValueError(f"{path} is not torchvision's vgg16: {key} is missing or has another shape; fetch that file")
                     getattr(conv, name).data.copy_(state[key])
                 stage.extend([conv, nn.ReLU()])
                 index += 2
@@ -106,11 +107,3 @@ class Vgg(nn.Module):
             x = stage(x)
             found.append(x)
         return found
-
-
-def _read_state(path: Path) -> dict[str, torch.Tensor]:
-    if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
-        return load_file(path)
-    return torch.load(path, map_location="cpu", weights_only=True)

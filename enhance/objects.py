@@ -9,8 +9,10 @@ Trained to be near in the picture, it corrects less the less sure it is. A missi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 from scipy import ndimage
 from torch import nn
@@ -100,12 +102,16 @@ def _share(at: torch.Tensor, side: slice) -> torch.Tensor:
 
 def boxes(instance: torch.Tensor) -> dict[int, Box]:
     """Of every object of FEWEST pixels and more in `[H, W]`, by its id above 0."""
-    ids = instance.clamp_min(0).int().cpu().numpy()
+    ids = instance.clamp_min(0).long().cpu().numpy()
     height, width = ids.shape
+    names: Sequence[int] = range(int(ids.max()) + 1)
+    if len(names) > ids.size:  # as colours that stand for objects: SciPy would make a list as long as the highest
+        several, ids = np.unique(np.append(ids, 0), return_inverse=True)
+        names, ids = several.tolist(), ids[:-1].reshape(height, width)
     found = {}
-    for i, box in enumerate(ndimage.find_objects(ids)):
-        if box is not None and int((ids[box] == i + 1).sum()) >= FEWEST:
-            found[i + 1] = Box.around(box[0], box[1], height, width)
+    for i, box in enumerate(ndimage.find_objects(ids), 1):
+        if box is not None and int((ids[box] == i).sum()) >= FEWEST:
+            found[names[i]] = Box.around(box[0], box[1], height, width)
     return found
 
 

@@ -221,7 +221,10 @@ def claim(out: Path, settings: dict, made_of: dict) -> None:
     """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
     note, before = out / "pairs.json", {}
     if note.exists():
-        before = json.loads(note.read_text())
+        try:
+            before = dict(json.loads(note.read_text()))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{note} does not say how these pairs were made ({error}); choose another folder") from error
         if {k: v for k, v in before.items() if k in settings} != settings:
             raise ValueError(f"{out} holds pairs made with other settings ({note.read_text()}); choose another folder")
         for name, digest in made_of.items():

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from enhance.clips import PairConfig
 from enhance.isp import alter, random_pipeline
 from enhance.masks import random_mask
 from enhance.pairs import claim
@@ -24,14 +25,15 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
     same region is told and is as it was.
 
     They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path
-    holds no photos, where two have one name, and where the folder holds pairs of others of that name or made with other settings.
+    holds no photos, where two have one name, and where the folder holds pairs of others of that name or made with other settings; and for a
+    `width` that PairConfig refuses.
     """
-    out = Path(out)
+    out, config = Path(out), PairConfig(width)
     check_names(paths)
     for path in map(Path, paths):
-        photos = Photos((path,), STRIDE, width).frames
+        photos = Photos((path,), STRIDE, config.width).frames
         digest = hashlib.sha256(photos[0].tobytes()).hexdigest()[:16]
-        claim(out, {"seed": seed, "width": width}, {f"source {path.stem}": f"{len(photos)} {digest}"})
+        claim(out, {"seed": seed, "width": config.width}, {f"source {path.stem}": f"{len(photos)} {digest}"})
         for i, photo in enumerate(photos):
             rng = np.random.default_rng([seed, i])
             target = torch.from_numpy(photo).permute(2, 0, 1).float() / 255

@@ -10,6 +10,9 @@ import torch
 from render.frame_types import Frame
 from scenes.checks import check_tensor
 
+BYTES = 2.0
+"""Mean of a picture from which it cannot be 0..1, however bright: bytes as floats, or linear light without an exposure."""
+
 
 class Steps(Protocol):
     """An enhancer: frames of one clip in order, `better, memory = enhancer.step(frame, memory)`, memory None at its start.
@@ -53,6 +56,8 @@ def checked(frame: Frame | torch.Tensor) -> Given:
     if not rgb.is_floating_point():
         raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
     _check_finite("rgb", rgb)
+    if not isinstance(frame, Frame) and (mean := float(rgb.mean(dtype=torch.float32))) > BYTES:  # a render may be that bright
+        raise ValueError(f"rgb must be floats in 0..1, but its mean is {mean:.4g}; divide bytes by 255")
     if flow is not None:
         check_tensor("flow_prev", flow, (height, width, 2))
     if instance is not None:

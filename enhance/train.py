@@ -83,10 +83,11 @@ def train(
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off, or weights alone; ValueError where there is nothing to train
     a stage of `only` on (others are left out then), and where the checkpoint is of a training of something else.
     """
-    if (minutes is None) == (steps is None):
+    budget = steps if minutes is None else minutes
+    if budget is None or (minutes is not None and steps is not None):
         raise ValueError("give the training budget either as minutes or as steps")
-    if not (minutes or steps or 0) > 0:
-        raise ValueError(f"the training budget must be positive, got {minutes or steps}")
+    if not budget > 0:
+        raise ValueError(f"the training budget must be positive, got {budget}")
     for stage in only or ():
         if stage not in STAGES[1:]:
             raise ValueError(unknown("stage", stage, "what can be trained further", STAGES[1:]))
@@ -119,6 +120,7 @@ def train(
     run = Run(config, begun, minutes, steps, seed, stages, device, told)
     if resume and checkpoint.exists():
         run.load(checkpoint)
+    perceptual = PatchPerceptual(run.net.encoder, vgg).to(run.device)  # now, or a wrong file would be found after the other stages
     out.mkdir(parents=True, exist_ok=True)
     report = _Reporter(run, progress)
     try:
@@ -137,7 +139,6 @@ def train(
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
-        perceptual = PatchPerceptual(run.net.encoder, vgg).to(run.device)
         go("enhancer", partial(_clips, run, sampler), partial(_enhancer_step, run, perceptual))
     except KeyboardInterrupt:
         run.save(checkpoint)

@@ -55,7 +55,8 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f'no weights at {path}; write "builtin" for the shipped ones, or train some: sidestep train PAIRS -o {path.parent}'
+            f'no weights at {path}; write "builtin" for the shipped ones, fetch a public model and give where it lies, '
+            f"or train some: sidestep train PAIRS -o {path.parent}"
         )
     try:
         with safe_open(path, "pt") as file:
@@ -68,8 +69,8 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
     try:
         known = {f.name for f in fields(NetConfig)}
         net = Net(NetConfig(**{k: int(v) for k, v in json.loads(header["config"]).items() if k in known}))
-        about = json.loads(header.get("about", "{}"))
-    except (KeyError, TypeError, ValueError) as error:
+        about = dict(json.loads(header.get("about", "{}")))
+    except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:  # torch's own, of sizes that are none
         raise ValueError(f"{path} has a broken header ({error}); fetch or train it again") from error
     _check_state(path, net, state)
     net.load_state_dict(state)

@@ -56,11 +56,13 @@ class Video:
 
     fps: frames a second in the mean; width, height: pixels of the turned frames; pixel_aspect: how much wider than high a pixel is to be
     shown; count, seconds: frames and length as the file claims, None where it does not say. Raises ValueError where the file is no video,
-    has no frames, or breaks off in the middle.
+    has no frames, breaks off in the middle, or goes on in another size.
     """
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
+        if self.path.is_dir():
+            raise ValueError(f"{path} is a folder, not a video; of pictures make one first, as by ffmpeg -i {path}/%06d.png clip.mp4")
         if not self.path.is_file():
             raise FileNotFoundError(f"no such video: {path}")
         with self._open() as container:
@@ -88,7 +90,11 @@ class Video:
         for i, frame in enumerate(self._decoded()):
             at = i / self.fps if frame.pts is None else float(frame.pts * frame.time_base)
             began = at if began is None else began
-            yield round((at - began) * 1e6), from_bytes(np.rot90(frame.to_ndarray(format="rgb24"), _quarters(frame)))
+            pixels = np.rot90(frame.to_ndarray(format="rgb24"), _quarters(frame))
+            if pixels.shape[:2] != (self.height, self.width):
+                sizes = f"{self.width}x{self.height} to {pixels.shape[1]}x{pixels.shape[0]}"
+                raise ValueError(f"{self.path} changes its size after frame {i}, from {sizes}; cut it there, or scale it to one size")
+            yield round((at - began) * 1e6), from_bytes(pixels)
 
     def _decoded(self):
         """PyAV's frames, as they are stored."""

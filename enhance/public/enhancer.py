@@ -57,7 +57,7 @@ class PublicEnhancer:
         if self.history not in (0, model.history):
             raise ValueError(f"history must be {' or '.join(str(n) for n in sorted({0, model.history}))} for {model.name}, got {history}")
 
-    @torch.inference_mode()
+    @torch.no_grad()  # not inference mode, whose tensors nobody may write to
     def step(self, frame: Frame | torch.Tensor, memory: Recent | None = None) -> tuple[torch.Tensor, Recent]:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 
@@ -75,7 +75,7 @@ class PublicEnhancer:
             clip = (rgb, _resized(self.reference, rgb.shape[:2]))
         out = in_parts(self.model, torch.stack(clip).permute(0, 3, 1, 2)[None], torch.bfloat16 if self.bfloat16 else torch.float32)
         better = out[0].permute(1, 2, 0).clamp(0, 1).contiguous()
-        return better, Recent(rgb, (better, *last)[: max(self.history, 1)])
+        return better, Recent(rgb, (better.clone(), *last)[: max(self.history, 1)])  # what is handed out may be drawn on
 
 
 def in_parts(model: Model, clip: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:

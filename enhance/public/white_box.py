@@ -136,7 +136,7 @@ class WhiteBoxEnhancer:
         self.device = torch.device(device)
         self.model, self.about = model.to(self.device), about or {}
 
-    @torch.inference_mode()
+    @torch.no_grad()  # not inference mode, whose tensors nobody may write to
     def step(self, frame: Frame | torch.Tensor, memory: Arguments | None = None) -> tuple[torch.Tensor, Arguments | None]:
         """One frame of any size: float32 `[H, W, 3]` in 0..1; as it went in where it has no instance, or none is seen. Raises ValueError
         for values that are not finite."""

@@ -1,11 +1,14 @@
 """Whole videos."""
 
+import io
 from dataclasses import replace
 from fractions import Fraction
 
+import av
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from small_net import SMALL, stirred
 
 from enhance.clip import enhance_frames, enhance_video, enhancement, telling
@@ -66,6 +69,28 @@ def test_an_undecodable_clip_is_refused_and_leaves_nothing(tmp_path, enhancer):
     assert [p.name for p in tmp_path.iterdir()] == ["in.mp4"]
 
 
+def test_a_clip_that_goes_on_in_another_size_is_refused_by_frame(tmp_path, enhancer):
+    """Each picture of motion JPEG has a size of its own."""
+    with av.open(tmp_path / "in.mkv", "w") as container:
+        stream = container.add_stream("mjpeg", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for i, size in enumerate([(64, 48), (64, 48), (96, 64)]):
+            whole = io.BytesIO()
+            Image.new("RGB", size, "grey").save(whole, "JPEG")
+            packet = av.Packet(whole.getvalue())
+            packet.pts = packet.dts = i
+            packet.time_base, packet.stream = Fraction(1, 10), stream
+            container.mux(packet)
+    with pytest.raises(ValueError, match=r"in.mkv changes its size after frame 2, from 64x48 to 96x64; cut it there"):
+        enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", enhancer)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.mkv"]
+
+
+def test_a_folder_of_pictures_is_called_that(tmp_path, enhancer):
+    with pytest.raises(ValueError, match="is a folder, not a video; of pictures make one first"):
+        enhance_video(tmp_path, tmp_path / "out.mp4", enhancer)
+
+
 def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
     write(tmp_path / "in.mp4")
     with pytest.raises(ValueError, match="itself"):
@@ -96,9 +121,30 @@ def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     assert "was changed" not in capsys.readouterr().err
 
 
+def test_it_is_said_where_a_scene_gives_nothing_to_go_by(street, capsys):
+    (actor, *_) = street.actors
+    put_in = replace(actor, asset=replace(actor.asset, meta={**actor.asset.meta, "inserted": True}), track="put_in")
+    for scene in (None, replace(street, actors=(actor, put_in))):
+        enhancement("builtin", scene=scene)
+    enhancement("builtin", references=References([], street), scene=street)
+    assert "nothing will be enhanced" not in capsys.readouterr().err
+    enhancement("builtin", scene=street)
+    assert "nothing will be enhanced: the scene keeps no photos" in capsys.readouterr().err
+
+
+def test_outputs_that_are_rendered_to_be_kept_change_no_picture(street, tmp_path):
+    save_net(Net(SMALL), tmp_path / "untrained.safetensors", {})
+    stages, reads = enhancement(str(tmp_path / "untrained.safetensors"))
+    (frame,) = render_clip(street, "front_camera", 0.5, times(street)[:1], outputs=("rgb", *reads))
+    referenced = replace(frame, reference=torch.ones_like(frame.rgb), trust=torch.ones_like(frame.rgb[..., 0]))
+    kept = replace(referenced, need=torch.zeros_like(referenced.trust))
+    without, beside = (next(stages["enhance"](iter([f]))) for f in (referenced, kept))
+    assert torch.equal(without.rgb, beside.rgb) and beside.need is kept.need and without.rgb.mean() > frame.rgb.mean() + 0.2
+
+
 def test_of_a_scenes_actors_those_that_were_put_in_or_edited_are_told(street):
     class Listening:
-        told = ()
+        told, reads = (), ("instance",)
 
         def step(self, frame, memory=None):
             self.told = (*self.told, frame.instance)

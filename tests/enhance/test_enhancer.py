@@ -6,7 +6,7 @@ from small_net import SMALL, stirred
 
 from enhance.enhancer import Enhancer
 from enhance.net import Net
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
+from enhance.weights_file import BUILTIN, FORMAT, REPAIR_GAIN, WORTH, load_net, save_net
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -100,11 +100,25 @@ def test_a_value_that_is_not_finite_is_refused_by_place(enhancer):
 
 @pytest.mark.parametrize(
     ("wrong", "says"),
-    [(torch.zeros(32, 48), "shape"), (torch.zeros(32, 48, 3, dtype=torch.uint8), "255"), (torch.zeros(0, 48, 3), "pixels")],
+    [
+        (torch.zeros(32, 48), "shape"),
+        (torch.zeros(32, 48, 3, dtype=torch.uint8), "255"),
+        (torch.full((32, 48, 3), 90.0), "its mean is 90; divide bytes by 255"),
+        (torch.zeros(0, 48, 3), "pixels"),
+    ],
 )
 def test_what_is_no_picture_is_refused(enhancer, wrong, says):
     with pytest.raises(ValueError, match=says):
         enhancer.step(wrong)
+
+
+def test_what_comes_back_may_be_written_to_and_learnt_through(enhancer):
+    better, memory = enhancer.step(picture().requires_grad_())
+    assert not better.requires_grad and not memory.past.latents.requires_grad
+    gain = torch.ones(3, requires_grad=True)
+    (better * gain).sum().backward()
+    better[:2] = 0
+    assert torch.isfinite(gain.grad).all()
 
 
 def test_flow_of_another_size_is_refused(enhancer):
@@ -135,6 +149,16 @@ def test_broken_weights_say_what_is_wrong(tmp_path):
         load_net(file)
     with pytest.raises(FileNotFoundError, match="builtin"):
         load_net(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("header", [{"config": "null"}, {"config": '{"width": -8}'}, {"config": '{"looks": 3}'}, {"about": "[1]"}])
+def test_a_header_that_says_nonsense_is_called_broken(tmp_path, header):
+    from safetensors.torch import save_file
+
+    file = tmp_path / "w.safetensors"
+    save_file({"a": torch.zeros(1)}, file, {"format": FORMAT, "config": "{}", **header})
+    with pytest.raises(ValueError, match="w.safetensors has a broken header"):
+        load_net(file)
 
 
 def test_weights_with_a_value_that_is_not_finite_are_refused(tmp_path):

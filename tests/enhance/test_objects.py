@@ -75,6 +75,14 @@ def test_only_told_objects_change_and_small_ones_do_not():
     assert differs[instance == 5].float().mean() > 0.9 and not differs[instance != 5].any()
 
 
+def test_ids_may_be_as_high_as_they_come():
+    """As of masks whose colours stand for objects: a list of all ids up to the highest would take the memory."""
+    _, instance = scene()
+    instance[40:60, 40:60] = 7
+    low, high = boxes(instance), boxes(torch.where(instance > 0, instance + (2**31 - 8), instance))
+    assert list(low) == [5, 7] and list(high) == [2**31 - 3, 2**31 - 1] and list(low.values()) == list(high.values())
+
+
 def test_where_no_mask_is_told_nothing_changes():
     rgb, _ = scene()
     assert torch.equal(correct(stirred(), rgb, torch.zeros(64, 96), {})[0], rgb)

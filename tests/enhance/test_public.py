@@ -227,6 +227,10 @@ def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer,
     torch.save({"layer.weight": torch.zeros(2)}, cut)
     with pytest.raises(ValueError, match=r"layer\.weight; give NVIDIA Harmonizer"):
         Enhancer.load(cut)
+    for vae in ("conv1.weight", 7):
+        torch.save({"state_dict_unet": {7: torch.zeros(2)}, "state_dict_vae": {vae: torch.zeros(2)}}, cut)
+        with pytest.raises(ValueError, match=r"cut\.pkl"):
+            open_public(cut)
     torch.save([torch.zeros(2)], cut)
     with pytest.raises(ValueError, match="holds a list"):
         open_public(cut)
@@ -235,7 +239,7 @@ def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer,
     (tmp_path / "enhancer.safetensors").touch()
     with pytest.raises(ValueError, match=r"folder of a training; give .*enhancer\.safetensors"):
         Enhancer.load(tmp_path)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match="fetch a public model"):
         Enhancer.load(tmp_path / "none.pkl")
 
 
@@ -384,6 +388,13 @@ def test_what_is_no_picture_is_refused(harmonizer):
         enhancer.step(rgb)
     with pytest.raises(ValueError, match="takes no reference"):
         Enhancer.load(harmonizer, reference=picture())
+
+
+def test_what_is_drawn_on_a_result_is_not_remembered(harmonizer):
+    better, memory = Enhancer.load(harmonizer, bfloat16=False).step(picture())
+    before = better.clone()
+    better[:4] = 0
+    assert torch.equal(memory.frames[0], before)
 
 
 def test_a_huge_model_says_so_before_it_begins(harmonizer, monkeypatch, capsys):

@@ -137,6 +137,20 @@ def test_a_damaged_clip_is_named_with_the_fix(tmp_path, spoil, capsys):
     assert main([str(tmp_path / "p"), "--split", "train"]) == 1 and "delete a.json" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("limit", ["0", "-1", "x"])
+def test_a_table_of_no_clips_is_refused(limit, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), f"--limit={limit}"])
+    assert f"must be a whole number from 1, got {limit}" in capsys.readouterr().err
+
+
+def test_a_rollout_that_is_not_there_is_said_before_anything_is_measured(tmp_path, monkeypatch, capsys):
+    written(tmp_path / "p", "clean")
+    monkeypatch.setitem(main.__globals__, "evaluate", lambda *_: pytest.fail("it measures"))
+    assert main([str(tmp_path / "p"), "--split", "train", "--rollout", str(tmp_path / "gone.mp4")]) == 1
+    assert "gone.mp4" in capsys.readouterr().err
+
+
 def test_pairs_of_another_scene_do_not_go_into_the_same_folder(street, recording, tmp_path):
     config = PairConfig(width=32, frames=2, every=4)
     out = make_pairs(street, recording, tmp_path / "p", ("clean",), config=config)
@@ -144,6 +158,9 @@ def test_pairs_of_another_scene_do_not_go_into_the_same_folder(street, recording
         make_pairs(replace(street, actors=()), recording, out, ("clean",), config=config)
     note = out / "pairs.json"
     settings = json.loads(note.read_text())
+    note.write_text("")
+    with pytest.raises(ValueError, match=r"pairs.json does not say how these pairs were made"):
+        make_pairs(street, recording, out, ("clean",), config=config)
     note.write_text(json.dumps({k: v for k, v in settings.items() if k not in ("scene", "recording")}))  # as the code before wrote it
     make_pairs(street, recording, out, ("clean",), config=config)
 
@@ -174,6 +191,12 @@ def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street,
         replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
     with pytest.raises(UsageError, match="--cameras names none"):
         replace(one, cameras=()).run()
+    for size in (0, -5, 31):
+        with pytest.raises(ValueError, match=f"at least 32 pixels wide, got {size}"):
+            replace(one, cameras=None, size=size).run()
+        with pytest.raises(ValueError, match=f"at least 32 pixels wide, got {size}"):
+            make_photo_pairs([tmp_path], tmp_path / "out", width=size)
+    assert not (tmp_path / "out").exists()
     with pytest.raises(UsageError, match="--only names none"):
         Train((tmp_path,), tmp_path / "t", only=()).run()
     make_pairs(replace(street, actors=()), recording, tmp_path / "out", ("clean",), config=PairConfig(frames=2, width=32))
@@ -192,6 +215,13 @@ def test_what_photos_say_must_be_finite_and_is_trusted_in_all_at_most():
         checked(Frame(camera, rgb=rgb, reference=bad, trust=trust))
     with pytest.raises(ValueError, match="trust holds"):
         checked(Frame(camera, rgb=rgb, reference=rgb, trust=torch.full((4, 6), torch.inf)))
+
+
+def test_a_vgg_that_is_none_is_refused_before_anything_is_trained(awake, tmp_path):
+    (tmp_path / "vgg16.pth").write_bytes(b"P" + bytes(200))
+    with pytest.raises(ValueError, match=r"vgg16.pth does not open as tensors alone"):
+        train(written(tmp_path / "p", "isp"), tmp_path / "t", steps=4, config=QUICK, start=awake, vgg=tmp_path / "vgg16.pth")
+    assert not (tmp_path / "t").exists()
 
 
 def test_weights_are_never_trained_over(tmp_path):

@@ -85,6 +85,8 @@ def test_an_unfinished_training_is_not_overwritten(pairs, tmp_path):
 def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
     with pytest.raises(ValueError, match="budget"):
         train(pairs, tmp_path, **budget)
+    with pytest.raises(ValueError, match=r"positive, got 0\.0"):
+        train(pairs, tmp_path, minutes=0.0)
 
 
 @pytest.mark.parametrize("device", DEVICES)
