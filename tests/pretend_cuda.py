@@ -177,7 +177,7 @@ def _there(function, at: int = 0):
 
 
 def _plainly(function):
-    """A function of Warp that looks at a tensor itself."""
+    """A function that looks at tensors itself."""
 
     @wraps(function)
     def plain(*args, **kwargs):
@@ -197,6 +197,15 @@ def pretend() -> None:
     from render import compositing, launch
 
     compositing.by_blocks = lambda device: False
+    by_lanes = _plainly(compositing._composite)
+
+    def composite(settings, w, lists, scene):
+        out = by_lanes(settings, w, lists, scene)
+        if _marked(scene.records):
+            tree_map_only(torch.Tensor, _mark, out)
+        return out
+
+    compositing._composite = composite
     ready = launch._ready
     launch._ready = lambda kernel, device: ready(kernel, "cpu")
     wp.from_torch = _plainly(wp.from_torch)

@@ -224,12 +224,12 @@ def examine(case: Case, device: str = "cpu") -> list[str]:
     if case.truth:
         with torch.no_grad():
             config = RenderConfig(termination=0, order=case.order)
-            frame = rasterize(case.placed, case.camera, ("rgb",), model=case.model, config=config)
+            frame = rasterize(placed, case.camera, ("rgb",), model=case.model, config=config)
             truth, _, _, _, edge = oracle.render(
                 oracle.as_oracle(case.placed), case.camera, case.model, cutoff=1 / 255, alpha_max=0.999, order=case.order,
                 world_from_cam_end=case.camera.world_from_cam_end, ends=[p.world_from_local_end for p in case.placed],
             )  # fmt: skip
-        off = (frame.rgb.double() - truth).abs()[~edge]
+        off = (frame.rgb.cpu().double() - truth).abs()[~edge]
         # beyond pixel 2048 a float's step is 2.4e-4 px, which a splat of one pixel shows as 1e-4
         limit = (1e-4 if max(case.camera.width, case.camera.height) > 2048 else 2.5e-5) * max(1.0, float(truth.max()))
         if off.numel() and off.max() > limit:
