@@ -11,11 +11,14 @@ from typing import Any
 import torch
 
 from enhance.enhancer import Enhancer
-from enhance.step import Steps
+from enhance.object_ids import ObjectIds
+from enhance.pictures import Pictures, PictureWriter
+from enhance.step import Steps, frame_of
 from render.frame_types import Frame
 from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
+from render.video import Video, VideoWriter, read_video
 from scenes.opening import warn
 from scenes.scene import Scene
 
@@ -77,37 +80,53 @@ def enhance_video(
     enhancer: Steps | None = None,
     progress: Callable[[int, int | None], None] | None = None,
     rendered: bool = False,
-) -> int:
-    """Enhance any video that FFmpeg decodes, of any size, in constant memory; returns the number of frames.
+    instances: str | Path | None = None,
+) -> tuple[int, int]:
+    """Enhance any video that FFmpeg decodes, or the pictures of a folder, of any size, in constant memory; returns how many frames there
+    are, and how many of them were changed.
 
-    The result is H.264 with the source's times and shape of pixels, without its sound. A side that is odd gains one repeated row or
-    column, which H.264's 4:2:0 needs. `progress` is called with frames done and frames in all, where the file says. rendered: whether the
-    video shows renders, which our own network repairs; else it leaves a video as it is, since nobody says what was put in. It warns where
-    no frame was changed.
+    A video becomes H.264 with the source's times and shape of pixels, without its sound; a side that is odd gains one repeated row or
+    column, which H.264's 4:2:0 needs. A folder becomes a folder of PNG by the same names. `progress` is called with frames done and frames
+    in all, where the file says. rendered: whether the clip shows renders, which our own network repairs. instances: a folder that tells
+    where objects were put in (`ObjectIds`), whose colours and shadows are set right. Without either our own network leaves a clip as it is,
+    and it warns where no frame was changed.
     Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
-    from render.video import VideoWriter, read_video
-
-    video = read_video(source)
+    clip = Pictures(source) if Path(source).is_dir() else read_video(source)
     if Path(out).exists() and Path(out).samefile(source):
         raise ValueError(f"{out} is the clip itself; write the enhanced one elsewhere")
+    ids = None if instances is None else ObjectIds(instances, clip.count)
     enhancer = enhancer or Enhancer.load()
+    if ids is not None and "instance" not in enhancer.reads:
+        raise ValueError(f"{enhancer.about.get('model', 'this model')} cannot be told where objects are; leave --instances out")
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
-    memory, done, changed = None, 0, False
-    with VideoWriter(out, video.fps, video.width, video.height, pixel_aspect=video.pixel_aspect) as writer:
-        for time_us, rgb in video.timed():
-            better, memory = enhancer.step(rgb, memory)
-            changed = changed or not torch.equal(better, rgb.to(better).clamp(0, 1))
-            writer.write(better, time_us)
+    memory, done, changed = None, 0, 0
+    with _writer(out, clip) as writer:
+        for at, rgb in clip.timed():
+            frame = rgb if ids is None else frame_of(rgb, ids.of(done, clip.width, clip.height))
+            better, memory = enhancer.step(frame, memory)
+            changed += not torch.equal(better, rgb.to(better).clamp(0, 1))
+            writer.write(better, at)
             done += 1
             if progress is not None:
-                progress(done, video.count)
+                progress(done, clip.count)
     if not changed:
-        why = (
-            "these weights' network rests, as it gained too little where it had not been"
-            if rendered
-            else "if it shows renders, say --rendered"
+        warn(
+            [f"no frame of {source} was changed: {_why(rendered, ids is not None)}; render --enhance tells objects and has photos to go by"]
         )
-        warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
-    return done
+    return done, changed
+
+
+def _writer(out: str | Path, clip: Pictures | Video) -> PictureWriter | VideoWriter:
+    if isinstance(clip, Pictures):
+        return PictureWriter(out, [file.stem for file in clip.files])
+    return VideoWriter(out, clip.fps, clip.width, clip.height, pixel_aspect=clip.pixel_aspect)
+
+
+def _why(rendered: bool, told_objects: bool) -> str:
+    if told_objects:
+        return "these weights find the told objects right"
+    if rendered:
+        return "these weights' network rests, as it gained too little where it had not been"
+    return "if it shows renders, say --rendered; if something was put in, say where by --instances"

@@ -147,29 +147,36 @@ class Train:
 
 @dataclass
 class Enhance:
-    """Enhance any video."""
+    """Enhance any video, or a folder of pictures."""
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP")]]
-    """The video."""
+    """The video, or the folder of a clip's pictures."""
     output: Output
-    """The enhanced video, as clean.mp4."""
+    """The enhanced video, as clean.mp4; of a folder of pictures, the folder of the enhanced ones."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
+    instances: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Tells where objects were put in, whose colours and shadows are then set right: a .png or .npy for each frame, in which each object
+    has a number or colour of its own and all else is 0; as render --outputs instance keeps them."""
     rendered: Flag = False
-    """The video shows renders of splats: repair them. Else the built-in weights leave it as it is, as nobody tells what was put in."""
+    """The video shows renders of splats: repair them. Without this and --instances the built-in weights leave it as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to enhance."""
     overwrite: Overwrite = False
-    """Replace an existing file."""
+    """Replace an existing file or folder."""
 
     def run(self) -> None:
         fresh(self.output, self.overwrite)
         from enhance.clip import enhance_video, load_saying
         from render.progress import Progress
-        from render.video import read_video
 
         check_device(self.device)
-        with Progress(f"enhance {self.clip.name}", read_video(self.clip).count) as steps:
+        with Progress(f"enhance {self.clip.name}") as steps:
+
+            def say(done: int, total: int | None) -> None:
+                steps.total = total
+                steps.step(done - steps.done)
+
             enhancer = load_saying(self.weights, self.device)
-            count = enhance_video(self.clip, self.output, enhancer, lambda done, total: steps.step(), self.rendered)
-        print(f"wrote {self.output}, {count} frames")
+            count, changed = enhance_video(self.clip, self.output, enhancer, say, self.rendered, self.instances)
+        print(f"wrote {self.output}, {count} frame{'s' * (count != 1)}, {changed} of them changed")

@@ -18,12 +18,10 @@ from enhance.drift import KEPT, drift, drift_text, of_video
 from enhance.enhancer import Enhancer
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
-from enhance.step import Steps
+from enhance.step import Steps, frame_of
 from enhance.weights_file import BUILTIN, load_net
 from render.compare import psnr, ssim
 from render.frame_types import Frame
-from scenes.camera import Camera
-from scenes.lenses import Pinhole
 from scenes.opening import check_device
 from scenes.spread import spread
 
@@ -176,10 +174,7 @@ def _mean(values: list[float], measure: str) -> float:
 
 def _frame(window: Window, t: int, told: bool, referenced: bool) -> Frame:
     rgb = window.input[t].permute(1, 2, 0).contiguous()
-    height, width = rgb.shape[:2]
-    somewhere = Camera(Pinhole(1.0, 1.0, width / 2, height / 2), width, height, torch.eye(4, dtype=torch.float64))
-    flow = window.flow[t].permute(1, 2, 0) if t else None
-    frame = Frame(somewhere, rgb=rgb, flow_prev=flow, instance=window.instance[t, 0] if told else None)
+    frame = replace(frame_of(rgb, window.instance[t, 0] if told else None), flow_prev=window.flow[t].permute(1, 2, 0) if t else None)
     if not referenced:
         return frame
     return replace(frame, reference=window.reference[t].permute(1, 2, 0), trust=window.trust[t, 0])

@@ -8,7 +8,9 @@ from typing import Any, Protocol
 import torch
 
 from render.frame_types import Frame
+from scenes.camera import Camera
 from scenes.checks import check_tensor
+from scenes.lenses import Pinhole
 
 BYTES = 2.0
 """Mean of a picture from which it cannot be 0..1, however bright: bytes as floats, or linear light without an exposure."""
@@ -72,6 +74,13 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         _check_finite("trust", reference[1])
         reference = reference[0], reference[1].clamp(0, 1)
     return Given(rgb, flow, instance, need, reference)
+
+
+def frame_of(rgb: torch.Tensor, instance: torch.Tensor | None) -> Frame:
+    """A frame of no camera, of rgb `[H, W, 3]` and of what is known of its objects `[H, W]`."""
+    height, width = rgb.shape[:2]
+    nowhere = Camera(Pinhole(1.0, 1.0, width / 2, height / 2), width, height, torch.eye(4, dtype=torch.float64))
+    return Frame(nowhere, rgb=rgb, instance=instance)
 
 
 def _check_finite(name: str, image: torch.Tensor) -> None:

@@ -18,7 +18,7 @@ from enhance.weights_file import save_net
 from render.clip import render_clip
 from render.frame_types import Frame
 from render.references import References, Shot
-from render.video import VideoWriter, read_video
+from render.video import VideoWriter, read_image, read_video, write_image
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def write(path, count=4, width=50, height=34):
 def test_every_frame_is_enhanced_and_said(tmp_path, enhancer):
     write(tmp_path / "in.mp4")
     told = []
-    assert enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer, lambda done, of: told.append((done, of))) == 4
+    assert enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer, lambda done, of: told.append((done, of))) == (4, 0)
     out = list(read_video(tmp_path / "out.mp4"))
     assert [round(float(f.mean()), 1) for f in out] == [0.2, 0.3, 0.4, 0.5] and out[0].shape == (34, 50, 3)
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)] and read_video(tmp_path / "out.mp4").fps == 10
@@ -86,9 +86,99 @@ def test_a_clip_that_goes_on_in_another_size_is_refused_by_frame(tmp_path, enhan
     assert [p.name for p in tmp_path.iterdir()] == ["in.mkv"]
 
 
-def test_a_folder_of_pictures_is_called_that(tmp_path, enhancer):
-    with pytest.raises(ValueError, match="is a folder, not a video; of pictures make one first"):
-        enhance_video(tmp_path, tmp_path / "out.mp4", enhancer)
+@pytest.fixture
+def pictures(tmp_path):
+    """A folder of a clip: a bright square on a grey street, frame 9 before frame 10."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i in (8, 9, 10):
+        write_image(folder / f"f{i}.png", torch.full((34, 50, 3), 0.4 + 0.01 * i))
+    return folder
+
+
+class Marking:
+    """An enhancer that paints what it is told in the colour of its id."""
+
+    about: dict = {}
+    reads = ("instance",)
+    device = torch.device("cpu")
+
+    def step(self, frame, memory=None):
+        if isinstance(frame, torch.Tensor):
+            return frame, None
+        return torch.where((frame.instance > 0)[..., None], frame.instance[..., None] / 255, frame.rgb), None
+
+
+def test_a_folder_of_pictures_becomes_one(tmp_path, pictures, capsys):
+    assert enhance_video(pictures, tmp_path / "out", Marking()) == (3, 0)
+    assert "say where by --instances" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["f10.png", "f8.png", "f9.png"]
+    assert torch.equal(read_image(tmp_path / "out" / "f9.png"), read_image(pictures / "f9.png"))
+    with pytest.raises(ValueError, match=r"out.mp4 would be a video; pictures become pictures: name a folder, as -o .*/out"):
+        enhance_video(pictures, tmp_path / "out.mp4", Marking())
+    with pytest.raises(FileExistsError, match=r"would be replaced, and holds more than pictures \(frames\)"):
+        enhance_video(pictures, tmp_path, Marking())
+    write_image(pictures / "f11.png", torch.zeros(20, 50, 3))
+    with pytest.raises(ValueError, match="f11.png is 50x20, f8.png 50x34"):
+        enhance_video(pictures, tmp_path / "other", Marking())
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="holds no pictures"):
+        enhance_video(tmp_path / "empty", tmp_path / "other", Marking())
+
+
+def ids(kind: str, number: int) -> np.ndarray | Image.Image:
+    """Object 7 in the columns from `number` on."""
+    array = np.zeros((34, 50), np.int32)
+    array[:, number:] = 7
+    if kind == "array":
+        return array - (array == 0)  # -1 is the sky
+    if kind == "colour":
+        return Image.fromarray((array[..., None] * np.array([0, 0, 1])).astype(np.uint8))
+    return Image.fromarray(array.astype(np.uint8 if kind == "grey" else np.uint16))
+
+
+@pytest.mark.parametrize("kind", ["array", "grey", "deep grey", "colour"])
+def test_objects_are_told_picture_by_picture(tmp_path, pictures, kind):
+    folder = tmp_path / "ids"
+    folder.mkdir()
+    for i in (8, 9, 10):
+        np.save(folder / f"{i}.npy", ids(kind, i)) if kind == "array" else ids(kind, i).save(folder / f"{i}.png")
+    assert enhance_video(pictures, tmp_path / "out", Marking(), instances=folder) == (3, 3)
+    for i in (8, 9, 10):
+        red = (255 * read_image(tmp_path / "out" / f"f{i}.png")[0, :, 0]).round().int()
+        assert (red[:i] != 7).all() and (red[i:] == 7).all()
+
+
+def test_ids_that_do_not_fit_are_refused(tmp_path, pictures):
+    folder = tmp_path / "ids"
+    folder.mkdir()
+
+    def refused(why: str) -> None:
+        with pytest.raises(ValueError, match=why):
+            enhance_video(pictures, tmp_path / "out", Marking(), instances=folder)
+        assert not (tmp_path / "out").exists()
+
+    refused("holds no .npy or .png")
+    for i in range(3):
+        np.save(folder / f"{i}.npy", np.zeros((34, 50), np.int32))
+    np.save(folder / "1.npy", np.zeros((30, 50), np.int32))
+    refused(r"1.npy has the shape \[30, 50\], but its picture is 34 rows of 50")
+    np.save(folder / "1.npy", np.zeros((34, 50)))
+    refused("1.npy holds float64; ids are whole numbers")
+    np.save(folder / "1.npy", np.arange(34 * 50, dtype=np.int32).reshape(34, 50))
+    refused("1.npy tells of 1699 objects.*without soft edges")
+    (folder / "1.npy").write_bytes(b"none")
+    refused("1.npy is not an array")
+    (folder / "1.npy").unlink()
+    refused("has ids for 2 pictures, and the clip has 3")
+
+
+def test_a_model_that_cannot_be_told_says_so(tmp_path, pictures):
+    deaf = Marking()
+    deaf.reads, deaf.about = (), {"model": "NVIDIA Fixer"}
+    with pytest.raises(ValueError, match="NVIDIA Fixer cannot be told where objects are; leave --instances out"):
+        enhance_video(pictures, tmp_path / "out", deaf, instances=pictures)
 
 
 def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):

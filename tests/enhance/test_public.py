@@ -422,5 +422,5 @@ def test_a_clip_is_enhanced_by_any_of_them(harmonizer, tmp_path):
     with VideoWriter(tmp_path / "clip.mp4", 10, 48, 32) as writer:
         for i in range(3):
             writer.write(picture() * (1 - 0.02 * i))
-    assert enhance_video(tmp_path / "clip.mp4", tmp_path / "clean.mp4", Enhancer.load(harmonizer)) == 3
+    assert enhance_video(tmp_path / "clip.mp4", tmp_path / "clean.mp4", Enhancer.load(harmonizer)) == (3, 3)
     assert [tuple(rgb.shape) for rgb in read_video(tmp_path / "clean.mp4")] == 3 * [(32, 48, 3)]
