@@ -13,6 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.past import alike, thin
 from enhance.public.filters import FILTERS, harmonized
 from enhance.public.layout import fill, finite
 from enhance.step import checked
@@ -122,9 +123,10 @@ class WhiteBox(nn.Module):
 
 @dataclass(frozen=True)
 class Arguments:
-    """The filters' arguments `[6]`, averaged over the frames so far."""
+    """The filters' arguments `[6]`, averaged over the frames so far, and what the last of these looked like, in small."""
 
     mean: torch.Tensor
+    look: torch.Tensor
 
 
 class WhiteBoxEnhancer:
@@ -138,13 +140,14 @@ class WhiteBoxEnhancer:
 
     @torch.no_grad()  # not inference mode, whose tensors nobody may write to
     def step(self, frame: Frame | torch.Tensor, memory: Arguments | None = None) -> tuple[torch.Tensor, Arguments | None]:
-        """One frame of any size: float32 `[H, W, 3]` in 0..1; as it went in where it has no instance, or none is seen. Raises ValueError
-        for values that are not finite."""
+        """One frame of any size: float32 `[H, W, 3]` in 0..1; as it went in where it has no instance, or none is seen. After a cut the
+        average begins anew. Raises ValueError for values that are not finite."""
         given = checked(frame)
         rgb = given.rgb.to(self.device, torch.float32).clamp(0, 1)
         if given.instance is None or not (given.instance > 0).any():
             return rgb, memory
         image, mask = rgb.permute(2, 0, 1)[None], (given.instance > 0).to(rgb)[None, None]
-        now = torch.cat(self.model(image, mask))
-        mean = now if memory is None else KEPT * memory.mean + (1 - KEPT) * now
-        return harmonized(image, mask, mean[:, None].unbind())[0].permute(1, 2, 0).contiguous(), Arguments(mean)
+        now, look = torch.cat(self.model(image, mask)), thin(image)
+        known = memory is not None and memory.look.shape == look.shape and bool(alike(look, memory.look)[0])
+        mean = KEPT * memory.mean + (1 - KEPT) * now if memory is not None and known else now
+        return harmonized(image, mask, mean[:, None].unbind())[0].permute(1, 2, 0).contiguous(), Arguments(mean, look)

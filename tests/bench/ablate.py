@@ -141,7 +141,8 @@ class Bench:
         if not weights.exists():
             say = lambda done, line: print(f"{name}: {100 * done:.0f} % {line}", flush=True)  # noqa: E731
             steps = max(1, round(share * self.steps))
-            train(self.pairs, folder, steps=steps, seed=self.seed, resume=True, config=config, start=start, only=stages, progress=say)
+            begun = (folder / "checkpoint.pt").exists()
+            train(self.pairs, folder, steps=steps, seed=self.seed, resume=begun, config=config, start=start, only=stages, progress=say)
         return weights
 
     def enhancer(self, name: str, variant: Variant, kinds: list[str]) -> Steps | Alone:

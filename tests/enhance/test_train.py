@@ -81,6 +81,12 @@ def test_an_unfinished_training_is_not_overwritten(pairs, tmp_path):
         train(pairs, tmp_path, steps=4, config=QUICK, net=SMALL, resume=True)
 
 
+def test_a_training_that_is_not_there_is_not_gone_on_with(pairs, tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing to resume: .*typo/checkpoint.pt does not exist"):
+        train(pairs, tmp_path / "typo", steps=4, config=QUICK, net=SMALL, resume=True)
+    assert not (tmp_path / "typo").exists()
+
+
 @pytest.mark.parametrize("budget", [{}, {"steps": 3, "minutes": 1}, {"steps": 0}, {"minutes": -1}])
 def test_the_budget_is_one_positive_number(pairs, tmp_path, budget):
     with pytest.raises(ValueError, match="budget"):

@@ -110,10 +110,11 @@ def test_objects_are_harmonized_and_arguments_follow_slowly(release):
     with torch.no_grad():
         now = net(image, mask)
         assert torch.allclose(better, harmonized(image, mask, now)[0].permute(1, 2, 0), atol=1e-6)
-        later = net(1 - image, mask)
+        later, cut = net(0.9 * image, mask), net(1 - image, mask)
     assert torch.equal(better[instance < 0], rgb[instance < 0])
-    _, after = enhancer.step(frame(1 - rgb, instance), memory)
+    _, after = enhancer.step(frame(0.9 * rgb, instance), memory)
     assert torch.allclose(after.mean, 0.96 * memory.mean + 0.04 * torch.cat(later), atol=1e-6)
+    assert torch.allclose(enhancer.step(frame(1 - rgb, instance), after)[1].mean, torch.cat(cut), atol=1e-6), "another place begins anew"
 
 
 def test_another_layout_is_refused_by_name(release, tmp_path):
