@@ -37,6 +37,7 @@ from enhance.shade_samples import Grounds
 from enhance.shards import RENDERED, PairSet
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
 from scenes.names import unknown
+from scenes.stops import Stops
 
 NEAR_ENOUGH = 3e-4
 """Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
@@ -70,7 +71,8 @@ def train(
 
     minutes, steps  the budget of all stages together: exactly one of the two. With steps a run repeats exactly, on a CPU.
     seed      of the first weights and of every sample drawn
-    out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C saves first.
+    out       folder; holds checkpoint.pt too, from which `resume` continues, at most `save_every` seconds behind. Ctrl-C and SIGTERM let a
+              step end and save first.
     photos    folders of images and videos, for the autoencoder, objects' colours and clean frames
     about     written into the weights' header, beside the data's attribution
     progress  called with the share done, 0..1, and a line of words
@@ -125,8 +127,8 @@ def train(
     perceptual = PatchPerceptual(run.net.encoder, vgg).to(run.device)  # now, or a wrong file would be found after the other stages
     out.mkdir(parents=True, exist_ok=True)
     report = _Reporter(run, progress)
-    try:
-        go = partial(_stage, run, checkpoint, save_every, report)
+    with Stops() as stops:
+        go = partial(_stage, run, checkpoint, save_every, report, stops)
         go("autoencoder", partial(_images, run, sampler), partial(_autoencoder_step, run))
         if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
@@ -142,9 +144,6 @@ def train(
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
         go("enhancer", partial(_clips, run, sampler), partial(_enhancer_step, run, perceptual))
-    except KeyboardInterrupt:
-        run.save(checkpoint)
-        raise
     run.save(checkpoint)
     shards = pair_set.of(split="train") if pair_set else []
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
@@ -189,6 +188,7 @@ def _stage(
     checkpoint: Path,
     save_every: float,
     report: _Reporter,
+    stops: Stops,
     name: str,
     draw: Callable[[int], Batch | None],
     step: Callable[[Any, int], torch.Tensor],
@@ -202,9 +202,10 @@ def _stage(
         run.lost(name, step(next(batches), run.step[name]))
         run.seconds[name] += time.monotonic() - start
         report(name)
-        if time.monotonic() - saved > save_every:
+        if stops.asked or time.monotonic() - saved > save_every:
             run.save(checkpoint)
             saved = time.monotonic()
+        stops.end()
     run.loss(name)
 
 

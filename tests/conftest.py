@@ -1,11 +1,15 @@
 """Fixtures of the whole house: the shared data where there is any, and a made-up street."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 import render  # noqa: F401 - says how OpenMP's workers wait, before anything loads torch
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a script's background jobs do; some tests send it, and it is to be heard
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -1,5 +1,7 @@
 """Training: repeatable, resumable, and downhill."""
 
+import os
+import signal
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,7 +14,7 @@ from small_net import SMALL
 from enhance.enhancer import Enhancer
 from enhance.evaluate import ALL_TOLD, ALONE, METHODS, PUT_IN, _told, evaluate, table
 from enhance.net import Net
-from enhance.run import TrainConfig
+from enhance.run import TrainConfig, opened
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import train
 from enhance.weights_file import load_net
@@ -51,7 +53,8 @@ def pairs(tmp_path_factory):
     return PairSet(folder)
 
 
-def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("stopped", "ends"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch, stopped, ends):
     torch.set_num_threads(1)
     whole = train(pairs, tmp_path / "whole", steps=12, seed=3, config=QUICK, net=SMALL)
 
@@ -59,15 +62,16 @@ def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch
     step = module._enhancer_step
 
     def stop(*arguments):
-        if len(steps) == 3:
-            raise KeyboardInterrupt
         steps.append(1)
+        if len(steps) == 3:
+            os.kill(os.getpid(), stopped)
         return step(*arguments)
 
     monkeypatch.setattr(module, "_enhancer_step", stop)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(ends):
         train(pairs, tmp_path / "halves", steps=12, seed=3, config=QUICK, net=SMALL)
     monkeypatch.undo()
+    assert len(steps) == opened(tmp_path / "halves" / "checkpoint.pt")["step"]["enhancer"] == 3
     halves = train(pairs, tmp_path / "halves", steps=12, seed=3, config=QUICK, net=SMALL, resume=True)
     first, second = load_net(whole)[0].state_dict(), load_net(halves)[0].state_dict()
     assert all(torch.equal(first[name], second[name]) for name in first)

@@ -1,0 +1,51 @@
+"""Work in steps that Ctrl-C or SIGTERM may end between any two of them, so that what is saved then is whole."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+
+
+class Stops:
+    """Within the block Ctrl-C and SIGTERM are kept for `end`; a second one ends the work at once.
+
+    with Stops() as stops:
+        while more:
+            step()
+            if stops.asked:
+                save()
+                stops.end()
+
+    What ignores a signal, as a shell's background jobs do Ctrl-C, goes on ignoring it. Only the main thread may listen to signals; on
+    others nothing is kept, and there is no Ctrl-C either.
+    """
+
+    def __init__(self) -> None:
+        self.asked: int | None = None
+        self._former: dict[int, object] = {}
+
+    def __enter__(self) -> Stops:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._former[number] = signal.signal(number, self._ask)
+        return self
+
+    def _ask(self, number: int, _frame) -> None:
+        if self.asked is not None:
+            self.end()
+        self.asked = number
+
+    def end(self) -> None:
+        """KeyboardInterrupt or, after SIGTERM, SystemExit where a stop was asked for."""
+        if self.asked == signal.SIGTERM:
+            sys.exit(128 + signal.SIGTERM)
+        if self.asked is not None:
+            raise KeyboardInterrupt
+
+    def __exit__(self, kind, *_problem) -> None:
+        for number, former in self._former.items():
+            signal.signal(number, former)  # type: ignore[arg-type]  # what `signal` gave
+        if kind is None:
+            self.end()  # what was asked for after the last step, too

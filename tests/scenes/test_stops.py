@@ -1,0 +1,42 @@
+"""What asks work to end is heard between its steps, and only there."""
+
+import os
+import signal
+
+import pytest
+
+from scenes.stops import Stops
+
+
+@pytest.mark.parametrize(("number", "ends"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_a_stop_waits_for_the_step_and_a_second_one_does_not(number, ends):
+    before, done = signal.getsignal(number), []
+    with pytest.raises(ends) as end, Stops() as stops:
+        stops.end()
+        os.kill(os.getpid(), number)
+        done.append("step")
+        assert stops.asked == number
+        stops.end()
+    assert done == ["step"] and signal.getsignal(number) is before
+    assert getattr(end.value, "code", 143) == 143
+    with pytest.raises(ends), Stops():
+        os.kill(os.getpid(), number)
+        done.append("first")
+        os.kill(os.getpid(), number)
+        done.append("second")
+    assert done == ["step", "first"]
+
+
+def test_a_stop_after_the_last_step_is_heard_too():
+    with pytest.raises(KeyboardInterrupt), Stops():
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_what_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Stops() as stops:
+            os.kill(os.getpid(), signal.SIGINT)
+        assert stops.asked is None and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
