@@ -6,7 +6,7 @@ import io
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from recon.assets.cleaning import cleaned
 from recon.assets.closing import closed
 from recon.assets.looking import looking_at
 from recon.assets.photos import photos_of
+from recon.assets.sight import FARTHEST, Sight, Views, sight_of
 from render import Frame, rasterize
 from render.album import shots_in
 from render.references import Shot
@@ -28,7 +29,7 @@ from scenes.match import ground_linear
 from scenes.opening import scene_folder
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
 from scenes.scene import Scene, dimmed
-from scenes.seen import SECTORS, sector, unseen_sides
+from scenes.seen import SECTORS, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
 
@@ -42,9 +43,6 @@ FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10
 FULL_SIDE = 0.85
 """Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
-
-FARTHEST = 20.0
-"""Metres between body and object at the nearest: from farther off too little of it was seen to be looked at closely."""
 
 THUMB = (320, 240)
 CORNERS = {3: 145, 1: 35, 5: 215, 7: 325}
@@ -91,8 +89,11 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
         shots, scene = shots_in(scene, loaded), loaded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
-    bank, ids = Databank(databank), []
-    for candidate in found:
+    bank, ids, far = Databank(databank), [], [c.track for c in found if not c.asset.meta["views"]]
+    if far:
+        said = f"{far[0]}: no camera saw it" if len(far) == 1 else f"{len(far)} ({', '.join(sorted(far))}): no camera saw them"
+        print(f"left out {said} from within {FARTHEST:.0f} m", file=sys.stderr)
+    for candidate in (c for c in found if c.track not in far):
         photos = () if candidate.flaw else candidate.photos(scene, shots)
         hidden = "no photo shows most of it" if shots and candidate.instance is not None and not photos else ""
         if flaw := candidate.flaw or hidden:
@@ -109,10 +110,11 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     """Every mover and every parked vehicle of a scene as an asset in its own frame."""
     share = {k: scene.meta[k] for k in ("licence", "attribution") if k in scene.meta}
     share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
+    views = Views(scene)
     for instance, actor in enumerate(scene.actors, 1):
         if actor.asset.meta.get("inserted"):
             continue  # it came from a databank
-        sight = seen(scene, actor.trajectory, actor.asset.size)
+        sight = sight_of(views, actor.trajectory, actor.asset.size)
         half = len(actor.trajectory) // 2
         middle, gain = actor.trajectory.world_from_body[half], scene.followed(int(actor.trajectory.times_us[half]))
         cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
@@ -126,7 +128,7 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
         near = moved(scene.background.gaussians, inverse(world_from_box) @ scene.background.world_from_local, size)
         cut = cleaned(within_box(near, size), size)
         stands = Trajectory(torch.zeros(1, dtype=torch.int64), world_from_box[None])
-        sight = seen(scene, stands, size)
+        sight = sight_of(views, stands, size)
         asset = Asset(cut, size, entry["label"], scene.model)
         yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight, stands, 0)
 
@@ -146,41 +148,6 @@ def _ground(scene: Scene, pose: torch.Tensor) -> dict:
     return {} if colour is None else {"ground_linear": [round(v, 5) for v in colour.tolist()]}
 
 
-@dataclass(frozen=True)
-class Sight:
-    """How an object was seen: frames of all cameras with its middle in view within `FARTHEST`, metres to the nearest camera then,
-    how large its left and right sides appeared, summed over those frames (solid angle in parts of the side's area), and in how many
-    frames it was seen from each of `SECTORS`."""
-
-    views: int
-    nearest: float
-    left: float
-    right: float
-    sectors: dict[str, int] = field(default_factory=dict)
-
-
-def seen(scene: Scene, box: Trajectory, size: torch.Tensor) -> Sight:
-    """How the cameras of a scene saw a box `[length, width, height]`."""
-    middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
-    views, nearest, sides, sectors = 0, math.inf, [0.0, 0.0], dict.fromkeys(SECTORS, 0)
-    for name, camera in scene.rig.items():
-        times = scene.frame_times(name)
-        times = times[torch.tensor([box.covers(t) and scene.ego.covers(t) for t in times.tolist()], dtype=torch.bool)]
-        cam_from_box = inverse(scene.ego.at_each(times) @ camera.body_from_cam) @ box.at_each(times)
-        at = (cam_from_box @ middle)[:, :3]
-        at, cam_from_box = at[at[:, 2] >= 0.5], cam_from_box[at[:, 2] >= 0.5]
-        pixels = camera.lens.project(at)
-        inside = ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
-        away, eyes = at[inside].norm(dim=1), inverse(cam_from_box[inside])[:, :2, 3]
-        nearest = min(nearest, float(away.min())) if len(away) else nearest
-        close = away <= FARTHEST
-        views += int(close.sum())
-        for (ahead, beside), metres in zip(eyes[close].tolist(), away[close].tolist(), strict=True):
-            sectors[sector(ahead, beside)] += 1
-            sides[beside < 0] += max(0.0, abs(beside) - float(size[1]) / 2) / metres**3
-    return Sight(views, nearest, sides[0], sides[1], sectors)
-
-
 def shown_colours(splats: Gaussians) -> dict[str, list[float]]:
     """Exposure statistics of splats: linear colour, the mean and the 5th and 95th percentile a channel, of what is not faint."""
     solid = splats.select(torch.sigmoid(splats.logit_opacities) > 0.3)
@@ -197,7 +164,7 @@ def _judged(
 ) -> Candidate:
     flaw = ""
     if sight.views < FEWEST_VIEWS:
-        flaw = f"{sight.views} views within {FARTHEST:.0f} m, fewer than {FEWEST_VIEWS}"
+        flaw = f"{sight.views} views within {FARTHEST:.0f} m that show most of it, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
     whole, mirrored = completed(cut, sight.left, sight.right) if not flaw else (cut, False)

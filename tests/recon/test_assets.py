@@ -10,11 +10,12 @@ from street import box, rig
 from recon import extract_assets
 from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned, within_box
 from recon.assets.looking import looking_at
+from recon.assets.sight import Views, sight_of
 from render import rasterize, render_frame
 from render.album import keep_photos
 from render.references import Shot
 from render.video import from_bytes, to_bytes
-from scenes import Asset, Databank, Gaussians, Placed, save
+from scenes import Asset, Databank, Gaussians, Placed, Trajectory, save
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw
 from scenes.report import validate
@@ -120,7 +121,7 @@ def test_parked_cars_and_movers_become_assets_and_the_rest_is_said(parked_street
     assert "veh_7" in tracks and tracks["veh_7"].views >= 10 and tracks["veh_7"].licence == "CC0-1.0" and tracks["veh_7"].thumb
     asset = bank.load(tracks["veh_7"].id)
     assert asset.gaussians.means[:, 2].min() > 0 and (asset.gaussians.means.abs() < torch.tensor([2.3, 1.1, 1.8])).all()
-    assert "left out veh_8 (pickup): 0 views" in capsys.readouterr().err
+    assert "left out veh_8: no camera saw it from within 20 m" in capsys.readouterr().err
 
 
 def _shots(scene):
@@ -187,16 +188,38 @@ def test_a_scene_folder_with_photos_gives_its_assets_theirs(parked_street, tmp_p
     assert all(asset.photos for asset in loaded) and not validate(tmp_path / "bank")
 
 
-def test_what_is_half_hidden_in_every_photo_is_no_asset(parked_street, tmp_path, capsys):
-    wall = box((9.0, 0.3, 3.0), (0.6, 0.6, 0.6))
-    wall = replace(wall, means=wall.means + torch.tensor([8.0, 2.3, 0.0]))
-    background = replace(parked_street.background, gaussians=Gaussians.cat([parked_street.background.gaussians, wall]))
-    scene = replace(parked_street, rig=rig(384, 216), background=background)
+def test_what_no_photo_shows_is_no_asset(parked_street, tmp_path, capsys):
+    """Of the drive's photos one is left, of the camera that looks away from it."""
+    scene = replace(parked_street, rig=rig(384, 216))
     save(scene, tmp_path / "s1")
-    keep_photos(tmp_path / "s1", [(CAMERA, s.camera.time_us, from_bytes(s.read(384, 216))) for s in _shots(scene)[:8]])
+    (shot,) = _shots(scene)[-1:]
+    keep_photos(tmp_path / "s1", [("left_camera", shot.camera.time_us, from_bytes(shot.read(384, 216)))])
     with pytest.raises(ValueError, match="good enough"):
         extract_assets(tmp_path / "s1", tmp_path / "bank")
     assert "left out veh_7 (car): no photo shows most of it" in capsys.readouterr().err
+
+
+def beside(scene, splats: Gaussians, at: tuple[float, float, float]):
+    """The scene with more splats in its background."""
+    more = replace(splats, means=splats.means + torch.tensor(at))
+    return replace(scene, background=replace(scene.background, gaussians=Gaussians.cat([scene.background.gaussians, more])))
+
+
+def test_what_stands_behind_a_wall_was_not_seen(parked_street):
+    """Nor do its sides and directions count in which it would have been, but for the wall."""
+
+    def sight(scene):
+        box = Trajectory(torch.zeros(1, dtype=torch.int64), translation(9.0, 3.5, 0.0)[None] @ yaw(math.pi))
+        return sight_of(Views(scene), box, SIZE)
+
+    free = sight(parked_street)
+    hidden = sight(beside(parked_street, box((9.0, 0.3, 3.0), (0.6, 0.6, 0.6)), (8.0, 2.3, 0.0)))
+    assert free.views >= 10 and free.left > 0 and hidden.views == 0 and hidden.left < 0.05 * free.left
+    assert free.nearest == hidden.nearest and not any(hidden.sectors.values())
+    assert free.views == sum(free.sectors.values()) and free.sectors["front"] + free.sectors["front left"] == free.views
+    # a car parked before its nose hides that, and not its flank: pictures from ahead no longer count, those from beside it do
+    parked = sight(beside(parked_street, box((4.2, 1.8, 1.5), (0.2, 0.2, 0.8)), (4.4, 3.5, 0.0)))
+    assert 0 < parked.views <= 0.5 * free.views and parked.left > 0.95 * free.left and parked.nearest == free.nearest
 
 
 def test_a_scene_without_objects_says_so(street, tmp_path):
