@@ -157,7 +157,8 @@ class Enhance:
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     instances: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Tells where objects were put in, whose colours and shadows are then set right: a .png or .npy for each frame, in which each object
-    has a number or colour of its own and all else is 0; as render --outputs instance keeps them."""
+    has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too: set
+    these to 0; out.json says which were inserted."""
     rendered: Flag = False
     """The video shows renders of splats: repair them. Without this and --instances the built-in weights leave it as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
