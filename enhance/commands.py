@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from scenes import units
-from scenes.opening import UsageError, check_device, fresh
+from scenes.opening import UsageError, check_device, fresh, warn
 from scenes.options import Flag, Names, Output, Overwrite, written
 
 
@@ -125,7 +125,12 @@ class Train:
         check_device(self.device)
         pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:
-            say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
+
+            def say(share: float, line: str) -> None:
+                if self.resume and not steps.done:
+                    steps.resume(round(1000 * share))
+                steps.step(round(1000 * share) - steps.done, line)
+
             try:
                 weights = train(
                     pairs,
@@ -142,6 +147,9 @@ class Train:
                 )
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
+            except SystemExit:  # after SIGTERM
+                warn(["stopped; the same command with --resume goes on from here"])
+                raise
         print(f"wrote {weights}; use it with --weights {weights}")
 
 
