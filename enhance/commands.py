@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -65,22 +67,35 @@ class Pairs:
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
-        for path, name, data in zip(self.scenes, names, self.data, strict=True):
-            scene, log = open_reconstruction(path), open_log(data)
-            cameras = check_cameras(scene, log, self.cameras)
-            out = self.output if len(self.scenes) == 1 else self.output / name
-            claim_pairs(out, scene, log, self.seed, config)
-            relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
-            sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
-            with Progress(f"pairs {name}") as steps:
+        with _stopped_saying("the same command goes on from here"):
+            for path, name, data in zip(self.scenes, names, self.data, strict=True):
+                scene, log = open_reconstruction(path), open_log(data)
+                cameras = check_cameras(scene, log, self.cameras)
+                out = self.output if len(self.scenes) == 1 else self.output / name
+                claim_pairs(out, scene, log, self.seed, config)
+                relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
+                sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
+                with Progress(f"pairs {name}") as steps:
 
-                def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
-                    steps.total = total
-                    steps.step(done - steps.done, name)
+                    def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
+                        steps.total = total
+                        steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
-        make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
+                    make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
+            make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
+
+
+@contextmanager
+def _stopped_saying(how: str) -> Iterator[None]:
+    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {how}") from None
+    except SystemExit:
+        warn([f"stopped; {how}"])
+        raise
 
 
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
@@ -131,7 +146,7 @@ class Train:
                     steps.resume(round(1000 * share))
                 steps.step(round(1000 * share) - steps.done, line)
 
-            try:
+            with _stopped_saying("the same command with --resume goes on from here"):
                 weights = train(
                     pairs,
                     self.output,
@@ -145,11 +160,6 @@ class Train:
                     device=self.device,
                     vgg=self.vgg,
                 )
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
-            except SystemExit:  # after SIGTERM
-                warn(["stopped; the same command with --resume goes on from here"])
-                raise
         print(f"wrote {weights}; use it with --weights {weights}")
 
 
