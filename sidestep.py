@@ -142,6 +142,8 @@ class Render:
     def run(self) -> None:
         for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
+        if self.weights != "builtin" and not self.enhance:
+            raise UsageError(f"--weights {self.weights} would do nothing without --enhance; add it, or leave --weights out")
         from render.clip import clip_cameras, clip_times
         from render.record import record
         from scenes import Databank

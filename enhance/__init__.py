@@ -9,6 +9,8 @@ import sys
 import types
 from typing import TYPE_CHECKING
 
+import scenes.idle  # noqa: F401
+
 _HOME = {
     "Enhancer": "enhancer",
     "Memory": "enhancer",

@@ -14,6 +14,7 @@ from enhance.enhancer import Enhancer
 from enhance.object_ids import ObjectIds
 from enhance.pictures import Pictures, PictureWriter
 from enhance.step import Steps, frame_of
+from recon.readers.photos import PHOTOS
 from render.frame_types import Frame
 from render.record import Stages
 from render.references import READS as NEEDED
@@ -92,6 +93,8 @@ def enhance_video(
     and it warns where no frame was changed.
     Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
+    if Path(source).is_file() and Path(source).suffix.lower() in PHOTOS:
+        raise ValueError(f"{source} is one picture; put it into a folder, and give that")
     clip = Pictures(source) if Path(source).is_dir() else read_video(source)
     if Path(out).exists() and Path(out).samefile(source):
         raise ValueError(f"{out} is the clip itself; write the enhanced one elsewhere")
@@ -101,10 +104,11 @@ def enhance_video(
         raise ValueError(f"{enhancer.about.get('model', 'this model')} cannot be told where objects are; leave --instances out")
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
-    memory, done, changed = None, 0, 0
+    memory, done, changed, told = None, 0, 0, 0
     with _writer(out, clip) as writer:
         for at, rgb in clip.timed():
             frame = rgb if ids is None else frame_of(rgb, ids.of(done, clip.width, clip.height))
+            told += isinstance(frame, Frame) and frame.instance is not None and bool((frame.instance > 0).any())
             better, memory = enhancer.step(frame, memory)
             changed += not torch.equal(better, rgb.to(better).clamp(0, 1))
             writer.write(better, at)
@@ -113,7 +117,7 @@ def enhance_video(
                 progress(done, clip.count)
     if not changed:
         warn(
-            [f"no frame of {source} was changed: {_why(rendered, ids is not None)}; render --enhance tells objects and has photos to go by"]
+            [f"no frame of {source} was changed: {_why(rendered, instances, told)}; render --enhance tells objects and has photos to go by"]
         )
     return done, changed
 
@@ -124,8 +128,10 @@ def _writer(out: str | Path, clip: Pictures | Video) -> PictureWriter | VideoWri
     return VideoWriter(out, clip.fps, clip.width, clip.height, pixel_aspect=clip.pixel_aspect)
 
 
-def _why(rendered: bool, told_objects: bool) -> str:
-    if told_objects:
+def _why(rendered: bool, instances: str | Path | None, told: int) -> str:
+    if instances is not None and not told:
+        return f"{instances} tells of no object, all of it is 0"
+    if instances is not None:
         return "these weights find the told objects right"
     if rendered:
         return "these weights' network rests, as it gained too little where it had not been"

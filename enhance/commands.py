@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +11,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from scenes import units
-from scenes.opening import UsageError, check_device, fresh
+from scenes.opening import UsageError, check_device, fresh, warn
 from scenes.options import Flag, Names, Output, Overwrite, written
 
 
@@ -65,22 +67,35 @@ class Pairs:
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
-        for path, name, data in zip(self.scenes, names, self.data, strict=True):
-            scene, log = open_reconstruction(path), open_log(data)
-            cameras = check_cameras(scene, log, self.cameras)
-            out = self.output if len(self.scenes) == 1 else self.output / name
-            claim_pairs(out, scene, log, self.seed, config)
-            relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
-            sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
-            with Progress(f"pairs {name}") as steps:
+        with _stopped_saying("the same command goes on from here"):
+            for path, name, data in zip(self.scenes, names, self.data, strict=True):
+                scene, log = open_reconstruction(path), open_log(data)
+                cameras = check_cameras(scene, log, self.cameras)
+                out = self.output if len(self.scenes) == 1 else self.output / name
+                claim_pairs(out, scene, log, self.seed, config)
+                relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
+                sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
+                with Progress(f"pairs {name}") as steps:
 
-                def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
-                    steps.total = total
-                    steps.step(done - steps.done, name)
+                    def say(done: int, total: int, name: str, steps: Progress = steps) -> None:
+                        steps.total = total
+                        steps.step(done - steps.done, name)
 
-                make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
-        make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
+                    make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
+            make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
+
+
+@contextmanager
+def _stopped_saying(how: str) -> Iterator[None]:
+    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {how}") from None
+    except SystemExit:
+        warn([f"stopped; {how}"])
+        raise
 
 
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
@@ -125,8 +140,13 @@ class Train:
         check_device(self.device)
         pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:
-            say = lambda share, line: steps.step(round(1000 * share) - steps.done, line)  # noqa: E731
-            try:
+
+            def say(share: float, line: str) -> None:
+                if self.resume and not steps.done:
+                    steps.resume(round(1000 * share))
+                steps.step(round(1000 * share) - steps.done, line)
+
+            with _stopped_saying("the same command with --resume goes on from here"):
                 weights = train(
                     pairs,
                     self.output,
@@ -140,8 +160,6 @@ class Train:
                     device=self.device,
                     vgg=self.vgg,
                 )
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt("interrupted; the same command with --resume goes on from here") from None
         print(f"wrote {weights}; use it with --weights {weights}")
 
 
@@ -157,7 +175,8 @@ class Enhance:
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     instances: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Tells where objects were put in, whose colours and shadows are then set right: a .png or .npy for each frame, in which each object
-    has a number or colour of its own and all else is 0; as render --outputs instance keeps them."""
+    has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too: set
+    these to 0; out.json says which were inserted."""
     rendered: Flag = False
     """The video shows renders of splats: repair them. Without this and --instances the built-in weights leave it as it is."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -18,8 +18,8 @@ class ObjectIds:
     """A folder of .png or .npy, one a picture of the clip, in the order of the numbers in their names.
 
     Numbers above 0 of arrays, of grey and of palette pictures are objects' ids, and each colour but black of coloured ones is an object;
-    what `sidestep render --outputs instance` keeps is taken as it is. pictures: how many the clip has, where that is known. ValueError
-    where there are none, or not as many.
+    what `sidestep render --outputs instance` keeps is read, too, and all of its actors count as put in. pictures: how many the clip has,
+    where that is known. ValueError where there are none, or not as many.
     """
 
     def __init__(self, folder: str | Path, pictures: int | None = None):

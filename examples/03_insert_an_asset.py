@@ -26,14 +26,15 @@ def main(
     """Insert the databank's first asset twice and film it from 2 m left of the recorded path."""
     drive, bank = load(scene), Databank(databank)
     name = bank.entries()[0].id
-    parked = parse_placement(f"{name}@14m,-4m,yaw=3deg")  # as on the command line: metres forward and left of the car
+    times = drive.frame_times("front_camera")[:frames]
+    parked = parse_placement(f"{name}@32m,6.1m")  # as on the command line: metres forward and left of the car
     driving = Placement(name, x=9.0, y=3.5, speed=4.0)  # the same in numbers: metres, radians, metres a second
     for placement in (parked, driving):
-        result = insert(drive, bank.load(name), placement)
+        result = insert(drive, bank.load(name), placement, int(times[0]), int(times[-1]))
         drive = result.scene
-        print(*result.warnings, sep="\n", end="")
+        for warning in result.warnings:  # of what it would run into while the clip lasts
+            print(warning)
 
-    times = drive.frame_times("front_camera")[:frames]
     clip = render_clip(drive, "front_camera", shift=2.0, times_us=times, width=width, height=height)
     with VideoWriter(output, frame_rate(times), width, height) as video:
         for frame in progress(clip, "render", len(times)):

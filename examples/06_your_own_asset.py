@@ -37,7 +37,8 @@ def main(
     for x in (8.0, 11.0, 14.0):
         result = insert(drive, Databank(databank).load(id), Placement(id, x, 1.2))
         drive = result.scene
-        print(*result.warnings, sep="\n", end="")
+        for warning in result.warnings:
+            print(warning)
     print("light:", light_of(drive).source)
     time = drive.frame_times("front_camera")[:1]
     (frame,) = render_clip(drive, "front_camera", times_us=time, width=width, height=width * 9 // 16)

@@ -2,6 +2,8 @@
 
 import importlib
 
+import scenes.idle  # noqa: F401
+
 _HOME = {
     "FitConfig": "fit",
     "Log": "log",

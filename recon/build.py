@@ -118,7 +118,7 @@ def reconstruct(
         save_checkpoint(checkpoint, options, start, fit.tensors() | {"seconds": seconds(), "live": live.curve})
 
     with Progress("fit", total=config.steps) as steps:
-        steps.step(fit.step_count)
+        steps.resume(fit.step_count)
 
         def report(fit: Fit) -> None:
             live.look(fit, seconds())

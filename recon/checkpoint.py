@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,8 +48,19 @@ def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:
         raise ValueError(f"{path} is of version {version}, and this is {VERSION}; delete it and run without --resume")
     for name, value in options.items():
         if saved.get(name) != value:
-            raise ValueError(f"{path} was made with {name} {saved.get(name)!r}, not {value!r}; repeat its options, or delete it")
+            raise ValueError(f"{path} was made with {_other(name, saved.get(name), value)}; repeat its options, or delete it")
     return _start(data["start"], data["fit"]), data["fit"]
+
+
+def _other(name: str, saved: Any, value: Any) -> str:
+    """How an option of a checkpoint differs, in the words of the command line where it has any."""
+    if name != "span_us" or saved is None:
+        return f"{name} {saved!r}, not {value!r}"
+    lasted, lasts = ((end - start) / 1e6 for start, end in (saved, value))
+    if lasted != lasts:
+        return f"a --duration of {lasted:g}s, not {lasts:g}s"
+    later = (saved[0] - value[0]) / 1e6
+    return f"a --start {abs(later):g}s {'later' if later > 0 else 'earlier'}"
 
 
 def plain_config(config: FitConfig) -> dict:

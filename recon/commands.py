@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from scenes.opening import check_device
+from scenes.opening import check_device, warn
 from scenes.options import AngleOrNone, FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 
 if TYPE_CHECKING:
@@ -66,9 +66,12 @@ class Recon:
                 log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
                 size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
             )  # fmt: skip
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit) as stop:
             begun = checkpoint_path(self.output).exists()
             fix = "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
+            if isinstance(stop, SystemExit):  # after SIGTERM, with a code of its own
+                warn([f"stopped; {fix}"])
+                raise
             raise KeyboardInterrupt(f"interrupted; {fix}") from None
 
 

@@ -1,15 +1,11 @@
 """How it looks: the Warp rasterizer, frames, clips, image and video files. Rooms are loaded when first used."""
 
 import importlib
-import os
 import sys
 import types
 from typing import TYPE_CHECKING
 
-# OpenMP's idle workers would spin for milliseconds on the cores that Warp's threads need, and if they never spun, waking them would cost
-# as much as many an operation: they spin for some 60 microseconds, until the next one. It reads this once, when torch is loaded.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-os.environ.setdefault("GOMP_SPINCOUNT", "30000")
+import scenes.idle  # noqa: F401
 
 _HOME = {
     "rasterize": "rasterize",

@@ -123,8 +123,8 @@ def stage(device: torch.device):
     """What is launched inside runs in order with torch: on its current CUDA stream, or on the CPU with the cores left to Warp.
 
     After every parallel operation torch's OpenMP workers spin for milliseconds on the cores that our bands need, which makes frames
-    several times slower. So torch's own small operations between launches stay on this thread. (What `render/__init__.py` sets before torch
-    is loaded ends the spinning after the caller's operations soon, too.)
+    several times slower. So torch's own small operations between launches stay on this thread. (What `scenes/idle.py` sets before torch is
+    loaded ends the spinning after the caller's operations soon, too.)
     """
     if device.type == "cuda":
         # nothing runs on Warp's own stream that this one should wait for

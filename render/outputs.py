@@ -21,19 +21,18 @@ OUTPUTS = (
 )
 
 
-def check_outputs(outputs: Iterable[str]) -> tuple[str, ...]:
+def check_outputs(outputs: Iterable[str], known: tuple[str, ...] = OUTPUTS) -> tuple[str, ...]:
     """`outputs` as a tuple of known names; ValueError naming the nearest otherwise."""
     if isinstance(outputs, str):
         raise ValueError(f'outputs must be a tuple of names, got the string "{outputs}"; write ("{outputs}",)')
     for name in outputs:
-        if name not in OUTPUTS:
-            raise ValueError(f'output "{name}" does not exist; there are {", ".join(OUTPUTS)}.{nearest(name, OUTPUTS)}')
+        if name not in known:
+            raise ValueError(f'output "{name}" does not exist; there are {", ".join(known)}.{nearest(name, known)}')
     return tuple(outputs)
 
 
 def check_scene_outputs(outputs: Iterable[str]) -> tuple[str, ...]:
     """`outputs` as a tuple of names that a scene's frame can have; ValueError otherwise."""
-    outputs = check_outputs(outputs)
-    if "features" in outputs:
+    if not isinstance(outputs, str) and "features" in (outputs := tuple(outputs)):
         raise ValueError('a scene has no "features"; pass them to rasterize with scene.placed(time)')
-    return outputs
+    return check_outputs(outputs, tuple(name for name in OUTPUTS if name != "features"))

@@ -23,6 +23,7 @@ class Progress:
 
     def __init__(self, label: str, total: int | None = None, stream=None):
         self.label, self.total, self.note, self.done = label, total, "", 0
+        self.before = 0
         self.stream = stream or sys.stderr
         self.bar = self.stream.isatty()
         self.start = time.monotonic()
@@ -45,14 +46,19 @@ class Progress:
         if time.monotonic() - self.said >= (BAR_SECONDS if self.bar else PLAIN_SECONDS):
             self._say()
 
+    def resume(self, count: int) -> None:
+        """`count` steps were done in an earlier run: they are counted, and say nothing of how fast this one is."""
+        self.done = self.before = count
+
     def line(self) -> str:
         """The state in words: label, count, rate or time left, note."""
         spent = time.monotonic() - self.start
         of = f"/{self.total}" if self.total else ""
         parts = [f"{self.label} {self.done}{of}"]
-        if self.total and 0 < self.done < self.total:
-            parts.append(f"{_clock(spent * (self.total - self.done) / self.done)} left")
-        elif self.done:
+        now = self.done - self.before
+        if self.total and now > 0 and self.done < self.total:
+            parts.append(f"{_clock(spent * (self.total - self.done) / now)} left")
+        elif now:
             parts.append(_clock(spent))
         return "  ".join(parts + ([self.note] if self.note else []))
 

@@ -19,6 +19,8 @@ instance     id of the largest compositing weight, -1 where alpha < 0.5; backgro
 
 import importlib
 
+import scenes.idle  # noqa: F401
+
 _HOME = {
     "Gaussians": "gaussians",
     "Placed": "gaussians",

@@ -198,6 +198,8 @@ USAGE = [
     (["edit", "street"], "say what to change", "--remove veh_12"),
     (["edit", "street", "--shift", "veh_1"], "--shift", "as veh_3=0m,1.5m"),
     (["edit", "street", "--retime", "veh_1=2"], "--retime", "write 2s (seconds) or 2000ms"),
+    ([*SHOOT, "--weights", "mine.safetensors"], "--weights mine.safetensors would do nothing without --enhance", "add it"),
+    ([*SHOOT, "--outputs", "colour"], 'output "colour" does not exist', "normal, flow_prev"),
 ]
 
 

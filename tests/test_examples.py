@@ -62,7 +62,7 @@ def test_assets_are_inserted(data, tmp_path):
 
 def test_a_clip_is_enhanced(data, tmp_path):
     weights = str(data / "weights.safetensors")
-    example("04").main(data / "drive002", weights, 2, **SMALL, output=tmp_path / "enhanced.mp4")
+    example("04").main(data / "drive002", data / "databank", weights, 2, **SMALL, output=tmp_path / "enhanced.mp4")
     assert len(list(read_video(tmp_path / "enhanced.mp4"))) == 2
 
 

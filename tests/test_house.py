@@ -52,6 +52,13 @@ def test_importing_scenes_loads_torch_and_numpy_only():
     assert not modules & {"warp", "pxr", "kornia", "scipy", "pandas", "trimesh", "av", "PIL", "render"}
 
 
+@pytest.mark.parametrize("package", ORDER)
+def test_idle_workers_are_told_to_wait_before_torch_is_loaded(package):
+    code = f"import os; os.environ.pop('OMP_WAIT_POLICY', None); import {package}; assert os.environ['OMP_WAIT_POLICY'] == 'passive'"
+    modules, _ = loaded(code)
+    assert "torch" not in modules
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

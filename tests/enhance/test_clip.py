@@ -150,7 +150,7 @@ def test_objects_are_told_picture_by_picture(tmp_path, pictures, kind):
         assert (red[:i] != 7).all() and (red[i:] == 7).all()
 
 
-def test_ids_that_do_not_fit_are_refused(tmp_path, pictures):
+def test_ids_that_do_not_fit_are_refused(tmp_path, pictures, capsys):
     folder = tmp_path / "ids"
     folder.mkdir()
 
@@ -160,8 +160,12 @@ def test_ids_that_do_not_fit_are_refused(tmp_path, pictures):
         assert not (tmp_path / "out").exists()
 
     refused("holds no .npy or .png")
+    with pytest.raises(ValueError, match="f9.png is one picture; put it into a folder"):
+        enhance_video(pictures / "f9.png", tmp_path / "out", Marking())
     for i in range(3):
         np.save(folder / f"{i}.npy", np.zeros((34, 50), np.int32))
+    enhance_video(pictures, tmp_path / "same", Marking(), instances=folder)
+    assert f"{folder} tells of no object" in capsys.readouterr().err
     np.save(folder / "1.npy", np.zeros((30, 50), np.int32))
     refused(r"1.npy has the shape \[30, 50\], but its picture is 34 rows of 50")
     np.save(folder / "1.npy", np.zeros((34, 50)))

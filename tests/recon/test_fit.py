@@ -1,5 +1,6 @@
 import os
 import signal
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -167,9 +168,18 @@ def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, m
         reconstruct(log, out, size=SIZE, config=CONFIG)
     with pytest.raises(ValueError, match="held_out 8, not 4"):
         reconstruct(log, out, size=SIZE, config=CONFIG, held_out=4, resume=True)
+    with pytest.raises(ValueError, match=r"made with a --duration of 0.8s, not 0.5s; repeat its options"):
+        reconstruct(log, out, size=SIZE, config=CONFIG, duration_us=500_000, resume=True)
     checkpoint_path(out).write_bytes(checkpoint_path(out).read_bytes()[:2000])
     with pytest.raises(ValueError, match="scene.fit"):
         reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
+
+
+def test_who_is_stopped_by_sigterm_is_told_how_it_goes_on(drive, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("recon.reconstruct", lambda *_, **__: sys.exit(143))
+    with pytest.raises(SystemExit) as stop:
+        Recon(drive, tmp_path / "scene").run()
+    assert stop.value.code == 143 and "stopped; nothing was fitted yet; give the command again" in capsys.readouterr().err
 
 
 def test_an_existing_output_and_a_missing_folder_are_refused_before_any_work(drive, tmp_path):

@@ -17,6 +17,15 @@ def test_elsewhere_than_a_terminal_lines_are_plain():
     assert out.getvalue() == "fit 3/3  0 s  28.1 dB\n"
 
 
+def test_what_an_earlier_run_did_says_nothing_of_the_time_left():
+    steps = Progress("fit", 100, stream=io.StringIO())
+    steps.resume(90)
+    assert steps.line() == "fit 90/100"
+    steps.step(5)
+    steps.start = time.monotonic() - 50
+    assert steps.line() == "fit 95/100  50 s left"
+
+
 def test_a_terminal_gets_a_bar_that_ends_in_a_new_line():
     out = Terminal()
     with Progress("fit", 2, stream=out) as steps:
