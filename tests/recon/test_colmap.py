@@ -10,7 +10,7 @@ from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
 from PIL import Image
 
 from recon import open_log, reconstruct
-from recon.build import MOST, PER_PHOTO, fit_config, fit_size
+from recon.build import FEW, MOST, PER_PHOTO, fit_config, fit_size
 from recon.fit.config import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
@@ -268,7 +268,8 @@ def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
 def test_photos_that_stand_apart_are_not_learnt_by_heart(street, drive, tmp_path):
     log = open_log(write_colmap(tmp_path / "far", street, {"": pictures_along(street, count=6, step=4.0)}))
     config = fit_config(log, ["camera"])
-    assert (config.steps, config.budget) == tuple(6 * n for n in PER_PHOTO) and config.steps < FitConfig().steps
+    assert (config.steps, config.budget) == tuple(base + 6 * n for base, n in zip(FEW, PER_PHOTO, strict=True))
+    assert config.steps < FitConfig().steps
     drive_config = fit_config(open_log(drive), ["front_camera"])
     assert drive_config.steps > config.steps and drive_config.sh_degree > 0 and drive_config.drop == 0 < config.drop
     assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
