@@ -132,7 +132,7 @@ def _why(rendered: bool, instances: str | Path | None, told: int) -> str:
     if instances is not None and not told:
         return f"{instances} tells of no object, all of it is 0"
     if instances is not None:
-        return "these weights find the told objects right"
+        return "these weights find the told objects right, or too small to judge"
     if rendered:
         return "these weights' network rests, as it gained too little where it had not been"
     return "if it shows renders, say --rendered; if something was put in, say where by --instances"

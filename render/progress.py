@@ -34,6 +34,8 @@ class Progress:
         return self
 
     def __exit__(self, kind, value, trace) -> None:
+        if kind is not None and not self.done:
+            return  # nothing was begun, and the error says why
         self._say()
         if self.bar:
             self.stream.write("\n")

@@ -34,6 +34,15 @@ def test_a_terminal_gets_a_bar_that_ends_in_a_new_line():
     assert out.getvalue().endswith("\n")
 
 
+def test_what_never_began_says_nothing():
+    out = io.StringIO()
+    try:
+        with Progress("enhance clip.mp4", stream=out):
+            raise ValueError
+    except ValueError:
+        assert out.getvalue() == ""
+
+
 def test_unknown_totals_are_counted_without_a_bar():
     out = Terminal()
     with Progress("decode", stream=out) as steps:
