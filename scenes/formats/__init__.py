@@ -7,6 +7,7 @@ turned. GLB does (glTF is Y up), so its splats are turned to this project's Z up
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,7 @@ def found(path: Path) -> Format | None:
     form = named(path) if path.is_file() else None
     if form in (PLY, COMPRESSED_PLY):
         with open(path, "rb") as file:
-            head = file.read(4096)
-        return COMPRESSED_PLY if b"packed_position" in head else PLY
+            head = file.read(1 << 16)
+        # a property's line: comments may hold the word
+        return COMPRESSED_PLY if re.search(rb"^property[ \t]+\w+[ \t]+packed_position\s", head, re.MULTILINE) else PLY
     return form
