@@ -45,6 +45,12 @@ def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
         return clean(moved(read_splats(prim), torch.tensor(np.array(transform).T), path), str(path))  # USD's vectors are rows
 
 
+def model_in(path: Path) -> SplatModel:
+    """The model of the one splat prim of a USD file."""
+    with open_stage(path) as stage:
+        return read_model(only_splats(stage.GetPseudoRoot(), path))
+
+
 def stage_axes(path: Path) -> tuple[str, float]:
     """Which axis of a USD file is up, "y" or "z", and the metres of its unit: 1 where it does not say, as splat tools write it."""
     with open_stage(path) as stage:

@@ -39,6 +39,7 @@ _FIELDS = {
 _RGB = ("red", "green", "blue")
 _FULL = {"u1": 255.0, "u2": 65535.0}
 _FILTER = "filter_3D"
+ANTIALIASED = "comment SplatRenderMode: mip"
 _REST_COUNTS = [3 * (k - 1) for k in (*SH_COUNTS, 25)]
 
 
@@ -96,15 +97,24 @@ def _filtered(log_scales: np.ndarray, logits: np.ndarray, sigma: np.ndarray) -> 
     return (after / 2).astype(np.float32), logits_from(opacities_from(logits) * thinner)
 
 
-def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write splats as Kerbl et al.'s code does. Reading them back is bit-equal."""
+def save_ply(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = False) -> None:
+    """Write splats as Kerbl et al.'s code does, and with Brush's comment where they were trained with antialiasing. Reading them back is
+    bit-equal."""
     n, k, _ = gaussians.sh.shape
     g = gaussians.detach().to("cpu")
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = ["x", "y", "z", "nx", "ny", "nz", *_FIELDS["dc"], *rest, "opacity", *_FIELDS["scales"], *_FIELDS["quats"]]
     higher = g.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
     parts = [g.means, torch.zeros(n, 3), g.sh[:, 0], higher, g.logit_opacities[:, None], g.log_scales, g.quats]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}", *(f"property float {name}" for name in names), "end_header"]
+    about = [ANTIALIASED] if antialias else []
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *about,
+        f"element vertex {n}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
     with atomic_file(path) as partial, open(partial, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(torch.cat(parts, 1).numpy().astype("<f4", copy=False).data)

@@ -36,6 +36,7 @@ from scenes.formats.packing import (
 from scenes.gaussians import SH_COUNTS, Gaussians
 
 _PALETTE = 65536
+_MODEL = "antialiased"
 _ROW = 64  # sets of harmonics in a row of shN_centroids
 _SLACK = 65536  # pixels beyond the splats, of padding
 
@@ -50,8 +51,8 @@ def load_sog(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
         with open(path, "rb") as file:
             try:
                 with zipfile.ZipFile(file) as bundle:
-                    folder = _folder(bundle)
-                    return clean(_read(path, lambda name: _unzipped(path, bundle, folder + name)), str(path))
+                    inside = _folder(bundle)
+                    return clean(_read(path, lambda name: _unzipped(path, bundle, inside + name)), str(path))
             # zipfile seeks where the file says, reads what it has no name for, and asks for passwords
             except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as error:
                 raise ValueError(f"{path} is not a whole SOG file: {error}") from error
@@ -59,8 +60,19 @@ def load_sog(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     return clean(_read(path, lambda name: (folder / name).read_bytes()), str(path))
 
 
-def save_sog(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a .sog file, in the splats' order: neighbours should follow each other, for the pictures' sake.
+def antialiased(path: Path) -> bool:
+    """Whether meta.json says that the splats were trained with antialiasing."""
+    if path.is_file() and path.name != "meta.json":
+        with zipfile.ZipFile(path) as bundle:
+            text = _unzipped(path, bundle, _folder(bundle) + "meta.json")
+    else:
+        text = ((path if path.is_dir() else path.parent) / "meta.json").read_bytes()
+    return parsed(path, text).get("model") == _MODEL
+
+
+def save_sog(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = False) -> None:
+    """Write a .sog file, in the splats' order: neighbours should follow each other, for the pictures' sake. antialias: how they were
+    trained.
 
     Positions keep 16 bits of the box; scales and colours the nearest of 256 values; harmonics the mean of about N / 65536 alike ones.
     """
@@ -86,6 +98,8 @@ def save_sog(path: str | os.PathLike, gaussians: Gaussians) -> None:
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colours.tolist(), "files": ["sh0.webp"]},
     }  # fmt: skip
+    if antialias:
+        meta["model"] = _MODEL
     files = {name: _webp(pixels, shape) for name, pixels in pictures.items()}
     if k > 1:
         sets, labels = palette(g["sh"][:, 1:].reshape(n, 3 * (k - 1)), _PALETTE)

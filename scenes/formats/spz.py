@@ -25,7 +25,7 @@ _GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 _SIZES = struct.Struct("<QQ")
-_EXTENDED = 0x2
+_ANTIALIASED, _EXTENDED = 0x1, 0x2
 _COLOUR = 0.15
 _COUNTS = (*SH_COUNTS, 25)  # harmonics of degree 4 are read past
 _FRACTION = 12  # bits: a quarter of a millimetre, as Niantic's writer has it
@@ -59,8 +59,18 @@ def unpacked(data: bytes, path: str) -> Gaussians:
     return assembled(means, quats, log_scales, BYTE_LOGITS[alphas], sh)
 
 
-def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4) -> None:
-    """Write splats as version 2, 3 or 4. Positions get fewer bits after the point where metres need more before it.
+def antialiased(path: Path) -> bool:
+    """Whether a file's header says that its splats were trained with antialiasing."""
+    with open(path, "rb") as file:
+        head = file.read(4096)
+    if head.startswith(_GZIP):
+        head = zlib.decompressobj(31).decompress(head, _HEADER.size)
+    return bool(_HEADER.unpack(head[: _HEADER.size])[5] & _ANTIALIASED)
+
+
+def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4, antialias: bool = False) -> None:
+    """Write splats as version 2, 3 or 4. Positions get fewer bits after the point where metres need more before it. antialias: how they
+    were trained.
 
     ValueError where a position is beyond 8388 km, which 24 bits cannot hold.
     """
@@ -81,7 +91,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4) ->
         ((sh + steps // 2) // steps * steps).clip(0, 255),
     ]
     plain = [block.astype(np.uint8).tobytes() for block in blocks]
-    about = _MAGIC, version, len(gaussians), gaussians.sh_degree, fraction, 0
+    about = _MAGIC, version, len(gaussians), gaussians.sh_degree, fraction, _ANTIALIASED * antialias
     with atomic_file(path) as partial, open(partial, "wb") as file:
         if version < 4:
             squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
