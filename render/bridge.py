@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from render.compositing import Picture, draw, draw_backward
 from render.kernels.bin import REACH_INTS
@@ -107,6 +108,7 @@ class Rasterize(torch.autograd.Function):
         return *sums, median, instance
 
     @staticmethod
+    @once_differentiable  # kernels leave no trace: a gradient of gradients is refused, not taken as 0
     def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):
         _unchanged = ctx.saved_tensors  # raises where a field was written to
         settings, device, groups = ctx.settings, ctx.scene.records.device, ctx.work.groups

@@ -76,10 +76,11 @@ class Convert:
     def run(self) -> None:
         fresh(self.target, self.overwrite)
         from scenes.convert import convert
+        from scenes.formats.trained import model_of
 
         thing, warnings = open_splats(self.source, self.drop_invalid)
         warn(warnings)
-        print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite)}")
+        print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite, model_of(self.source))}")
 
 
 @dataclass

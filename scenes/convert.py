@@ -10,7 +10,7 @@ import torch
 from scenes.asset import Asset
 from scenes.files import load, save
 from scenes.formats import USD, named
-from scenes.gaussians import SH_COUNTS, Gaussians
+from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class Fidelity:
         return f"{size}; off by at most {most}{lost}"
 
 
-def convert(thing: Asset | Gaussians, target: Path, overwrite: bool = False) -> Fidelity:
+def convert(thing: Asset | Gaussians, target: Path, overwrite: bool = False, model: SplatModel | None = None) -> Fidelity:
     """Write splats or an asset as what the target's suffix says, and read them back to compare. Errors are those of `save`.
 
-    An asset keeps its label, size and metadata only as USD; elsewhere its splats are written.
+    An asset keeps its label, size and metadata only as USD; elsewhere its splats are written, and how they were trained as of `save`.
     """
     form = named(target)
     gaussians = thing.gaussians if isinstance(thing, Asset) else thing
-    save(thing if form is USD else gaussians, target, overwrite)
+    save(thing if form is USD else gaussians, target, overwrite, model=thing.model if isinstance(thing, Asset) else model)
     after = load(target)
     assert form is not None and isinstance(after, Asset | Gaussians)  # `save` knew the suffix, and a file is no scene
     return fidelity(form.arranged(gaussians), after.gaussians if isinstance(after, Asset) else after, target.stat().st_size)

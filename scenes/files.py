@@ -9,7 +9,7 @@ from pathlib import Path
 from scenes.asset import Asset
 from scenes.databank import Databank
 from scenes.formats import SUFFIXES, USD, found, named
-from scenes.gaussians import Gaussians
+from scenes.gaussians import Gaussians, SplatModel
 from scenes.scene import Scene
 
 KINDS = ("scene", "databank", "asset", "splats")
@@ -30,9 +30,16 @@ def load_dropping(path: str | os.PathLike) -> tuple[Scene | Asset | Gaussians, i
     return read(path, clean), clean.count
 
 
-def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: bool = False, half: bool = False) -> None:
+def save(
+    thing: Scene | Asset | Gaussians,
+    path: str | os.PathLike,
+    overwrite: bool = False,
+    half: bool = False,
+    model: SplatModel | None = None,
+) -> None:
     """Write a Scene as a folder, an Asset as .usdc or .usda, Gaussians as the suffix says (scenes.formats): whole or not at all.
 
+    model: what Gaussians were trained with, where that is known; USD keeps it, and PLY, SPZ and SOG whether it is antialiased.
     `half` stores all but positions in USD's half precision, at about half the bytes. An existing target raises
     FileExistsError; with `overwrite` a file is replaced, a folder only if it is a scene. Raises ValueError where a value is
     not finite or the suffix does not fit.
@@ -63,9 +70,9 @@ def save(thing: Scene | Asset | Gaussians, path: str | os.PathLike, overwrite: b
     elif form is USD:
         from scenes.usd_splats import save_gaussians
 
-        save_gaussians(path, thing, half=half)
+        save_gaussians(path, thing, model, half)
     else:
-        form.save(path, thing)
+        form.save(path, thing, bool(model and model.antialias))
 
 
 def kind_of(path: str | os.PathLike) -> str:

@@ -27,14 +27,14 @@ STRAY = 2.0
 """Percent of the splats, at either end of each axis, that the box leaves out."""
 
 
-def around(thing: Asset | Gaussians, path: str, up: str = "z") -> Scene:
+def around(thing: Asset | Gaussians, path: str, up: str = "z", model: SplatModel = SplatModel()) -> Scene:  # noqa: B008 - frozen
     """A scene of splats, whose axis `up` points up: a body goes once around them, to the left, in four seconds, with a camera `orbit`.
 
-    A lateral shift brings the camera nearer. ValueError where there are no splats, and for an axis that is none; errors of the scene name
-    `path`.
+    model: what plain splats were trained with; an asset has its own. A lateral shift brings the camera nearer. ValueError where there are
+    no splats, and for an axis that is none; errors of the scene name `path`.
     """
     turn = upright(up)
-    gaussians, model = (thing.gaussians, thing.model) if isinstance(thing, Asset) else (thing, SplatModel())
+    gaussians, model = (thing.gaussians, thing.model) if isinstance(thing, Asset) else (thing, model)
     if not len(gaussians):
         raise ValueError(f"{path} is empty: it has no splats")
     low, high = np.percentile(gaussians.means.numpy().astype(np.float64) @ turn.T, [STRAY, 100 - STRAY], axis=0)

@@ -13,7 +13,8 @@ from scenes.asset import Asset
 from scenes.databank import Databank, Entry
 from scenes.files import as_is, kind_of, read, splats_of
 from scenes.formats import USD, found
-from scenes.gaussians import Gaussians
+from scenes.formats.trained import model_of
+from scenes.gaussians import Gaussians, SplatModel
 from scenes.lenses import Lens
 from scenes.scene import Scene
 
@@ -38,7 +39,9 @@ def describe(path: str | os.PathLike) -> dict:
     thing = read(path)
     if isinstance(thing, Gaussians):
         form = found(path)
-        return told | ({"format": form.name} if form else {}) | _about_splats(thing)
+        model = model_of(path)
+        trained = {"model": asdict(model)} if model != SplatModel() else {}
+        return told | ({"format": form.name} if form else {}) | trained | _about_splats(thing)
     if isinstance(thing, Asset):
         about = {"label": thing.label, "size": thing.size.tolist(), "model": asdict(thing.model)}
         return told | about | _about_splats(thing.gaussians) | {"meta": thing.meta}

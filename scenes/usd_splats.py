@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+from pxr import Usd, UsdGeom, UsdVol, Vt
 
 from scenes.asset import Asset
 from scenes.asset_photos import load_photos, photos_beside
-from scenes.formats.packing import logits_from, opacities_from, unit
+from scenes.formats.packing import log_scales_from, logits_from, opacities_from, unit
+from scenes.formats.transform import moved
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
 
@@ -37,12 +38,17 @@ def save_gaussians(path: Path, gaussians: Gaussians, model: SplatModel | None = 
 
 
 def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
-    """The splats of a USD file that has exactly one splat prim, not under a transform."""
+    """The splats of a USD file that has exactly one splat prim, in the stage's frame."""
     with open_stage(path) as stage:
         prim = only_splats(stage.GetPseudoRoot(), path)
-        if UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
-            raise ValueError(f"{path}: {prim.GetPath()} stands under a transform, which splats alone cannot carry; apply it before export")
-        return clean(read_splats(prim), str(path))
+        transform = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
+        return clean(moved(read_splats(prim), torch.tensor(np.array(transform).T), path), str(path))  # USD's vectors are rows
+
+
+def model_in(path: Path) -> SplatModel:
+    """The model of the one splat prim of a USD file."""
+    with open_stage(path) as stage:
+        return read_model(only_splats(stage.GetPseudoRoot(), path))
 
 
 def stage_axes(path: Path) -> tuple[str, float]:
@@ -131,9 +137,13 @@ def read_splats(prim: Usd.Prim) -> Gaussians:
     for name, (found, wanted) in counts.items():
         if found != wanted:
             raise ValueError(f"{prim.GetPath()} has {found} {name} for {n} positions of SH degree {degree}; it needs {wanted}")
-    with np.errstate(divide="ignore", invalid="ignore"):  # what is out of range becomes inf or nan, which `validate` names
-        log_scales = np.log(scales.astype(np.float64))
-    fields = means, quats[:, [3, 0, 1, 2]], log_scales, logits_from(opacities[:, 0]), sh.reshape(n, SH_COUNTS[degree], 3)
+    fields = (
+        means,
+        quats[:, [3, 0, 1, 2]],
+        log_scales_from(scales.astype(np.float64)),
+        logits_from(opacities[:, 0]),
+        sh.reshape(n, SH_COUNTS[degree], 3),
+    )
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(f, np.float32)) for f in fields))
 
 

@@ -14,6 +14,7 @@ from scenes.asset import Asset
 from scenes.databank import Databank
 from scenes.files import load
 from scenes.formats import GLB, PLY, USD, found
+from scenes.formats.trained import model_of
 from scenes.gaussians import Gaussians
 from scenes.report import validate
 from scenes.sizes import odd_size
@@ -56,7 +57,9 @@ def add_splats(
     upright = turned_upright(splats, scale or metres, up or own_up, forward or own_forward)
     low, high = solid_box(upright)
     base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
-    asset = Asset(replace(upright, means=upright.means - base), (high - low).double(), label, meta={**share, "source": file.name})
+    asset = Asset(
+        replace(upright, means=upright.means - base), (high - low).double(), label, model_of(file), {**share, "source": file.name}
+    )
     _check_size(file, label, asset.size.tolist(), force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
 
@@ -102,7 +105,7 @@ def solid_box(splats: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
 def holds_splats(file: Path) -> bool:
     """Whether a file holds splats rather than a mesh: of the kinds that can hold either, the header says."""
     form = found(file)
-    mark = {PLY: b"opacity", GLB: b"KHR_gaussian_splatting"}.get(form) if form else None
+    mark = {PLY: b"opacity", GLB: b"gaussian_splat"}.get(form) if form else None
     if mark is None:
         return form is not None
     with open(file, "rb") as opened:

@@ -7,6 +7,7 @@ turned. GLB does (glTF is Y up), so its splats are turned to this project's Z up
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from scenes.gaussians import Gaussians
 class Format:
     """A kind of splat file: its name, its suffixes, and the module that reads and writes it.
 
-    ordered: whether it is written along a Morton curve, since its neighbours share a range of values or compress together.
+    ordered: whether it is written along a Morton curve, since its neighbours share a range of values or compress together. tagged:
+    whether it has a place for how splats were trained (scenes/formats/trained.py).
     """
 
     name: str
@@ -26,14 +28,16 @@ class Format:
     module: str
     functions: str
     ordered: bool = False
+    tagged: bool = False
 
     def load(self, path: Path, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
         """The splats of a file. ValueError where it is not of this format or not whole; `clean` answers for the values."""
         return getattr(importlib.import_module(self.module), f"load_{self.functions}")(path, clean)
 
-    def save(self, path: Path, gaussians: Gaussians) -> None:
+    def save(self, path: Path, gaussians: Gaussians, antialias: bool = False) -> None:
         """Write splats, as `arranged` has them, whole or not at all. ValueError where the format cannot hold them."""
-        getattr(importlib.import_module(self.module), f"save_{self.functions}")(path, self.arranged(gaussians))
+        more = {"antialias": antialias} if self.tagged else {}
+        getattr(importlib.import_module(self.module), f"save_{self.functions}")(path, self.arranged(gaussians), **more)
 
     def arranged(self, gaussians: Gaussians) -> Gaussians:
         """The splats in the order in which this format stores them."""
@@ -44,13 +48,15 @@ class Format:
         return gaussians.select(morton_order(gaussians.means))
 
 
-PLY = Format("PLY", (".ply",), "scenes.formats.ply", "ply")
-COMPRESSED_PLY = Format("compressed PLY", (".compressed.ply",), "scenes.formats.compressed_ply", "compressed_ply", ordered=True)
+PLY = Format("PLY", (".ply",), "scenes.formats.ply", "ply", tagged=True)
+COMPRESSED_PLY = Format(
+    "compressed PLY", (".compressed.ply",), "scenes.formats.compressed_ply", "compressed_ply", ordered=True, tagged=True
+)
 USD = Format("USD", (".usdc", ".usda", ".usd"), "scenes.usd_splats", "gaussians")
 GLB = Format("GLB", (".glb",), "scenes.formats.glb", "glb")
-SPZ = Format("SPZ", (".spz",), "scenes.formats.spz", "spz")
+SPZ = Format("SPZ", (".spz",), "scenes.formats.spz", "spz", tagged=True)
 SPLAT = Format(".splat", (".splat",), "scenes.formats.splat", "splat")
-SOG = Format("SOG", (".sog",), "scenes.formats.sog", "sog", ordered=True)
+SOG = Format("SOG", (".sog",), "scenes.formats.sog", "sog", ordered=True, tagged=True)
 FORMATS = (PLY, COMPRESSED_PLY, USD, GLB, SPZ, SPLAT, SOG)
 SUFFIXES = tuple(suffix for form in FORMATS for suffix in form.suffixes)
 
@@ -69,6 +75,7 @@ def found(path: Path) -> Format | None:
     form = named(path) if path.is_file() else None
     if form in (PLY, COMPRESSED_PLY):
         with open(path, "rb") as file:
-            head = file.read(4096)
-        return COMPRESSED_PLY if b"packed_position" in head else PLY
+            head = file.read(1 << 16)
+        # a property's line: comments may hold the word
+        return COMPRESSED_PLY if re.search(rb"^property[ \t]+\w+[ \t]+packed_position\s", head, re.MULTILINE) else PLY
     return form

@@ -16,7 +16,7 @@ import numpy as np
 
 from scenes.atomic import atomic_file
 from scenes.formats.packing import BYTE_LOGITS, assembled, drop_largest, levels, opacities_from, restore_largest, stored
-from scenes.formats.ply import Element, read_header, record
+from scenes.formats.ply import ANTIALIASED, Element, read_header, record
 from scenes.gaussians import SH_COUNTS, Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 
@@ -54,8 +54,9 @@ def load_compressed_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str
     return clean(assembled(means, quats, log_scales, BYTE_LOGITS[colour & 0xFF], sh), str(path))
 
 
-def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write splats in their order: neighbours should follow each other, since a chunk's range sets the error of its positions."""
+def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = False) -> None:
+    """Write splats in their order: neighbours should follow each other, since a chunk's range sets the error of its positions.
+    antialias: how they were trained."""
     n, k = len(gaussians), gaussians.sh.shape[1]
     g = stored(gaussians)
     colours = rgb_from_sh(g["sh"][:, 0])
@@ -75,7 +76,7 @@ def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
     rgba = np.concatenate([share("color"), opacities_from(g["logit_opacities"])[:, None]], 1)
     packed[:, 3] = _packed(rgba, _8888)
     rest = np.floor((g["sh"][:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1)) / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8)
-    header = ["ply", "format binary_little_endian 1.0", f"element chunk {len(starts)}"]
+    header = ["ply", "format binary_little_endian 1.0", *([ANTIALIASED] if antialias else []), f"element chunk {len(starts)}"]
     header += [f"property float {name}" for name in _RANGES + _COLOURS]
     header += [f"element vertex {n}", *(f"property uint {name}" for name in _PACKED)]
     header += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * (k - 1)))] if k > 1 else []

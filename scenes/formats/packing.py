@@ -13,6 +13,7 @@ import torch
 from scenes.gaussians import Gaussians
 
 LOGIT_LIMIT = 15.0  # opacities of 0 and 1 have no finite logit; here they are this far from it
+FLAT = -13.8  # log scale of an axis along which a splat has no extent at all: a micrometre
 MOST_BYTES = 1024  # unpacked bytes for each byte of a compressed file: more is a lie of the header, or a bomb
 
 
@@ -26,6 +27,12 @@ def logits_from(opacities: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         p = opacities.astype(np.float64)
         return np.clip(np.log(p) - np.log1p(-p), -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.float32)
+
+
+def log_scales_from(scales: np.ndarray) -> np.ndarray:
+    """float32 logarithms of linear scales, those of 0 as of a micrometre; NaN where a scale is negative, which `validate` names."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(scales == 0, FLAT, np.log(scales)).astype(np.float32)
 
 
 BYTE_LOGITS = logits_from(np.arange(256) / 255)

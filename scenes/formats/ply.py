@@ -2,7 +2,9 @@
 
 x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: all of red's, all of green's, all of blue's), opacity (logit),
 scale_0..2 (ln), rot_0..3 (wxyz); binary little-endian floats. The reader takes any order, number type and byte order, more
-properties and ASCII. It maps the file: what the header claims is checked against its size before anything is allocated.
+properties and ASCII, and what other tools write: red, green, blue instead of f_dc (nerfstudio), no scale_2 (2D splats), harmonics of
+degree 4 (Brush; those of degree 3 are kept), filter_3D (Mip-Splatting and what builds on it), logits and scales of 0 and 1 that are
+infinite. It maps the file: what the header claims is checked against its size before anything is allocated.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ import numpy as np
 import torch
 
 from scenes.atomic import atomic_file
+from scenes.formats.packing import FLAT, LOGIT_LIMIT, logits_from, opacities_from
 from scenes.gaussians import SH_COUNTS, Gaussians
+from scenes.harmonics import sh_from_rgb
 
 _MAX_HEADER = 1 << 20
 _ROWS = 4096
@@ -32,6 +36,11 @@ _FIELDS = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
+_RGB = ("red", "green", "blue")
+_FULL = {"u1": 255.0, "u2": 65535.0}
+_FILTER = "filter_3D"
+ANTIALIASED = "comment SplatRenderMode: mip"
+_REST_COUNTS = [3 * (k - 1) for k in (*SH_COUNTS, 25)]
 
 
 @dataclass
@@ -44,36 +53,68 @@ class Element:
 
 
 def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
-    """The splats of a 3DGS PLY file, bit for bit. ValueError where it is not one or not whole.
+    """The splats of a 3DGS PLY file, bit for bit where they are finite. ValueError where it is not one or not whole.
 
     `clean(gaussians, where)` answers for the values: by default those that are not finite are refused by splat and field.
     """
     path = Path(path)
     order, elements, offset = read_header(path)
-    rest = _check_splats(path, elements)
+    fields, rest = _check_splats(path, elements)
     vertices = _read_vertices(path, order, elements, offset)
-    n, k = len(vertices), 1 + rest // 3
-    fields = {name: np.empty((n, len(names)), np.float32) for name, names in _FIELDS.items() if name != "dc"}
+    n, k = len(vertices), min(SH_COUNTS[-1], 1 + rest // 3)
+    values = {name: np.empty((n, len(names)), np.float32) for name, names in fields.items() if name not in ("dc", "rgb")}
     sh, higher = np.empty((n, k, 3), np.float32), [f"f_rest_{i}" for i in range(rest)]
     for start in range(0, n, _ROWS):  # one pass over the file, in parts that stay in the processor's cache
         rows, part = slice(start, start + _ROWS), vertices[start : start + _ROWS]
-        for name, field in fields.items():
-            field[rows] = _columns(part, _FIELDS[name])
-        sh[rows, 0] = _columns(part, _FIELDS["dc"])
-        sh[rows, 1:] = _columns(part, higher).reshape(len(part), 3, k - 1).transpose(0, 2, 1)
-    parts = fields["means"], fields["quats"], fields["scales"], fields["opacity"][:, 0], sh
+        for name, value in values.items():
+            value[rows] = _columns(part, fields[name])
+        sh[rows, 0] = _columns(part, fields["dc"]) if "dc" in fields else _constants(part, elements)
+        sh[rows, 1:] = _columns(part, higher).reshape(len(part), 3, rest // 3).transpose(0, 2, 1)[:, : k - 1]
+    logits, scales = values["opacity"][:, 0], values["scales"]
+    if scales.shape[1] == 2:
+        scales = np.concatenate([scales, np.full((n, 1), FLAT, np.float32)], 1)
+    scales[scales == -np.inf] = FLAT
+    logits[np.isinf(logits)] = LOGIT_LIMIT * np.sign(logits[np.isinf(logits)])
+    if "filter" in values:
+        scales, logits = _filtered(scales, logits, values["filter"])
+    parts = values["means"], values["quats"], scales, logits, sh
     return clean(Gaussians(*(torch.from_numpy(np.ascontiguousarray(f)) for f in parts)), str(path))
 
 
-def save_ply(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write splats as Kerbl et al.'s code does. Reading them back is bit-equal."""
+def _constants(part: np.ndarray, elements: list[Element]) -> np.ndarray:
+    """float32 `[N, 3]`: the constant coefficients of the colours red, green and blue, whole numbers up to their type's largest."""
+    kinds = next(e.properties for e in elements if e.name == "vertex")
+    rgb = _columns(part, _RGB) / np.array([_FULL.get(kinds[name], 1.0) for name in _RGB])
+    return sh_from_rgb(rgb).astype(np.float32)
+
+
+def _filtered(log_scales: np.ndarray, logits: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log scales and logits of splats that were rendered through Mip-Splatting's 3D filter (Yu et al. 2024), its sigma `[N, 1]` apart."""
+    before = 2 * log_scales.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        after = np.logaddexp(before, 2 * np.log(sigma.astype(np.float64)))
+    thinner = np.exp((before - after).sum(1) / 2)
+    return (after / 2).astype(np.float32), logits_from(opacities_from(logits) * thinner)
+
+
+def save_ply(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = False) -> None:
+    """Write splats as Kerbl et al.'s code does, and with Brush's comment where they were trained with antialiasing. Reading them back is
+    bit-equal."""
     n, k, _ = gaussians.sh.shape
     g = gaussians.detach().to("cpu")
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = ["x", "y", "z", "nx", "ny", "nz", *_FIELDS["dc"], *rest, "opacity", *_FIELDS["scales"], *_FIELDS["quats"]]
     higher = g.sh[:, 1:].transpose(1, 2).reshape(n, 3 * (k - 1))
     parts = [g.means, torch.zeros(n, 3), g.sh[:, 0], higher, g.logit_opacities[:, None], g.log_scales, g.quats]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}", *(f"property float {name}" for name in names), "end_header"]
+    about = [ANTIALIASED] if antialias else []
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *about,
+        f"element vertex {n}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
     with atomic_file(path) as partial, open(partial, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(torch.cat(parts, 1).numpy().astype("<f4", copy=False).data)
@@ -119,20 +160,29 @@ def _add_property(elements: list[Element], name: str, kind: str) -> None:
     elements[-1].properties[name] = kind
 
 
-def _check_splats(path: Path, elements: list[Element]) -> int:
-    """The number of f_rest properties; ValueError saying what the file is instead where it holds no splats."""
+def _check_splats(path: Path, elements: list[Element]) -> tuple[dict[str, tuple[str, ...]], int]:
+    """The properties of each field, and the number of f_rest; ValueError saying what the file is instead where it holds no splats."""
     names = {e.name: e.properties for e in elements}
     vertex = names.get("vertex", {})
     if "packed_position" in vertex:
         raise ValueError(f"{path} is a compressed splat PLY (PlayCanvas, SuperSplat); scenes.load reads it, by its header")
-    missing = [name for group in _FIELDS.values() for name in group if vertex.get(name, "list") == "list"]
+    has = {name for name, kind in vertex.items() if kind != "list"}
+    fields = dict(_FIELDS)
+    if has.isdisjoint(fields["dc"]) and has.issuperset(_RGB):
+        fields["rgb"] = _RGB
+        del fields["dc"]
+    if "scale_2" not in vertex:
+        fields["scales"] = fields["scales"][:2]
+    missing = [name for group in fields.values() for name in group if name not in has]
     if missing:
         what = "a mesh" if "face" in names else "not a Gaussian splat file"
         raise ValueError(f"{path} is {what}: its vertices lack {', '.join(missing)}")
+    if _FILTER in has:
+        fields["filter"] = (_FILTER,)
     rest = [name for name in vertex if name.startswith("f_rest_")]
-    if len(rest) not in [3 * (k - 1) for k in SH_COUNTS] or any(vertex.get(f"f_rest_{i}", "list") == "list" for i in range(len(rest))):
-        raise ValueError(f"{path} has {len(rest)} f_rest properties; SH of degree 0 to 3 has f_rest_0 to f_rest_8, 23 or 44, or none")
-    return len(rest)
+    if len(rest) not in _REST_COUNTS or any(f"f_rest_{i}" not in has for i in range(len(rest))):
+        raise ValueError(f"{path} has {len(rest)} f_rest properties; SH of degree 0 to 4 has f_rest_0 to f_rest_8, 23, 44 or 71, or none")
+    return fields, len(rest)
 
 
 def _read_vertices(path: Path, order: str, elements: list[Element], offset: int) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""PlayCanvas' SOG version 2: lossless WebP pictures with one splat a pixel, and meta.json; a folder, or a .sog (both zipped).
+"""PlayCanvas' SOG: lossless WebP pictures with one splat a pixel, and meta.json; a folder, or a .sog (both zipped).
 
 means_l, means_u: the two bytes of sign(x) ln(1 + |x|) between a least and a largest. quats: three terms of wxyz as bytes of
 q / sqrt(2) + 1/2, the left-out largest one as 252 + its place. scales, sh0: an entry of a table of 256 log scales or constant
 coefficients a channel; opacity in sh0's alpha. shN: a label of 16 bits, an entry of a palette of up to 65536 sets of harmonics
-(shN_centroids, 64 a row) whose numbers are entries of a third table.
+(shN_centroids, 64 a row) whose numbers are entries of a third table. That is version 2, which is written; of version 1, which is read,
+too, bytes run evenly from a least to a largest value of each channel, opacities as logits.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from scenes.formats.packing import (
 from scenes.gaussians import SH_COUNTS, Gaussians
 
 _PALETTE = 65536
+_MODEL = "antialiased"
 _ROW = 64  # sets of harmonics in a row of shN_centroids
 _SLACK = 65536  # pixels beyond the splats, of padding
 
@@ -49,7 +51,8 @@ def load_sog(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
         with open(path, "rb") as file:
             try:
                 with zipfile.ZipFile(file) as bundle:
-                    return clean(_read(path, lambda name: _unzipped(path, bundle, name)), str(path))
+                    inside = _folder(bundle)
+                    return clean(_read(path, lambda name: _unzipped(path, bundle, inside + name)), str(path))
             # zipfile seeks where the file says, reads what it has no name for, and asks for passwords
             except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as error:
                 raise ValueError(f"{path} is not a whole SOG file: {error}") from error
@@ -57,8 +60,19 @@ def load_sog(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     return clean(_read(path, lambda name: (folder / name).read_bytes()), str(path))
 
 
-def save_sog(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a .sog file, in the splats' order: neighbours should follow each other, for the pictures' sake.
+def antialiased(path: Path) -> bool:
+    """Whether meta.json says that the splats were trained with antialiasing."""
+    if path.is_file() and path.name != "meta.json":
+        with zipfile.ZipFile(path) as bundle:
+            text = _unzipped(path, bundle, _folder(bundle) + "meta.json")
+    else:
+        text = ((path if path.is_dir() else path.parent) / "meta.json").read_bytes()
+    return parsed(path, text).get("model") == _MODEL
+
+
+def save_sog(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = False) -> None:
+    """Write a .sog file, in the splats' order: neighbours should follow each other, for the pictures' sake. antialias: how they were
+    trained.
 
     Positions keep 16 bits of the box; scales and colours the nearest of 256 values; harmonics the mean of about N / 65536 alike ones.
     """
@@ -84,6 +98,8 @@ def save_sog(path: str | os.PathLike, gaussians: Gaussians) -> None:
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colours.tolist(), "files": ["sh0.webp"]},
     }  # fmt: skip
+    if antialias:
+        meta["model"] = _MODEL
     files = {name: _webp(pixels, shape) for name, pixels in pictures.items()}
     if k > 1:
         sets, labels = palette(g["sh"][:, 1:].reshape(n, 3 * (k - 1)), _PALETTE)
@@ -104,9 +120,10 @@ def _read(path: Path, fetch: Callable[[str], bytes]) -> Gaussians:
     """The splats of the files that `fetch` gives by name."""
     meta = parsed(path, fetch("meta.json"))
     with follows(path, "SOG"):
-        if meta["version"] != 2:
-            raise ValueError(f"{path} is SOG version {meta['version']!r}; version 2 is read")
-        n = meta["count"]
+        version = meta.get("version", 1)
+        if version not in (1, 2):
+            raise ValueError(f"{path} is SOG version {version!r}; versions 1 and 2 are read")
+        n = meta["count"] if version == 2 else meta["means"]["shape"][0]
         if type(n) is not int or n < 0:
             raise ValueError(f"{path} is corrupt: its meta.json claims {n!r} splats")
 
@@ -129,25 +146,30 @@ def _read(path: Path, fetch: Callable[[str], bytes]) -> Gaussians:
             raise ValueError(f"{path} is corrupt: splat {int((turns[:, 3] < 252).argmax())} has no quaternion: its tag is below 252")
         terms = ((np.arange(256) / 255 - 0.5) * 2**0.5).astype(np.float32)
         quats = restore_largest(turns[:, 3] - 252, terms[turns.T[:3]])
-        log_scales = _table(path, meta, "scales")[pixels("scales")[:, :3]]
-        colours = pixels("sh0")
-        sh = _table(path, meta, "sh0")[colours[:, :3]][:, None]
+        log_scales = _entries(_table(path, meta, "scales"), pixels("scales")[:, :3])
+        colours, table = pixels("sh0"), _table(path, meta, "sh0")
+        sh = _entries(table, colours[:, :3])[:, None]
+        logits = BYTE_LOGITS[colours[:, 3]] if version == 2 else table[colours[:, 3], -1]
         if meta.get("shN"):
             sh = np.concatenate([sh, _harmonics(path, fetch, meta, pixels("shN", 1))], 1)
-    return assembled(means, quats, log_scales, BYTE_LOGITS[colours[:, 3]], sh)
+    return assembled(means, quats, log_scales, logits, sh)
 
 
 def _harmonics(path: Path, fetch: Callable[[str], bytes], meta: dict, labels: np.ndarray) -> np.ndarray:
     """float32 `[n, K - 1, 3]`."""
     about = meta["shN"]
-    bands, count = about["bands"], about["count"]
-    if bands not in (1, 2, 3) or type(count) is not int or not 0 <= count <= _PALETTE:
+    bands, count = about.get("bands"), about.get("count", 0)
+    if "codebook" in about and (bands not in (1, 2, 3) or type(count) is not int or not 0 <= count <= _PALETTE):
         raise ValueError(f"{path} is corrupt: its meta.json claims harmonics of {bands!r} bands, {count!r} sets")
-    width = SH_COUNTS[bands] - 1
-    entries = _picture(path, fetch, about["files"][0], count * width)
-    if entries.shape[1] != _ROW * width:
-        raise ValueError(f"{path} is corrupt: its harmonics' picture is {entries.shape[1]} wide, {bands} bands need {_ROW * width}")
-    sets = _table(path, meta, "shN")[entries[..., :3].reshape(-1, width, 3)]
+    entries = _picture(path, fetch, about["files"][0], count * (SH_COUNTS[bands] - 1) if bands else 0)
+    if not bands:  # version 1: the picture's width says, and its rows are full
+        bands, count = {_ROW * (k - 1): d for d, k in enumerate(SH_COUNTS) if d}.get(entries.shape[1]), _ROW * len(entries)
+    width = SH_COUNTS[bands] - 1 if bands else 0
+    if not bands or entries.shape[1] != _ROW * width:
+        raise ValueError(
+            f"{path} is corrupt: its harmonics' picture is {entries.shape[1]} wide, which is none of {bands or '1 to 3'} bands"
+        )
+    sets = _entries(_table(path, meta, "shN"), entries[..., :3]).reshape(-1, width, 3)
     index = labels[:, 0].astype(np.int64) | labels[:, 1].astype(np.int64) << 8
     if len(index) and index.max() >= len(sets):
         raise ValueError(f"{path} is corrupt: splat {int(index.argmax())} has set {int(index.max())} of {len(sets)} sets of harmonics")
@@ -155,12 +177,26 @@ def _harmonics(path: Path, fetch: Callable[[str], bytes], meta: dict, labels: np
 
 
 def _table(path: Path, meta: dict, field: str) -> np.ndarray:
-    """float32 `[256]`; entries that a short table lacks are NaN, which `validate` names where a splat has them."""
-    values = [float(v) for v in meta[field]["codebook"]]
-    if len(values) > 256:
-        raise ValueError(f"{path} is corrupt: its {field} table has {len(values)} entries, a byte has 256")
-    with np.errstate(over="ignore"):
-        return np.pad(np.array(values, np.float64), (0, 256 - len(values)), constant_values=np.nan).astype(np.float32)
+    """float32 `[256, 1]`, or `[256, C]` of as many channels; entries that a short table lacks are NaN, which `validate` names."""
+    about = meta[field]
+    if "codebook" in about:
+        values = [float(v) for v in about["codebook"]]
+        if len(values) > 256:
+            raise ValueError(f"{path} is corrupt: its {field} table has {len(values)} entries, a byte has 256")
+        with np.errstate(over="ignore"):
+            return np.pad(np.array(values, np.float64), (0, 256 - len(values)), constant_values=np.nan).astype(np.float32)[:, None]
+    ends = [about[end] if isinstance(about[end], list) else [about[end]] for end in ("mins", "maxs")]
+    least, most = (np.array([float(v) for v in end]) for end in ends)
+    channels = {"scales": 3, "sh0": 4, "shN": 1}[field]
+    if len(least) != channels or len(most) != channels:
+        raise ValueError(f"{path} is corrupt: its meta.json gives {len(least)} and {len(most)} ends of {field}, not {channels}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (least + (most - least) * (np.arange(256)[:, None] / 255)).astype(np.float32)
+
+
+def _entries(table: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """float32, of the shape of `places` `[..., 3]`: a table's entries, of each channel's own column where it has several."""
+    return table[:, 0][places] if table.shape[1] == 1 else table[places, np.arange(3)]
 
 
 def _picture(path: Path, fetch: Callable[[str], bytes], name: str, least: int) -> np.ndarray:
@@ -191,6 +227,12 @@ def _webp(pixels: np.ndarray, shape: tuple[int, int]) -> bytes:
     # exact: colours under an alpha of 0 are splats' values like any other
     Image.fromarray(canvas.reshape(*shape, 4)).save(out, "WEBP", lossless=True, exact=True, quality=50, method=2)
     return out.getvalue()
+
+
+def _folder(bundle: zipfile.ZipFile) -> str:
+    """Where in a bundle its uppermost meta.json lies, as "scene/": archives made of a folder keep that; "" where it has none."""
+    found = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")]
+    return min(found, key=lambda name: name.count("/"), default="").removesuffix("meta.json")
 
 
 def _unzipped(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:

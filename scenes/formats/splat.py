@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.atomic import atomic_file
-from scenes.formats.packing import BYTE_LOGITS, assembled, levels, opacities_from, stored, unit
+from scenes.formats.packing import BYTE_LOGITS, assembled, levels, log_scales_from, opacities_from, stored, unit
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 
@@ -27,8 +27,7 @@ def load_splat(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussi
     if size % _RECORD.itemsize:
         raise ValueError(f"{path} is not a whole .splat file: its {size} bytes are not a multiple of {_RECORD.itemsize}")
     records = np.memmap(path, _RECORD, "r") if size else np.zeros(0, _RECORD)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales = np.log(records["scales"])
+    log_scales = log_scales_from(records["scales"])
     rgba = records["rgba"]
     sh = sh_from_rgb(rgba[:, None, :3].astype(np.float32) / 255)
     quats = (records["quats"].astype(np.float32) - 128) / 128

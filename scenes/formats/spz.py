@@ -2,8 +2,8 @@
 
 Positions 24-bit fixed point; opacities a byte; colours a byte each, 0.15 of the constant coefficient about the middle; log scales a
 byte each, 1/16 from -10; rotations the largest of xyzw, 2 bits, and sign and 9 bits of each other term (version 2: xyz, a byte each);
-harmonics a byte each, 1/128 about 0. Versions 2 and 3 are one gzip stream behind a header of 16 bytes; version 4 has a plain header
-of 32 bytes, a table of sizes and a Zstandard stream for each block.
+harmonics a byte each, 1/128 about 0 (of degree 4, which version 4 knows, those of degree 3 are kept). Versions 2 and 3 are one gzip
+stream behind a header of 16 bytes; version 4 has a plain header of 32 bytes, a table of sizes and a Zstandard stream for each block.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ _GZIP = b"\x1f\x8b"
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 _SIZES = struct.Struct("<QQ")
-_EXTENDED = 0x2
+_ANTIALIASED, _EXTENDED = 0x1, 0x2
 _COLOUR = 0.15
+_COUNTS = (*SH_COUNTS, 25)  # harmonics of degree 4 are read past
 _FRACTION = 12  # bits: a quarter of a millimetre, as Niantic's writer has it
 _DEGREE_1_STEP, _HIGHER_STEP = 8, 16  # of 256 levels; its writer keeps 5 and 4 bits of harmonics, for the compressor's sake
 _LEVEL = 12  # of zstd, as in its writer
@@ -34,8 +35,11 @@ _LEVEL = 12  # of zstd, as in its writer
 
 def load_spz(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
     """The splats of an SPZ file. ValueError where it is not one or not whole; `clean` answers for the values."""
-    path = Path(path)
-    data = path.read_bytes()
+    return clean(unpacked(Path(path).read_bytes(), str(path)), str(path))
+
+
+def unpacked(data: bytes, path: str) -> Gaussians:
+    """The splats of an SPZ file's bytes, with whatever values they have; errors name `path`."""
     if data.startswith(_GZIP):
         version, n, k, fraction, blocks = _read_gzip(path, data)
     elif data.startswith(_MAGIC):
@@ -46,16 +50,27 @@ def load_spz(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     fixed = np.zeros((n * 3, 4), np.uint8)
     fixed[:, 1:] = positions.reshape(n * 3, 3)  # in the upper bytes of an int32, so that the sign is where it belongs
     means = fixed.view("<i4").reshape(n, 3).astype(np.float32) * np.float32(2.0 ** -(8 + fraction))
-    sh = np.empty((n, k, 3), np.float32)
+    kept = min(k, SH_COUNTS[-1])
+    sh = np.empty((n, kept, 3), np.float32)
     sh[:, 0] = ((np.arange(256) / 255 - 0.5) / _COLOUR).astype(np.float32)[colours].reshape(n, 3)
-    sh[:, 1:] = ((np.arange(256) - 128) / 128).astype(np.float32)[harmonics].reshape(n, k - 1, 3)
+    sh[:, 1:] = ((np.arange(256) - 128) / 128).astype(np.float32)[harmonics.reshape(n, k - 1, 3)[:, : kept - 1]]
     log_scales = (np.arange(256) / 16 - 10).astype(np.float32)[scales].reshape(n, 3)
     quats = _first_three(rotations.reshape(n, 3)) if version == 2 else _smallest_three(rotations.view("<u4"))
-    return clean(assembled(means, quats, log_scales, BYTE_LOGITS[alphas], sh), str(path))
+    return assembled(means, quats, log_scales, BYTE_LOGITS[alphas], sh)
 
 
-def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4) -> None:
-    """Write splats as version 2, 3 or 4. Positions get fewer bits after the point where metres need more before it.
+def antialiased(path: Path) -> bool:
+    """Whether a file's header says that its splats were trained with antialiasing."""
+    with open(path, "rb") as file:
+        head = file.read(4096)
+    if head.startswith(_GZIP):
+        head = zlib.decompressobj(31).decompress(head, _HEADER.size)
+    return bool(_HEADER.unpack(head[: _HEADER.size])[5] & _ANTIALIASED)
+
+
+def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4, antialias: bool = False) -> None:
+    """Write splats as version 2, 3 or 4. Positions get fewer bits after the point where metres need more before it. antialias: how they
+    were trained.
 
     ValueError where a position is beyond 8388 km, which 24 bits cannot hold.
     """
@@ -76,7 +91,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4) ->
         ((sh + steps // 2) // steps * steps).clip(0, 255),
     ]
     plain = [block.astype(np.uint8).tobytes() for block in blocks]
-    about = _MAGIC, version, len(gaussians), gaussians.sh_degree, fraction, 0
+    about = _MAGIC, version, len(gaussians), gaussians.sh_degree, fraction, _ANTIALIASED * antialias
     with atomic_file(path) as partial, open(partial, "wb") as file:
         if version < 4:
             squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
@@ -95,7 +110,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4) ->
             file.writelines(streams)
 
 
-def _read_gzip(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
+def _read_gzip(path: str, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
     """Version, splats, harmonics, bits after the point, and the six blocks, of version 2 or 3."""
     stream = zlib.decompressobj(31)
     try:
@@ -113,10 +128,10 @@ def _read_gzip(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]
     if more and not flags & _EXTENDED:
         raise ValueError(f"{path} is corrupt: its header claims {n} splats, {sum(sizes)} bytes, but it has more")
     ends = np.cumsum([0, *sizes])
-    return version, n, SH_COUNTS[degree], fraction, [body[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+    return version, n, _COUNTS[degree], fraction, [body[a:b] for a, b in zip(ends, ends[1:], strict=False)]
 
 
-def _read_zstd(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
+def _read_zstd(path: str, data: bytes) -> tuple[int, int, int, int, list[bytes]]:
     """As `_read_gzip`, of version 4."""
     import zstandard
 
@@ -142,18 +157,18 @@ def _read_zstd(path: Path, data: bytes) -> tuple[int, int, int, int, list[bytes]
         if len(blocks[i]) != plain:
             raise ValueError(f"{path} is corrupt: stream {row} holds {len(blocks[i])} bytes or more, where {plain} are due")
         at += packed
-    return version, n, SH_COUNTS[degree], fraction, blocks
+    return version, n, _COUNTS[degree], fraction, blocks
 
 
-def _block_sizes(path: Path, size: int, version: int, n: int, degree: int, fraction: int) -> list[int]:
+def _block_sizes(path: str, size: int, version: int, n: int, degree: int, fraction: int) -> list[int]:
     """Bytes of the six blocks; ValueError where the header's numbers cannot be."""
     if version not in (2, 3, 4):
         raise ValueError(f"{path} is SPZ version {version}; versions 2 to 4 are read")
-    if degree >= len(SH_COUNTS):
-        raise ValueError(f"{path} has spherical harmonics of degree {degree}; 0 to 3 are read")
+    if degree >= len(_COUNTS):
+        raise ValueError(f"{path} has spherical harmonics of degree {degree}; 0 to 4 are read")
     if fraction > 24:
         raise ValueError(f"{path} is corrupt: it claims {fraction} bits after the point of 24")
-    sizes = [n * width for width in (9, 1, 3, 3, 3 if version == 2 else 4, 3 * (SH_COUNTS[degree] - 1))]
+    sizes = [n * width for width in (9, 1, 3, 3, 3 if version == 2 else 4, 3 * (_COUNTS[degree] - 1))]
     if sizes[0] > MOST_BYTES * size:
         raise ValueError(f"{path} is truncated or corrupt: its header claims {n} splats, but it has {size} bytes")
     return sizes

@@ -28,6 +28,14 @@ def test_splats_written_to_between_forward_and_backward_are_refused():
         frame.rgb.sum().backward()
 
 
+def test_a_gradient_of_gradients_is_refused_and_not_silently_left_out():
+    splats = Gaussians(*(t.clone().requires_grad_() for t in ahead().tensors().values()))
+    loss = rasterize(splats, CAMERA).rgb.square().sum()
+    (slope,) = torch.autograd.grad(loss, splats.means, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        (loss + slope.square().sum()).backward()
+
+
 def test_splats_made_in_inference_mode_are_drawn_alike():
     with torch.inference_mode():
         made = Gaussians(*(t.clone() for t in ahead().tensors().values()))

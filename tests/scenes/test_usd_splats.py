@@ -170,14 +170,26 @@ def test_another_tools_file_with_some_half_attributes_loads(tmp_path):
         (lambda s: s.GetRadianceSphericalHarmonicsDegreeAttr().Set(4), "degree 4"),
         (lambda s: s.GetPrim().RemoveProperty("opacities"), "has no opacities"),
         (lambda s: s.GetOpacitiesAttr().Set(Vt.FloatArray([0.5, 1.5])), "splat 1 has nan in logit_opacities"),
-        (lambda s: s.GetScalesAttr().Set(Vt.Vec3fArray([Gf.Vec3f(1), Gf.Vec3f(0, 1, 1)])), "splat 1 has -inf in log_scales"),
-        (lambda s: s.AddTranslateOp().Set(Gf.Vec3d(1, 0, 0)), "stands under a transform"),
+        (lambda s: s.GetScalesAttr().Set(Vt.Vec3fArray([Gf.Vec3f(1), Gf.Vec3f(-1, 1, 1)])), "splat 1 has nan in log_scales"),
+        (lambda s: s.AddScaleOp().Set(Gf.Vec3f(1, 0, 1)), "whose scale is 0"),
         (lambda s: s.GetPrim().SetTypeName("Points"), "must hold one ParticleField3DGaussianSplat, it has none"),
     ],
 )
 def test_another_tools_bad_file_is_refused(tmp_path, edit, said):
     with pytest.raises(ValueError, match=said):
         load(foreign(tmp_path / "a.usda", edit))
+
+
+def test_splats_under_a_transform_are_moved_by_it(tmp_path):
+    def edit(splats):
+        splats.AddTranslateOp().Set(Gf.Vec3d(10, 20, 30))
+        splats.AddRotateZOp().Set(90)
+        splats.AddScaleOp().Set(Gf.Vec3f(2, 2, 4))
+
+    still, moved = load(foreign(tmp_path / "a.usda")), load(foreign(tmp_path / "b.usda", edit))
+    assert moved.means[0].tolist() == pytest.approx([10 - 2 * 2, 20 + 2 * 1, 30 + 4 * 3])  # the splat is at 1, 2, 3
+    wide = moved.log_scales.sub(still.log_scales).exp()
+    assert sorted(wide[0].tolist()) == pytest.approx([2, 2, 4], rel=1e-4)
 
 
 def test_invalid_splats_of_a_usd_file_can_be_dropped_and_counted(tmp_path):

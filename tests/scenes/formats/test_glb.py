@@ -1,33 +1,16 @@
 """GLB: a file of glTF's own axes, with nodes."""
 
-import json
 import math
-import struct
 
 import numpy as np
 import pytest
 import torch
+from made_glb import NAME, rewritten
 from randomized import gaussians
 
 from scenes import load, save
 from scenes.harmonics import evaluate
 from scenes.poses import matrix_from_quat
-
-NAME = "KHR_gaussian_splatting"
-
-
-def rewritten(path, change, binary=None):
-    """Change the JSON of a GLB file, and its binary chunk where one is given."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    tree = json.loads(data[20 : 20 + length])
-    change(tree)
-    body = data[28 + length :] if binary is None else binary
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(body), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + struct.pack("<II", len(body), 0x004E4942) + body)
-    return tree
 
 
 @pytest.fixture
@@ -91,16 +74,19 @@ def test_nodes_move_scale_and_nest(glb):
 @pytest.mark.parametrize(
     "change, said",
     [
-        (lambda t: t["nodes"][0].update(scale=[1, 2, 1]), "shears, mirrors or stretches"),
-        (lambda t: t["nodes"][0].update(scale=[-1, 1, 1]), "shears, mirrors or stretches"),
+        (lambda t: t["nodes"][0].update(scale=[1, 0, 1]), "whose scale is 0"),
         (lambda t: t["nodes"][0].update(children=[0]), "stands in its tree twice"),
         (lambda t: t["meshes"][0]["primitives"][0].pop("extensions"), "is a mesh, not splats"),
         (lambda t: t["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"), f"without {NAME}:SCALE"),
         (lambda t: t["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SH_DEGREE_2_COEF_1"), "SH_DEGREE_2_COEF_1"),
-        (lambda t: t["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={f"{NAME}_compression_spz_2": {}}), "packed by"),
+        (lambda t: t["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={f"{NAME}_compression_spz_2": {}}), "bufferView"),
+        (lambda t: t["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={f"{NAME}_compression_x": {}}), "packed by"),
+        (lambda t: t["meshes"][0]["primitives"][0]["extensions"][NAME].update(colorSpace="lin_rec709_display"), "srgb_rec709_display"),
+        (lambda t: t["meshes"][0]["primitives"][0]["extensions"][NAME].update(kernel="cone"), "kernel is 'cone'"),
         (lambda t: t["accessors"][0].update(count=2**60), "accessor 0 claims 1152921504606846976"),
-        (lambda t: t["accessors"][0].update(sparse={}), "sparse"),
-        (lambda t: t["bufferViews"][1].update(byteOffset=10**9), "truncated or corrupt: accessor 1"),
+        (lambda t: t["accessors"][0].update(sparse={}), "does not hold what glTF 2.0 says"),
+        (lambda t: (t["accessors"][0].pop("bufferView"), t["accessors"][0].update(count=2**40)), "accessor 0 claims 1099511627776"),
+        (lambda t: t["bufferViews"][1].update(byteOffset=10**9), "truncated or corrupt: buffer view 1"),
         (lambda t: t["accessors"][3].update(count=19), "its attributes have 19, 20 values"),
         (lambda t: t.update(scene=-1), "does not hold what glTF 2.0 says"),
         (lambda t: t.update(nodes=7), "does not hold what glTF 2.0 says"),
