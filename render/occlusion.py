@@ -23,6 +23,9 @@ FARTHEST = 30.0
 BESIDE = 1.5
 """Metres around a footprint that are traced whatever the light."""
 
+FADE = 4
+"""Cells within which a field fades towards its box's sides, so that no edge shows where it ends."""
+
 SOLID = 0.3
 """Opacity from which a splat blocks light."""
 
@@ -62,6 +65,8 @@ def shadow_box(size: torch.Tensor, directions: torch.Tensor) -> Box:
     half = size[:2].float() / 2
     low = torch.minimum(reach.quantile(0.03, 0) - half, -half - BESIDE)
     high = torch.maximum(reach.quantile(0.97, 0) + half, half + BESIDE)
+    fade = FADE * _cell(high - low)  # beyond the tip of the shadow, not over it
+    low, high = low - fade, high + fade
     return Box(torch.cat([low, torch.zeros(1)]), torch.cat([high, torch.tensor([height])]))
 
 
@@ -69,16 +74,19 @@ def trace_field(splats: Gaussians, box: Box, directions: torch.Tensor, weights: 
     """The light from `directions` `[K, 3]` of `weights` `[K]` that splats keep from the places of a box, all in one frame."""
     blockers = Blockers(squares(splats))
     extent = (box.high - box.low)[:2]
-    cell = max(0.08, float(extent.prod() / CELLS) ** 0.5)
-    counts = [max(2, round(float(e) / cell) + 1) for e in extent]
+    counts = [max(2, round(float(e) / _cell(extent)) + 1) for e in extent]
     axes = [torch.linspace(float(a), float(b), n) for a, b, n in zip(box.low, box.high, [*counts, LEVELS], strict=True)]
     axes[2][0] = 0.02  # above what is left of the road in an asset
     z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     points = torch.stack([x, y, z], -1).reshape(-1, 3)
     blocked = (1 - blockers.open_share(points, directions, weights, FARTHEST)).reshape(z.shape)
-    # towards the box's sides it fades, so that no edge shows where it ends
-    fade = [(torch.minimum(torch.arange(n), torch.arange(n).flip(0)) / 4).clamp_max(1) for n in counts]
+    fade = [(torch.minimum(torch.arange(n), torch.arange(n).flip(0)) / FADE).clamp_max(1) for n in counts]
     return Field(blocked * fade[1][:, None] * fade[0], box)
+
+
+def _cell(extent: torch.Tensor) -> float:
+    """Metres of a cell of a field of so many metres `[2]` along x and y."""
+    return max(0.08, float(extent.prod() / CELLS) ** 0.5)
 
 
 def squares(splats: Gaussians) -> np.ndarray:

@@ -38,8 +38,11 @@ GROUND = 0.3
 SKIRT = 0.25
 """Of the asset itself only what is lower receives some: tyres, and the rim of asphalt that was cut out with it."""
 
-TURN = math.radians(3)
-"""Turn of an asset from which its shadow is traced anew."""
+TURN, TILT = math.radians(3), math.radians(1.5)
+"""Turn and tilt of an asset from which its shadow is traced anew: uphill and downhill shadows differ more than sideways ones."""
+
+GRAZING = 0.05
+"""Of light that comes over level ground less steeply than this (sine) slopes are taken to get as much as of light that does."""
 
 STEP = 6.0
 """Metres of its way from which it is asked anew what houses and trees keep off."""
@@ -71,6 +74,8 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
             continue
         pose, shade = actor.trajectory.at(camera.time_us), _shade(scene)
         directions, weights = shade.at(actor, pose)
+        if not (weights > 0).any():
+            continue  # the slope turns away from all the light there is
         box = shadow_box(actor.asset.size, directions[weights > 0])
         asset_from_cam = inverse(pose) @ camera.world_from_cam.detach()
         window = _window(asset_from_cam, box, camera)
@@ -140,13 +145,20 @@ class Shade:
         self._fields: dict[tuple, Field] = {}
 
     def at(self, actor: Actor, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Directions `[K, 3]` of the light in the frame of an actor at a pose, and how much of each `[K]` reaches that place."""
+        """Directions `[K, 3]` of the light in the frame of an actor at a pose, whose base is the ground there, and how much of each `[K]`
+        reaches that ground."""
         place = tuple((pose[:3, 3] / STEP).round().int().tolist())
         if place not in self._passing:
             self._passing[place] = self._pass(pose, actor.asset.size)
-        # the asset's tilt is left out: the ground that is shaded tilts along
-        turned = yaw(-TURN * round(float(yaw_of(pose)) / TURN))[:3, :3]
-        return (self.light.directions @ turned.T).float(), self._passing[place]
+        heading = float(yaw_of(pose))
+        about = (yaw(-heading)[:3, :3] @ pose[:3, 2]).tolist()
+        steep = [math.tan(TILT * round(math.atan2(v, about[2]) / TILT)) for v in about[:2]]
+        tilted = _on_slope(TURN * round(heading / TURN), *steep)
+        up = tilted[:, 2]
+        # as many directions as light falls on level ground from there: on a slope of each that much more or less
+        level = self.light.directions[:, 2].clamp_min(GRAZING)
+        share = ((self.light.directions @ up).clamp_min(0) / level).float()
+        return (self.light.directions @ tilted).float(), self._passing[place] * share
 
     def field(self, actor: Actor, box: Box, directions: torch.Tensor, weights: torch.Tensor) -> Field:
         """What an actor keeps off in a box of its frame."""
@@ -169,6 +181,13 @@ class Shade:
         each = torch.eye(len(turned))
         passing = torch.stack([self._houses.open_share(points, turned, one, AROUND).mean() for one in each])
         return passing if bool((passing > 0).any()) else torch.ones(len(turned))  # under a bridge any light will do
+
+
+def _on_slope(heading: float, forward: float, left: float) -> torch.Tensor:
+    """The rotation `[3, 3]` of what stands at a heading on a plane whose normal leans so much forward and left, a metre up."""
+    up = torch.nn.functional.normalize(torch.tensor([forward, left, 1.0], dtype=torch.float64), dim=0)
+    ahead = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, -forward], dtype=torch.float64), dim=0)
+    return yaw(heading)[:3, :3] @ torch.stack([ahead, torch.linalg.cross(up, ahead), up], 1)
 
 
 _last: list[Shade] = []

@@ -26,8 +26,13 @@ WIDTH = 160
 BEFORE = 0.3
 """Metres that something must stand before the skin of a box to hide it, so that the object itself does not."""
 
-SHOWN = 0.5
-"""Of the sides that face a camera, as far as they are in its picture, the part that nothing may hide for it to count as the object's."""
+SHOWN, LEAST = 0.5, 0.25
+"""A side that faces a camera counts as seen where nothing stands before this part of what is in the picture of it, and that is at least
+this part of the whole side: beside a long one, close by, no picture holds it all."""
+
+_WAYS = {"front": (1, 0, 0), "left": (0, 1, 0), "rear": (-1, 0, 0), "right": (0, -1, 0)}
+SIDES = {name: torch.tensor(way, dtype=torch.float64) for name, way in _WAYS.items()}
+"""The upright sides of a box, by the words that `SECTORS` are made of, and which way is out there."""
 
 ALONG, UP = 6, (0.3, 0.6, 0.9)
 """Points of a side: how many along it, and at what parts of its height."""
@@ -37,8 +42,9 @@ ALONG, UP = 6, (0.3, 0.6, 0.9)
 class Sight:
     """How an object was seen.
 
-    views    frames of all cameras with its middle in view within `FARTHEST`, in which at least `SHOWN` of the sides that face them is not
-             hidden; sectors: from how many of them it was seen from each of `SECTORS`
+    views    frames of all cameras with its middle in view within `FARTHEST`, in which a side that faces them is seen; sectors: in how many
+             of them it was seen from each of `SECTORS`. Seen from a corner are the two sides that meet there: where only one of them
+             is, since the next parked car hides the other, the frame counts for that one
     nearest  metres to the nearest camera that has its middle in view, hidden or not
     left, right   how large its sides appeared, summed over those frames within `FARTHEST`: solid angle of what nothing hid, in parts of
              the side's area
@@ -74,7 +80,7 @@ def sight_of(views: Views, box: Trajectory, size: torch.Tensor) -> Sight:
     """How a scene's cameras saw a box `[length, width, height]`."""
     middle = torch.tensor([0.0, 0.0, float(size[2]) / 2, 1.0], dtype=torch.float64)
     points, outwards = _skin(size)
-    scene, count, nearest, sides, sectors = views.scene, 0, math.inf, [0.0, 0.0], dict.fromkeys(SECTORS, 0)
+    scene, count, nearest, sides, sectors = views.scene, 0, math.inf, {"left": 0.0, "right": 0.0}, dict.fromkeys(SECTORS, 0)
     for name, camera in scene.rig.items():
         times = scene.frame_times(name)
         times = times[torch.tensor([box.covers(t) and scene.ego.covers(t) for t in times.tolist()], dtype=torch.bool)]
@@ -88,15 +94,15 @@ def sight_of(views: Views, box: Trajectory, size: torch.Tensor) -> Sight:
             eye = inverse(cam_from_box[i])[:3, 3]
             faces = ((eye - points) * outwards).sum(-1) > 0
             inside, free = _shown(*views.at(name, int(times[i])), points @ cam_from_box[i, :3, :3].T + cam_from_box[i, :3, 3])
-            shows = faces & inside & free
-            for side, (way, beside) in enumerate(((1, float(eye[1])), (-1, -float(eye[1])))):
-                of_side = outwards[:, 1] == way
-                part = float(shows[of_side].double().mean())
-                sides[side] += part * max(0.0, beside - float(size[1]) / 2) / float(at[i].norm()) ** 3
-            if int(shows.sum()) >= SHOWN * int((faces & inside).sum()):
+            held, shown = faces & inside, faces & inside & free
+            part = {name: float(shown[outwards @ way > 0].double().mean()) for name, way in SIDES.items()}
+            least = {name: max(LEAST, SHOWN * float(held[outwards @ way > 0].double().mean())) for name, way in SIDES.items()}
+            for side, beside in (("left", float(eye[1])), ("right", -float(eye[1]))):
+                sides[side] += part[side] * max(0.0, beside - float(size[1]) / 2) / float(at[i].norm()) ** 3
+            if seen := " ".join(name for name in sector(float(eye[0]), float(eye[1])).split() if part[name] >= least[name]):
                 count += 1
-                sectors[sector(float(eye[0]), float(eye[1]))] += 1
-    return Sight(count, nearest, sides[0], sides[1], sectors)
+                sectors[seen] += 1
+    return Sight(count, nearest, sides["left"], sides["right"], sectors)
 
 
 def _skin(size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -104,14 +110,11 @@ def _skin(size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     along = (torch.arange(ALONG, dtype=torch.float64) + 0.5) / ALONG - 0.5
     along, up = (v.flatten() for v in torch.meshgrid(along, torch.tensor(UP, dtype=torch.float64), indexing="ij"))
     points, ways = [], []
-    for axis in (0, 1):
-        for way in (0.5, -0.5):
-            side = torch.stack([along, along, up], 1)
-            side[:, axis] = way
-            out = torch.zeros_like(side)
-            out[:, axis] = 2 * way
-            points.append(side * size)
-            ways.append(out)
+    for way in SIDES.values():
+        side = torch.stack([along, along, up], 1)
+        side[:, :2] = torch.where(way[:2] == 0, side[:, :2], way[:2] / 2)
+        points.append(side * size)
+        ways.append(way.expand_as(side))
     return torch.cat(points), torch.cat(ways)
 
 

@@ -1,0 +1,55 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from street import START_US, box
+
+from render.aside import room_aside, shift_warning
+from render.clip import clip_cameras
+from scenes import Actor, Asset, Gaussians, Trajectory
+from scenes.poses import translation
+
+CAMERA = "front_camera"
+
+
+def room(scene, left, reach=500.0):
+    return room_aside(scene, scene.camera(CAMERA, START_US + 300_000), scene.ego.at(START_US + 300_000), left, reach)
+
+
+def told(scene, shift):
+    return shift_warning(scene, clip_cameras(scene, CAMERA), scene.ego, shift)
+
+
+def test_a_camera_can_go_aside_up_to_the_houses(street):
+    """Whose fronts stand 8.5 m from the path, on both sides."""
+    assert room(street, True) == pytest.approx(8.5 - 0.5, abs=0.6) and room(street, False) == pytest.approx(8.5 - 0.5, abs=0.6)
+    assert room(street, True, reach=3.0) == 3
+
+
+def test_where_nothing_stands_the_known_ground_ends(street):
+    g = street.background.gaussians
+    bare = replace(street, background=replace(street.background, gaussians=g.select(g.means[:, 2] < 0.1)))
+    assert room(bare, True) == pytest.approx(19, abs=0.5) and room(bare, False) == pytest.approx(20, abs=0.5)
+
+
+def test_what_drives_beside_the_path_is_in_nobodys_way(street):
+    wide = Asset(box((30.0, 1.8, 3.0), (0.5, 0.5, 0.5)), (30.0, 1.8, 3.0), "truck")
+    beside = Actor(wide, Trajectory(torch.zeros(1, dtype=torch.int64), translation(5.0, 4.0, 0.0)[None]), "t")
+    assert room(replace(street, actors=(beside,)), True) == room(street, True)
+
+
+def test_a_shift_to_where_nothing_was_recorded_is_told_with_the_largest_that_makes_sense(street):
+    (said,) = told(street, 500.0)
+    assert "500m goes beyond" in said and "m to the left of the path" in said
+    largest = float(said.rpartition(" is ")[2].rstrip("m"))
+    assert 7 <= largest <= 8 and not told(street, largest) and not told(street, -largest) and not told(street, 0.0)
+    (said,) = told(street, -500.0)
+    assert "to the right" in said and said.endswith(f"is {-largest:g}m")
+
+
+def test_beside_a_wall_no_shift_makes_sense(street):
+    wall = box((30.0, 0.3, 3.0), (0.6, 0.6, 0.6))
+    wall = replace(wall, means=wall.means + torch.tensor([5.0, 0.9, 0.0]))
+    walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, wall])))
+    (said,) = told(walled, 2.0)
+    assert said.endswith("no shift to that side makes sense") and not told(walled, -2.0)
