@@ -99,10 +99,10 @@ def train(
     checkpoint, weights = out / "checkpoint.pt", out / "enhancer.safetensors"
     if checkpoint.exists() and not resume:
         raise FileExistsError(f"{out} holds a training already; go on with it by --resume, or choose another folder")
-    if resume and not checkpoint.exists():
-        raise FileNotFoundError(f"nothing to resume: {checkpoint} does not exist; run without --resume")
     if weights.exists() and not checkpoint.exists():
         raise FileExistsError(f"{weights} exists already, and no checkpoint of its training to go on from; choose another folder")
+    if resume and not checkpoint.exists():
+        raise FileNotFoundError(f"nothing to resume: {checkpoint} does not exist; run without --resume")
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     if config is None:
         config = TrainConfig(**opened(checkpoint)["config"]) if checkpoint.exists() else TrainConfig.of(torch.device(device))

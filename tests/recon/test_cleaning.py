@@ -7,7 +7,8 @@ import torch
 from street import box, splats
 
 from recon.assets.cleaning import cleaned, lies_on_road, of_object, outliers
-from recon.assets.extract import seen, shown_colours
+from recon.assets.extract import shown_colours
+from recon.assets.sight import Views, sight_of
 from scenes import Gaussians, Trajectory
 from scenes.poses import translation, yaw
 from scenes.seen import SECTORS
@@ -65,10 +66,14 @@ def test_nothing_is_cleaned_to_nothing():
 
 def test_a_car_seen_from_behind_and_its_left_says_so(street):
     path = Trajectory(street.ego.times_us[:1], (translation(9.0, -3.0) @ yaw(0.0))[None])
-    sectors = seen(street, path, SIZE).sectors
-    assert list(sectors) == list(SECTORS) and sectors["rear"] + sectors["rear left"] == sum(sectors.values()) > 0
+    sectors = sight_of(Views(street), path, SIZE).sectors
+    assert list(sectors) == list(SECTORS) and sectors["rear left"] > 0
+    assert sectors["rear"] + sectors["rear left"] + sectors["left"] == sum(
+        sectors.values()
+    )  # close by, its rear is past the picture's edge
     turned = Trajectory(street.ego.times_us[:1], (translation(9.0, -3.0) @ yaw(torch.pi))[None])
-    assert seen(street, turned, SIZE).sectors["front right"] + seen(street, turned, SIZE).sectors["front"] == sum(sectors.values())
+    there = sight_of(Views(street), turned, SIZE).sectors
+    assert [there[name] for name in ("front", "front right", "right")] == [sectors[name] for name in ("rear", "rear left", "left")]
 
 
 def test_exposure_statistics_are_linear_light():
