@@ -148,10 +148,15 @@ class Render:
         from render.clip import clip_cameras, clip_times
         from render.record import record
         from scenes import Databank
+        from scenes.files import kind_of
         from scenes.insert import insert
         from scenes.seen import absence_warning, seeing, unseen_warning
 
         check_device(self.device)
+        if self.insert and kind_of(self.scene) in ("asset", "splats"):
+            raise UsageError(
+                f"--insert needs a street to put assets onto; give a scene that sidestep recon wrote, {self.scene} is splats alone"
+            )
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
@@ -213,11 +218,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         fail(stop if str(stop) else "interrupted", 130)
     except BrokenPipeError:
         os._exit(1)  # whoever read our output has gone: there is nobody left to tell
+    except (MemoryError, RuntimeError) as error:
+        if not lacks_memory(error) or os.environ.get("SIDESTEP_TRACEBACK"):
+            raise
+        fail("there is not enough memory for that; give a smaller --size, or fewer --outputs, or stop what else runs", 1)
     except (ValueError, OSError) as error:
         if os.environ.get("SIDESTEP_TRACEBACK"):
             raise
         named = isinstance(error, OSError) and error.strerror
         fail(f"{error.filename or 'the disk'}: {error.strerror}" if isinstance(error, OSError) and named else error, 1)
+
+
+def lacks_memory(error: Exception) -> bool:
+    """Whether an error says that memory ran out: numpy's and Python's by its type, torch's on a CPU by its words alone."""
+    words = ("allocate memory", "out of memory", "Failed to allocate")
+    return isinstance(error, MemoryError) or any(said in str(error) for said in words)
 
 
 def fail(said: object, code: int) -> NoReturn:

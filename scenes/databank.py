@@ -49,7 +49,8 @@ class Databank:
         """All entries, by id. FileNotFoundError where there is no databank, ValueError where its index is corrupt."""
         index = self.path / "index.json"
         if not index.is_file():
-            raise FileNotFoundError(f"{self.path} is not a databank: it has no index.json; name one by --databank, or add an asset")
+            fix = f"sidestep assets extract SCENE --databank {self.path}, or assets add, makes one; another is named by --databank"
+            raise FileNotFoundError(f"{self.path} is not a databank: it has no index.json; {fix}")
         try:
             data = json.loads(index.read_text(encoding="utf-8"))
             if data["format"] != FORMAT or data["version"] != VERSION:

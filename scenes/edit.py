@@ -82,6 +82,8 @@ def check_edit(edit: Edit, scene: Scene) -> None:
             raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):
             raise ValueError(f"{track} is removed and changed at once; say one of the two")
+        if edit.shift.get(track) == (0, 0) or edit.retime.get(track) == 0:
+            raise ValueError(f"{track} is shifted or retimed by nought, which changes nothing; say by how much, as 0m,1.5m or +0.5s")
         if track in edit.retime and len(have[track].trajectory) == 1:
             raise ValueError(f"{track} stands still for all times, so it cannot be retimed; shift or remove it")
 

@@ -25,10 +25,16 @@ def written(parse: Callable[[str], Any], metavar: str, default: str) -> Any:
     )
 
 
+LARGEST = 16_384
+"""Pixels along a side: H.264 holds no more."""
+
+
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f'"{text}" is not a size; write width and height in pixels, as 640x360')
+    if max(int(width), int(height)) > LARGEST:
+        raise ValueError(f'"{text}" is larger than a video can be; give at most {LARGEST} pixels a side, as 3840x2160')
     return int(width), int(height)
 
 
@@ -38,7 +44,7 @@ def _rate(text: str) -> float:
     except ValueError:
         rate = 0.0
     if not 0 < rate < 1000:
-        raise ValueError(f'"{text}" is not a frame rate; write frames a second, as 10')
+        raise ValueError(f'"{text}" is not a frame rate; write frames a second, above 0 and below 1000, as 10')
     return rate
 
 

@@ -188,7 +188,9 @@ USAGE = [
     ([*SHOOT, "--size", "640"], "--size", "as 640x360"),
     ([*SHOOT, "--outputs", "dept"], "--outputs", "Did you mean depth?"),
     ([*SHOOT, "--insert", "car/0001"], "--insert", "write ID@X,Y"),
-    ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, as 10"),
+    ([*SHOOT, "--size", "100000x9"], "--size", "at most 16384 pixels a side"),
+    ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, above 0 and below 1000, as 10"),
+    (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a street", "a scene that sidestep recon"),
     ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
     (["render", "street"], "--output", "required"),
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
@@ -222,6 +224,9 @@ DATA = [
     ([*SHOOT, "--start", "20s"], "front_camera has 8 frames over 0.7s"),
     ([*SHOOT, "--insert", "van/2@5m,0m", "--databank", "bank"], "it has car/0001, van/0001. Did you mean van/0001?"),
     ([*SHOOT, "--insert", "car/0001@5m,0m"], "databank is not a databank"),
+    (["assets", "extract", "street", "--databank", "clip.mp4"], "clip.mp4 is a file; a databank is a folder"),
+    (["assets", "list"], "sidestep assets extract SCENE --databank databank, or assets add, makes one"),
+    (["edit", "street", "--shift", "veh_1=0m,0m"], "by nought, which changes nothing"),
     ([*SHOOT, "--insert", "car/0001@trajectory=t.csv", "--databank", "bank"], "t.csv"),
     ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
     (["edit", "street", "--remove", "veh_2"], 'actor "veh_2" is not in street; it has veh_1. Did you mean veh_1?'),
@@ -245,6 +250,17 @@ def test_bad_data_is_one_line_and_exits_1(door, desk, words, message):
     (line,) = [line for line in errors.splitlines() if line.startswith("sidestep: ")]
     assert message in line
     assert not list(desk.glob("x*")) and not list(desk.glob(".x*"))
+
+
+def test_lack_of_memory_is_said_with_the_fix(door, desk, monkeypatch):
+    def full(*_, **__):
+        raise RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: you tried to allocate"
+        )
+
+    monkeypatch.setattr("render.clip.render_frame", full)
+    _, errors = door(SHOOT, 1)
+    assert "not enough memory for that; give a smaller --size" in errors and not list(desk.glob("x*"))
 
 
 def test_photos_that_claim_to_be_huge_are_bad_data(door, tmp_path):

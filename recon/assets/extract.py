@@ -81,6 +81,8 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
+    if Path(databank).exists() and not Path(databank).is_dir():  # before the scene is looked through, which takes long
+        raise ValueError(f"{databank} is a file; a databank is a folder, and made where there is none: give another name with --databank")
     shots: list[Shot] = []
     if not isinstance(scene, Scene):
         scene = scene_folder(scene)

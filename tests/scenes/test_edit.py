@@ -318,6 +318,8 @@ def test_a_scene_whose_root_held_the_recording_can_be_edited(saved):
         (Edit(remove=("veh_9",)), 'actor "veh_9" is not in .* it has veh_1, veh_2, veh_3. Did you mean'),
         (Edit(remove=("veh_1",), shift={"veh_1": (1, 0)}), "removed and changed at once"),
         (Edit(retime={"veh_3": 1000}), "veh_3 stands still"),
+        (Edit(shift={"veh_1": (0.0, 0.0)}), "by nought, which changes nothing"),
+        (Edit(retime={"veh_1": 0}), "by nought, which changes nothing"),
     ],
 )
 def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
