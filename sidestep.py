@@ -145,7 +145,7 @@ class Render:
         if self.weights != "builtin" and not self.enhance:
             raise UsageError(f"--weights {self.weights} would do nothing without --enhance; add it, or leave --weights out")
         from render.aside import shift_warning
-        from render.clip import clip_cameras, clip_times
+        from render.clip import clip_cameras, clip_times, cut_warning
         from render.record import record
         from scenes import Databank
         from scenes.files import kind_of
@@ -161,6 +161,7 @@ class Render:
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)
+        warnings += cut_warning(scene, camera, self.start, self.duration)
         warnings += shift_warning(scene, clip_cameras(scene, camera, 0.0, times), scene.ego, self.lateral_shift)
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))

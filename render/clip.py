@@ -82,6 +82,16 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
     return times
 
 
+def cut_warning(scene: Scene, camera: str, start_us: int, duration_us: int | None) -> list[str]:
+    """What to tell of a clip that would last longer than the recording does: a sentence, or nothing."""
+    have = scene.frame_times(camera)
+    step = 1e6 / frame_rate(have)
+    left = int(have[-1]) - int(have[0]) - start_us + step  # its last frame is shown as long as others
+    if duration_us is None or duration_us < left + step / 2:
+        return []
+    return [f"--duration {duration_us / 1e6:g}s goes beyond the recording: {camera} has {left / 1e6:.1f}s from there, and so the clip"]
+
+
 def frame_rate(times_us: torch.Tensor) -> float:
     """Frames a second of a clip with these times: by the median step, 10 for a single frame."""
     return 10.0 if len(times_us) < 2 else 1e6 / float(times_us.diff().double().median())

@@ -6,7 +6,7 @@ import torch
 from street import START_US, STEP_US
 
 from render import render_clip, render_frame
-from render.clip import clip_cameras, clip_times, frame_rate
+from render.clip import clip_cameras, clip_times, cut_warning, frame_rate
 from scenes import Trajectory
 
 
@@ -22,6 +22,13 @@ def test_a_positive_shift_moves_every_camera_to_the_left_of_travel(street):
         for a, b in zip(recorded, shifted, strict=True):
             assert (b.world_from_cam[:3, 3] - a.world_from_cam[:3, 3]).tolist() == pytest.approx([0, 2, 0])
             assert torch.allclose(a.world_from_cam[:3, :3], b.world_from_cam[:3, :3])
+
+
+def test_a_clip_that_would_last_longer_than_the_recording_says_so(street):
+    assert cut_warning(street, "front_camera", 0, None) == [] == cut_warning(street, "front_camera", 0, 800_000)
+    assert cut_warning(street, "front_camera", 300_000, 500_000) == []
+    (said,) = cut_warning(street, "front_camera", 300_000, 700_000)
+    assert "--duration 0.7s goes beyond the recording: front_camera has 0.5s from there" in said
 
 
 def test_any_path_of_the_body_can_be_driven(street):
