@@ -104,21 +104,20 @@ def enhance_video(
         raise ValueError(f"{enhancer.about.get('model', 'this model')} cannot be told where objects are; leave --instances out")
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
-    memory, done, changed, told = None, 0, 0, 0
+    memory, done, changed, told = None, 0, 0, False
     with _writer(out, clip) as writer:
         for at, rgb in clip.timed():
-            frame = rgb if ids is None else frame_of(rgb, ids.of(done, clip.width, clip.height))
-            told += isinstance(frame, Frame) and frame.instance is not None and bool((frame.instance > 0).any())
-            better, memory = enhancer.step(frame, memory)
+            instance = None if ids is None else ids.of(done, clip.width, clip.height)
+            told = told or (instance is not None and bool((instance > 0).any()))
+            better, memory = enhancer.step(rgb if instance is None else frame_of(rgb, instance), memory)
             changed += not torch.equal(better, rgb.to(better).clamp(0, 1))
             writer.write(better, at)
             done += 1
             if progress is not None:
                 progress(done, clip.count)
     if not changed:
-        warn(
-            [f"no frame of {source} was changed: {_why(rendered, instances, told)}; render --enhance tells objects and has photos to go by"]
-        )
+        why = _why(rendered, instances, told)
+        warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
     return done, changed
 
 
@@ -128,7 +127,7 @@ def _writer(out: str | Path, clip: Pictures | Video) -> PictureWriter | VideoWri
     return VideoWriter(out, clip.fps, clip.width, clip.height, pixel_aspect=clip.pixel_aspect)
 
 
-def _why(rendered: bool, instances: str | Path | None, told: int) -> str:
+def _why(rendered: bool, instances: str | Path | None, told: bool) -> str:
     if instances is not None and not told:
         return f"{instances} tells of no object, all of it is 0"
     if instances is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,8 +9,9 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from scenes import units
-from scenes.opening import UsageError, check_device, fresh, warn
+from scenes.opening import UsageError, check_device, fresh
 from scenes.options import Flag, Names, Output, Overwrite, written
+from scenes.stops import stopped_saying
 
 
 @dataclass
@@ -67,7 +66,7 @@ class Pairs:
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
-        with _stopped_saying("the same command goes on from here"):
+        with stopped_saying(lambda: "the same command goes on from here"):
             for path, name, data in zip(self.scenes, names, self.data, strict=True):
                 scene, log = open_reconstruction(path), open_log(data)
                 cameras = check_cameras(scene, log, self.cameras)
@@ -84,18 +83,6 @@ class Pairs:
                     make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
             make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
-
-
-@contextmanager
-def _stopped_saying(how: str) -> Iterator[None]:
-    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; {how}") from None
-    except SystemExit:
-        warn([f"stopped; {how}"])
-        raise
 
 
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
@@ -146,7 +133,7 @@ class Train:
                     steps.resume(round(1000 * share))
                 steps.step(round(1000 * share) - steps.done, line)
 
-            with _stopped_saying("the same command with --resume goes on from here"):
+            with stopped_saying(lambda: "the same command with --resume goes on from here"):
                 weights = train(
                     pairs,
                     self.output,

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from scenes.opening import check_device, warn
+from scenes.opening import check_device
 from scenes.options import AngleOrNone, FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+from scenes.stops import stopped_saying
 
 if TYPE_CHECKING:
     from scenes import Asset
@@ -61,18 +62,16 @@ class Recon:
         if self.size is not None:
             check_size(self.size)  # before photos are placed, which takes long
         log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
-        try:
+
+        def fix() -> str:
+            begun = checkpoint_path(self.output).exists()
+            return "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
+
+        with stopped_saying(fix):
             reconstruct(
                 log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
                 size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
             )  # fmt: skip
-        except (KeyboardInterrupt, SystemExit) as stop:
-            begun = checkpoint_path(self.output).exists()
-            fix = "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
-            if isinstance(stop, SystemExit):  # after SIGTERM, with a code of its own
-                warn([f"stopped; {fix}"])
-                raise
-            raise KeyboardInterrupt(f"interrupted; {fix}") from None
 
 
 @dataclass

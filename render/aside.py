@@ -13,6 +13,7 @@ from scenes.camera import Camera
 from scenes.insert import outside_ground
 from scenes.lenses import Pinhole
 from scenes.scene import Scene
+from scenes.spread import spread
 from scenes.trajectory import Trajectory
 
 LOOKS = 40
@@ -42,8 +43,8 @@ def room_aside(scene: Scene, camera: Camera, world_from_body: torch.Tensor, left
     frame = rasterize(scene.background, looking, ("median_depth",), model=scene.model)
     assert isinstance(frame, Frame) and frame.median_depth is not None
     room = min(reach, max(0.0, float(frame.median_depth.median()) - BEFORE))
-    while room > 0 and outside_ground(scene, (eye + room * aside)[:2]) > 0:
-        room = max(0.0, room - STEP)
+    while room > 0 and (beyond := outside_ground(scene, (eye + room * aside)[:2])) > 0:
+        room = max(0.0, room - max(STEP, beyond))
     return room
 
 
@@ -51,7 +52,7 @@ def shift_warning(scene: Scene, recorded: Sequence[Camera], ego: Trajectory, shi
     """What to tell of a clip that is shifted to where nothing was recorded: a sentence, or nothing. recorded: its cameras, unshifted."""
     if not shift:
         return []
-    looks = [recorded[i] for i in sorted({round(v) for v in torch.linspace(0, len(recorded) - 1, LOOKS).tolist()})]
+    looks = spread(recorded, LOOKS)
     room = [room_aside(scene, camera, ego.at(camera.time_us), shift > 0, abs(shift)) for camera in looks]
     least = min(room)
     if least >= abs(shift):

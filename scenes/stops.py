@@ -5,6 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from scenes.opening import warn
 
 
 class Stops:
@@ -49,3 +53,15 @@ class Stops:
             signal.signal(number, former)  # type: ignore[arg-type]  # what `signal` gave
         if kind is None:
             self.end()  # what was asked for after the last step, too
+
+
+@contextmanager
+def stopped_saying(how: Callable[[], str]) -> Iterator[None]:
+    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM, which ends with a code of its own."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {how()}") from None
+    except SystemExit:
+        warn([f"stopped; {how()}"])
+        raise

@@ -1,9 +1,9 @@
 """`python -m tests.pretend_cuda MODULE ARGUMENTS...` runs a module (`sidestep`, `enhance.evaluate`, `pytest`) on a GPU that is not there.
 
 Tensors that a program puts on "cuda" stay on the host and are marked; what meets a mark is marked, and what a GPU would refuse is refused:
-host and GPU tensors in one operation, `.numpy()` of a GPU tensor, a graph's gradient for what is elsewhere. Kernels run on the CPU, those
-for blocks of threads as lanes. So Python's way through a command with `--device cuda`, which no machine without a GPU goes otherwise, is
-gone; what the CUDA kernels compute is another matter (tests/render/test_cuda.py).
+host and GPU tensors in one operation, `.numpy()` of a GPU tensor. Kernels run on the CPU, lanes in place of blocks of threads. This tests
+the Python that a command with `--device cuda` runs, which no machine without a GPU runs otherwise; what the CUDA kernels compute is tested
+in tests/render/test_cuda.py.
 """
 
 import runpy
@@ -20,6 +20,7 @@ from torch.overrides import TorchFunctionMode, resolve_name
 from torch.utils._pytree import tree_iter, tree_map_only
 
 CUDA, CPU = torch.device("cuda", 0), torch.device("cpu")
+
 _marks: dict[int, StorageWeakRef] = {}
 """Storages that are taken for a GPU's, by their addresses, which are not used again while a weak reference lasts."""
 
@@ -153,9 +154,7 @@ class _Generator(torch.Generator):
     """Of a GPU that is not there: it draws on the host."""
 
     def __new__(cls, device="cpu"):
-        made = super().__new__(cls, CPU)
-        made.there = torch.device(device).type == "cuda"
-        return made
+        return super().__new__(cls, CPU)
 
 
 class _Event:

@@ -77,11 +77,9 @@ def test_pairs_training_and_evaluation(desk, monkeypatch):
     made_of = ["scene", "--data", "drive", "--databank", "bank", "--kinds", kinds, "--size", "96"]
     call(desk, monkeypatch, "pairs", *made_of, "-o", "pairs", "--device", "cuda")
     assert {shard.meta["kind"] for shard in PairSet(desk / "pairs").shards} == set(kinds.split(","))
-    train(PairSet(desk / "pairs"), desk / "training", steps=12, config=TrainConfig(images=1, crop=48), start="builtin", device="cuda")
-    assert (
-        evaluate([str(desk / "pairs"), "--weights", str(desk / "training" / "enhancer.safetensors"), "--device", "cuda", "--limit", "1"])
-        == 0
-    )
+    config = TrainConfig(images=1, crop=48)
+    weights = train(PairSet(desk / "pairs"), desk / "training", steps=12, config=config, start="builtin", device="cuda")
+    assert evaluate([str(desk / "pairs"), "--weights", str(weights), "--device", "cuda", "--limit", "1"]) == 0
 
 
 @ON_A_GPU

@@ -148,6 +148,6 @@ class WhiteBoxEnhancer:
             return rgb, memory
         image, mask = rgb.permute(2, 0, 1)[None], (given.instance > 0).to(rgb)[None, None]
         now, look = torch.cat(self.model(image, mask)), thin(image)
-        known = memory is not None and memory.look.shape == look.shape and bool(alike(look, memory.look)[0])
-        mean = KEPT * memory.mean + (1 - KEPT) * now if memory is not None and known else now
-        return harmonized(image, mask, mean[:, None].unbind())[0].permute(1, 2, 0).contiguous(), Arguments(mean, look)
+        if memory is not None and memory.look.shape == look.shape and alike(look, memory.look)[0]:
+            now = KEPT * memory.mean + (1 - KEPT) * now
+        return harmonized(image, mask, now[:, None].unbind())[0].permute(1, 2, 0).contiguous(), Arguments(now, look)

@@ -95,7 +95,7 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
     if far:
         said = f"{far[0]}: no camera saw it" if len(far) == 1 else f"{len(far)} ({', '.join(sorted(far))}): no camera saw them"
         print(f"left out {said} from within {FARTHEST:.0f} m", file=sys.stderr)
-    for candidate in (c for c in found if c.track not in far):
+    for candidate in (c for c in found if c.asset.meta["views"]):
         photos = () if candidate.flaw else candidate.photos(scene, shots)
         hidden = "no photo shows most of it" if shots and candidate.instance is not None and not photos else ""
         if flaw := candidate.flaw or hidden:
@@ -166,7 +166,7 @@ def _judged(
 ) -> Candidate:
     flaw = ""
     if sight.views < FEWEST_VIEWS:
-        flaw = f"{sight.views} views within {FARTHEST:.0f} m that show most of it, fewer than {FEWEST_VIEWS}"
+        flaw = f"{sight.views} views within {FARTHEST:.0f} m that show a side of it, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
     whole, mirrored = completed(cut, sight.left, sight.right) if not flaw else (cut, False)

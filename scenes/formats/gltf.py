@@ -63,10 +63,10 @@ def item(tree: dict, kind: str, index: int) -> dict:
     """An entry of one of glTF's lists; not Python's idea of index -1 or True."""
     if type(index) is not int or index < 0:
         raise KeyError(f"{kind}[{index!r}]")
-    item = tree[kind][index]
-    if not isinstance(item, dict):
+    entry = tree[kind][index]
+    if not isinstance(entry, dict):
         raise TypeError(f"{kind}[{index}] is no object")
-    return item
+    return entry
 
 
 def _transform(node: dict) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 from small_net import stirred
 
 from enhance.clips import PairConfig
-from enhance.commands import Pairs, Train, _stopped_saying
+from enhance.commands import Pairs, Train
 from enhance.evaluate import main
 from enhance.pairs import make_pairs
 from enhance.photo_pairs import make_photo_pairs
@@ -232,10 +232,3 @@ def test_weights_are_never_trained_over(tmp_path):
         with pytest.raises(FileExistsError, match=r"enhancer.safetensors exists already.*choose another folder"):
             train(pairs, out, steps=4, config=QUICK, resume=resume)
     assert [p.read_bytes() for p in out.iterdir()] == [b"someone's weights"]
-
-
-@pytest.mark.parametrize(("stop", "told"), [(KeyboardInterrupt, "interrupted"), (SystemExit, "stopped")])
-def test_who_stops_is_told_how_it_goes_on(stop, told, capsys):
-    with pytest.raises(stop) as end, _stopped_saying("give the command again"):
-        raise stop
-    assert f"{told}; give the command again" in str(end.value) + capsys.readouterr().err

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from scenes.stops import Stops
+from scenes.stops import Stops, stopped_saying
 
 
 @pytest.mark.parametrize(("number", "ends"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
@@ -40,3 +40,10 @@ def test_what_is_ignored_stays_ignored():
         assert stops.asked is None and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(("stop", "told"), [(KeyboardInterrupt, "interrupted"), (SystemExit, "stopped")])
+def test_who_stops_is_told_how_it_goes_on(stop, told, capsys):
+    with pytest.raises(stop) as end, stopped_saying(lambda: "give the command again"):
+        raise stop
+    assert f"{told}; give the command again" in str(end.value) + capsys.readouterr().err
