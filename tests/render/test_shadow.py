@@ -61,6 +61,15 @@ def test_the_tip_of_a_shadow_is_as_dark_as_the_rest_of_it():
     assert at(field(sun(0.4)), tip + 0.15, 0) > 0.9
 
 
+def test_the_slanted_side_of_a_shadow_has_no_stairs():
+    shade, ahead = field(sun(0.4, 0.5)), torch.tensor([math.cos(0.5), math.sin(0.5)])
+    beside = torch.tensor([-ahead[1], ahead[0]])
+    along = [torch.tensor([-2.1, 0.9]) - d * ahead for d in torch.linspace(0.5, 2.5, 41)]
+    rows = [[at(shade, *(p + off * beside).tolist()) for p in along] for off in torch.linspace(-0.1, 0.3, 41)]
+    edge = min(rows, key=lambda row: abs(sum(row) / len(row) - 0.5))
+    assert max(edge) - min(edge) < 0.5  # 1 between cells that are lit or not
+
+
 def on_slope(street, rise: float):
     """The open street, climbing by so many metres a metre along x, under a sun 30 degrees high that stands ahead: its caster and light."""
     pose, g = torch.eye(4, dtype=torch.float64), open_street(street).background.gaussians
