@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -38,6 +39,10 @@ class Trajectory:
 
     def span_us(self) -> tuple[int, int]:
         """First and last covered time, half a step beyond the poses; int64's ends where the body stands still."""
+        return self._span_us
+
+    @cached_property
+    def _span_us(self) -> tuple[int, int]:  # every actor of a scene is asked whether it is there, in each frame
         if len(self) == 1:
             return -(2**63), 2**63 - 1
         t = self.times_us
