@@ -15,6 +15,8 @@ _HOME = {
     "Enhancer": "enhancer",
     "Memory": "enhancer",
     "enhance_video": "clip",
+    "Grade": "grade",
+    "Graded": "grade",
     "Isp": "isp",
     "random_isp": "isp",
     "make_pairs": "pairs",
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from enhance.enhancer import Enhancer as Enhancer
     from enhance.enhancer import Memory as Memory
     from enhance.evaluate import evaluate as evaluate
+    from enhance.grade import Grade as Grade
+    from enhance.grade import Graded as Graded
     from enhance.isp import Isp as Isp
     from enhance.isp import random_isp as random_isp
     from enhance.pairs import make_pairs as make_pairs

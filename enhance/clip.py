@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from enhance.enhancer import Enhancer
+from enhance.grade import Grade, Graded
 from enhance.object_ids import ObjectIds
 from enhance.pictures import Pictures, PictureWriter
 from enhance.step import Steps, frame_of
@@ -82,6 +83,7 @@ def enhance_video(
     progress: Callable[[int, int | None], None] | None = None,
     rendered: bool = False,
     instances: str | Path | None = None,
+    like: str | Path | None = None,
 ) -> tuple[int, int]:
     """Enhance any video that FFmpeg decodes, or the pictures of a folder, of any size, in constant memory; returns how many frames there
     are, and how many of them were changed.
@@ -89,8 +91,8 @@ def enhance_video(
     A video becomes H.264 with the source's times and shape of pixels, without its sound; a side that is odd gains one repeated row or
     column, which H.264's 4:2:0 needs. A folder becomes a folder of PNG by the same names. `progress` is called with frames done and frames
     in all, where the file says. rendered: whether the clip shows renders, which our own network repairs. instances: a folder that tells
-    where objects were put in (`ObjectIds`), whose colours and shadows are set right. Without either our own network leaves a clip as it is,
-    and it warns where no frame was changed.
+    where objects were put in (`ObjectIds`), whose colours and shadows are set right. like: photos of the place, in whose colours the whole
+    clip is graded before (`Grade.read`). Without any of them our own network leaves a clip as it is; it warns where no frame was changed.
     Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     if Path(source).is_file() and Path(source).suffix.lower() in PHOTOS:
@@ -104,7 +106,10 @@ def enhance_video(
         raise ValueError(f"{enhancer.about.get('model', 'this model')} cannot be told where objects are; leave --instances out")
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
-    memory, done, changed, told = None, 0, 0, False
+    if like is not None:
+        enhancer = Graded(enhancer, Grade.read(like))
+    memory: Any = None
+    done, changed, told = 0, 0, False
     with _writer(out, clip) as writer:
         for at, rgb in clip.timed():
             instance = None if ids is None else ids.of(done, clip.width, clip.height)
@@ -116,7 +121,7 @@ def enhance_video(
             if progress is not None:
                 progress(done, clip.count)
     if not changed:
-        why = _why(rendered, instances, told)
+        why = f"its colours are those of {like}" if like is not None else _why(rendered, instances, told)
         warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
     return done, changed
 
@@ -134,4 +139,4 @@ def _why(rendered: bool, instances: str | Path | None, told: bool) -> str:
         return "these weights find the told objects right, or too small to judge"
     if rendered:
         return "these weights' network rests, as it gained too little where it had not been"
-    return "if it shows renders, say --rendered; if something was put in, say where by --instances"
+    return "if it shows renders, say --rendered; if something was put in, where, by --instances; if all is in wrong colours, --like photos"

@@ -164,8 +164,11 @@ class Enhance:
     """Tells where objects were put in, whose colours and shadows are then set right: a .png or .npy for each frame, in which each object
     has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too: set
     these to 0; out.json says which were inserted."""
+    like: Annotated[Path | None, arg(metavar="PHOTOS")] = None
+    """Photos of the same place, as a folder of them, one, or a video: the whole clip is given their exposure, white balance, contrast and
+    saturation. A scene's own are in its photos/CAMERA. What differs no more than they do among themselves stays."""
     rendered: Flag = False
-    """The video shows renders of splats: repair them. Without this and --instances the built-in weights leave it as it is."""
+    """The video shows renders of splats: repair them. Without this, --instances and --like the built-in weights leave it as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to enhance."""
     overwrite: Overwrite = False
@@ -184,5 +187,5 @@ class Enhance:
                 steps.step(done - steps.done)
 
             enhancer = load_saying(self.weights, self.device)
-            count, changed = enhance_video(self.clip, self.output, enhancer, say, self.rendered, self.instances)
+            count, changed = enhance_video(self.clip, self.output, enhancer, say, self.rendered, self.instances, self.like)
         print(f"wrote {self.output}, {count} frame{'s' * (count != 1)}, {changed} of them changed")

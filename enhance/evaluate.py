@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ import torch
 from enhance.clip import telling
 from enhance.drift import KEPT, drift, drift_text, of_video
 from enhance.enhancer import Enhancer
+from enhance.grade import Grade, Graded
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
 from enhance.step import Steps, frame_of
@@ -36,10 +38,13 @@ SMALLEST = 200
 
 TOLD, PUT_IN = "ours + instances", "ours + what was put in"
 METHODS = ("identity", "ours", TOLD)
+WHOLE = ("isp_frame", "clean")
 """TOLD is told all actors; PUT_IN, of kinds that change some, those alone, as `render --enhance` does with what was inserted."""
 ALONE, ALL_TOLD, PUT_IN_TOLD = "references alone", "ours + instances + references", "ours + what was put in + references"
 PHOTOS = (ALONE, ALL_TOLD, PUT_IN_TOLD)
 """Where a rendered scene, or an asset put back, has photos: what those say of the frame, and that enhanced."""
+GRADED = "ours, graded like other photos"
+"""Of whole frames in other colours, and of right ones: given the colours of what the same camera's other clips should be."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,8 @@ def evaluate(
 ) -> list[Row]:
     """Rows for identity, the enhancer on plain RGB with flow, and the enhancer told the instances too, for each kind there is; of those
     that change some instances for the enhancer told these alone; where photos say something, for that, and the enhancer told that and the
-    instances; then for those `beside` it by name, told the instances too.
+    instances; of whole pictures in other colours, and of right ones, for the enhancer of graded frames; then for those `beside` it by name,
+    told the instances too.
 
     For clean frames the reference is the frame itself. Features are those of the shipped autoencoder, whatever the enhancer, so that
     weights are measured alike. `limit` is the most clips of a kind, spread over all. ValueError where nothing is held out.
@@ -95,15 +101,27 @@ def evaluate(
         shards = pairs.of(kind, split)
         shards = shards if limit is None else spread(shards, limit)
         put_in = any("instances" in s.meta for s in shards)
+        graded = (GRADED,) if kind in WHOLE and all(_siblings(s, pairs, split) for s in shards) else ()
         photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if kind in RENDERED or any(s.referenced for s in shards) else ()
         mine = enhancer if kind in RENDERED else of_photos
-        for method in (*METHODS, *((PUT_IN,) if put_in else ()), *photos, *others) if shards else ():
+        for method in (*METHODS, *((PUT_IN,) if put_in else ()), *graded, *photos, *others) if shards else ():
             if progress is not None:
                 progress(f"{kind}, {method}: {len(shards)} clips")
-            rows.append(measured(kind, method, shards, others.get(method, mine), features))
+            grades = [_grade_of(_siblings(s, pairs, split)) for s in shards] if method == GRADED else None
+            rows.append(measured(kind, method, shards, others.get(method, mine), features, grades))
     if not rows:
         raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
     return rows
+
+
+def _siblings(shard: Shard, pairs: PairSet, split: str) -> list[Shard]:
+    """The same camera's other clips of a kind."""
+    return [s for s in pairs.of(shard.meta["kind"], split) if s.meta.get("camera") == shard.meta.get("camera") and s.path != shard.path]
+
+
+def _grade_of(shards: Sequence[Shard]) -> Grade:
+    """Of what clips' middle frames should be."""
+    return Grade([shard.window(shard.frames // 2, 1).target[0].permute(1, 2, 0) for shard in shards])
 
 
 MEASURES = ("region", "frame", "ssim in the region", "ssim", "features", "warp error", "sharpness")
@@ -115,17 +133,21 @@ def shipped_features(device: str | torch.device = "cpu") -> Features:
     return lambda rgb: [x.cpu() for x in encoder.features(rgb.to(device))[:2]]
 
 
-def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features) -> Row:
-    """The row of one method, of METHODS, PHOTOS or an enhancer of another name, told the instances, on clips of a kind."""
+def measured(
+    kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, features: Features, grades: Sequence[Grade] | None = None
+) -> Row:
+    """The row of one method, of METHODS, GRADED, PHOTOS or an enhancer of another name, told the instances, on clips of a kind. grades: of
+    GRADED, a clip's each."""
     clips: dict[str, list[float]] = {m: [] for m in MEASURES}
     times: list[float] = []
-    for shard in shards:
+    for i, shard in enumerate(shards):
         found: dict[str, list[float]] = defaultdict(list)
+        steps = enhancer if grades is None else Graded(enhancer, grades[i])
         window = shard.window()
         previous: torch.Tensor | None = None
-        memory = None
+        memory: Any = None
         for t in range(shard.frames):
-            frame = _frame(window, t, told=method not in METHODS or method == TOLD, referenced=method in PHOTOS)
+            frame = _frame(window, t, told=method not in (*METHODS, GRADED) or method == TOLD, referenced=method in PHOTOS)
             if method in (PUT_IN, PUT_IN_TOLD):
                 frame = telling(frame, shard.meta.get("instances", ()))
             start = time.perf_counter()
@@ -134,7 +156,7 @@ def measured(kind: str, method: str, shards: Sequence[Shard], enhancer: Steps, f
             elif method == ALONE:
                 better = torch.lerp(window.input[t], window.reference[t], window.trust[t]).permute(1, 2, 0)
             else:
-                better, memory = enhancer.step(frame, memory)
+                better, memory = steps.step(frame, memory)
             better = better.cpu()  # which waits for a GPU: only then was the time all spent
             times.append(1000 * (time.perf_counter() - start))
             _measure(found, better, window, t, features)
