@@ -107,7 +107,7 @@ def enhance_video(
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
     if like is not None:
-        enhancer = Graded(enhancer, Grade.read(like))
+        enhancer = Graded(enhancer, Grade.read(like, clip.width))
     memory: Any = None
     done, changed, told = 0, 0, False
     with _writer(out, clip) as writer:

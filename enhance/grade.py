@@ -2,14 +2,15 @@
 
 Exposure, white balance, tone and saturation of a whole picture are set by the linear map that moves its colours least to have the mean and
 covariance of the photos' (Monge and Kantorovich; Pitié and Kokaram 2007, eq. 4). Of the photos those count that show most nearly the same:
-ranks of brightness over a coarse grid tell, which no exposure and no curve of tone changes. A map that changes no more than the photos
-differ among themselves is none.
+ranks of brightness over a coarse grid tell, which no exposure and no curve of tone changes. Then goes what the clip has of noise and
+sharpening beyond those photos (`enhance/grain.py`). What changes no more than the photos differ among themselves is left alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,12 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.grain import Excess, Grain, without
 from enhance.objects import LUMA
 from enhance.past import LONG, alike
-from enhance.samples import PHOTO_SUFFIXES, Photos
+from enhance.samples import frames_of, shrunk
 from enhance.step import Steps, checked
 from render.frame_types import Frame
-from render.video import read_image
-from scenes.spread import spread
 
 GRID = (12, 20)
 """Blocks, down and across, whose ranks of brightness are compared."""
@@ -32,13 +32,19 @@ NEAREST = 3
 """Photos whose colours a frame is given: the mean of those that show most nearly the same."""
 
 MOST = 200
-"""Photos that are kept, spread over all."""
+"""Photos of a folder that are looked at, spread over all."""
 
 STEADY = 50
 """Frames over which a clip's map is averaged, at most: a camera's settings change slowly."""
 
 FLAT = 1e-4
 """Variance that every picture is taken to have in all directions, so that a grey one has a map."""
+
+STRIDE = 8
+"""Every how many frames of a video are looked at."""
+
+OFTEN = 0.9
+"""Part of the photos whose excess of grain over others is usual."""
 
 STRETCH = 4.0
 """Times that a map makes differences of colours larger or smaller, at most: beyond, it is noise that grows."""
@@ -98,55 +104,60 @@ SAME = Map(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64
 
 
 class Grade:
-    """Colours of photos of one place.
+    """Colours and grain of photos of one place.
 
-    usual  mean square by which a photo is changed that is given the colours of the others
+    usual       mean square by which a photo is changed that is given the colours of others
+    usual_grain  excess that nine of ten photos have over others
     """
 
-    def __init__(self, photos: Sequence[torch.Tensor]):
-        """Of pictures `[H, W, 3]` in 0..1. ValueError where there are none."""
-        if not len(photos):
+    def __init__(self, photos: Iterable[torch.Tensor]):
+        """Of pictures `[H, W, 3]` in 0..1, best as wide as the frames. ValueError where there are none."""
+        colours, ranks, self.grains = [], [], []
+        for photo in photos:
+            small = _small(photo)
+            colours.append(Colours.of(small.flatten(0, 1)))
+            ranks.append(_ranks(small))
+            self.grains.append(Grain.of(photo))
+        if not colours:
             raise ValueError("there are no photos whose colours could be taken")
-        small = [_small(photo) for photo in photos]
-        self.colours = [Colours.of(s.flatten(0, 1)) for s in small]
-        self.ranks = torch.stack([_ranks(s) for s in small])
-        each = [Map.between(c, self._nearest(r, but=i)).changes(c) for i, (c, r) in enumerate(zip(self.colours, self.ranks, strict=True))]
-        self.usual = float(np.median(each)) if len(photos) > 1 else 0.0
+        self.colours, self.ranks = colours, torch.stack(ranks)
+        self.usual, self.usual_grain = 0.0, Excess(torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        if len(colours) > 1:
+            others = [self.nearest(r, but=i) for i, r in enumerate(self.ranks)]
+            self.usual = float(np.median([Map.between(c, o).changes(c) for c, (o, _) in zip(colours, others, strict=True)]))
+            each = [Excess.of(g, o) for g, (_, o) in zip(self.grains, others, strict=True)]
+            self.usual_grain = Excess(*(torch.stack(x).quantile(OFTEN, 0) for x in zip(*((e.gain, e.noise) for e in each), strict=True)))
 
     @classmethod
-    def read(cls, source: str | Path) -> Grade:
-        """Of a picture, the pictures of a folder, or some frames of a video. FileNotFoundError where there is nothing, ValueError where
-        it holds no photos."""
+    def read(cls, source: str | Path, width: int) -> Grade:
+        """Of a picture, the pictures of a folder, or some frames of a video, `width` pixels wide at most. FileNotFoundError where there is
+        nothing, ValueError where it holds no photos."""
         if not Path(source).exists():
             raise FileNotFoundError(f"no such photos: {source}")
-        if Path(source).suffix.lower() in PHOTO_SUFFIXES:
-            return cls([read_image(source)])
-        return cls([torch.from_numpy(photo).float() / 255 for photo in spread(Photos((source,), width=2 * LONG).frames, MOST)])
+        photos = (shrunk(photo, width) for photo in frames_of(Path(source), STRIDE, MOST))
+        first = next(photos, None)
+        if first is None:
+            raise ValueError(f"{source} holds no photos")
+        return cls(chain([first], photos))
 
-    def map_for(self, rgb: torch.Tensor, counts: torch.Tensor | None = None) -> tuple[Map, Colours]:
-        """What a frame `[H, W, 3]` is to be graded by, and its colours; of those that count, bool `[H, W]`, all where None."""
-        small = _small(rgb)
-        pixels = small.flatten(0, 1)
-        if counts is not None:
-            known = _small(counts[..., None].to(rgb)).flatten() > 0.99
-            pixels = pixels[known] if known.any() else pixels
-        given = Colours.of(pixels)
-        return Map.between(given, self._nearest(_ranks(small))), given
-
-    def _nearest(self, ranks: torch.Tensor, but: int | None = None) -> Colours:
+    def nearest(self, ranks: torch.Tensor, but: int | None = None) -> tuple[Colours, Grain]:
+        """What a picture with such ranks should have."""
         likeness = self.ranks @ ranks
-        if but is not None and len(self.colours) > 1:
+        if but is not None:
             likeness[but] = -torch.inf
-        count = min(NEAREST, max(1, len(self.colours) - (but is not None)))
-        return Colours.mean_of([self.colours[i] for i in likeness.topk(count).indices.tolist()])
+        count = min(NEAREST, len(self.colours) - (but is not None))
+        best = likeness.topk(count).indices.tolist()
+        return Colours.mean_of([self.colours[i] for i in best]), Grain.mean_of([self.grains[i] for i in best])
 
 
 @dataclass(frozen=True)
 class Settled:
-    """What is remembered between frames: the mean of the maps so far, of how many frames, the last frame in small, and what the enhancer
-    remembers."""
+    """What is remembered between frames: the means so far, of how many frames, of the map, and of the grain of frames and of photos like
+    them; the last frame in small; and what the enhancer remembers."""
 
     map: Map
+    grain: Grain
+    wanted: Grain
     count: int
     last: torch.Tensor
     inner: Any
@@ -162,20 +173,37 @@ class Graded:
 
     @torch.no_grad()
     def step(self, frame: Frame | torch.Tensor, memory: Settled | None = None) -> tuple[torch.Tensor, Settled]:
-        """One frame enhanced; after a cut the map is found anew. Raises what the enhancer's step raises."""
+        """One frame enhanced; after a cut all is found anew. Raises what the enhancer's step raises."""
         given = checked(frame)
         rgb = given.rgb.to(self.device, torch.float32).clamp(0, 1)
-        last = _small(rgb).permute(2, 0, 1)[None]
-        now, colours = self.grade.map_for(rgb, None if given.instance is None else given.instance.to(self.device) <= 0)
-        inner, count = None if memory is None else memory.inner, 0
-        if memory is not None and memory.last.shape == last.shape and alike(last, memory.last)[0]:
+        counts = None if given.instance is None else given.instance.to(self.device) <= 0
+        counts = None if counts is None or not counts.any() else counts
+        small = _small(rgb)
+        wanted, grain_wanted = self.grade.nearest(_ranks(small))
+        colours = Colours.of(small.flatten(0, 1) if counts is None else _counted(small, counts))
+        now = Map.between(colours, wanted)
+        last, inner, count = small.permute(2, 0, 1)[None], None if memory is None else memory.inner, 0
+        follows = memory is not None and memory.last.shape == last.shape and bool(alike(last, memory.last)[0])
+        if memory is not None and follows:
             count = min(memory.count, STEADY - 1)
             now = memory.map.toward(now, 1 / (count + 1))
         change = now.changes(colours)
         surely = max(0.0, 1 - self.grade.usual / change) if change > 0 else 0.0
-        graded = SAME.toward(now, surely)(rgb) if surely else rgb
-        better, inner = self.enhancer.step(replace(frame, rgb=graded) if isinstance(frame, Frame) else graded, inner)
-        return better, Settled(now, count + 1, last, inner)
+        better = SAME.toward(now, surely)(rgb) if surely else rgb
+        grain = Grain.of(better, counts)
+        if memory is not None and follows:
+            grain, grain_wanted = memory.grain.toward(grain, 1 / (count + 1)), memory.wanted.toward(grain_wanted, 1 / (count + 1))
+        excess = Excess.of(grain, grain_wanted).beyond(self.grade.usual_grain)
+        better = without(better, excess) if excess.any() else better
+        better, inner = self.enhancer.step(replace(frame, rgb=better) if isinstance(frame, Frame) else better, inner)
+        return better, Settled(now, grain, grain_wanted, count + 1, last, inner)
+
+
+def _counted(small: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
+    """Of a picture in small the pixels `[N, 3]` that count throughout; all where none does."""
+    known = _small(counts[..., None].to(small)).flatten() > 0.99
+    pixels = small.flatten(0, 1)
+    return pixels[known] if known.any() else pixels
 
 
 def _small(image: torch.Tensor) -> torch.Tensor:

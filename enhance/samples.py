@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from enhance.isp import random_isp
 from enhance.object_samples import Objects, ObjectSampler
 from enhance.shade_samples import Grounds, ShadeSampler
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
+from render.video import read_image, read_video
+from scenes.spread import spread
 
 KIND_WEIGHTS = {"underfit": 0.4, "sparse": 0.3, "cycle": 0.2, "crossref": 0.1}
 """How often the network sees rendered kinds; most of what crossref lacks nobody can know."""
@@ -54,7 +57,7 @@ class Photos:
         self.frames: list[np.ndarray] = []
         for path in map(Path, paths):
             before = len(self.frames)
-            self.frames += [_shrink(frame, width) for frame in _frames(path, stride)]
+            self.frames += [(shrunk(frame, width) * 255).round().to(torch.uint8).numpy() for frame in frames_of(path, stride)]
             if len(self.frames) == before:
                 raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PHOTO_SUFFIXES)} or a video")
 
@@ -176,22 +179,20 @@ def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:
     return Sample(**turned)
 
 
-def _frames(path: Path, stride: int):
-    from render.video import read_image, read_video
-
+def frames_of(path: Path, stride: int, most: int | None = None) -> Iterator[torch.Tensor]:
+    """Of a picture that, of a folder its pictures, `most` of them spread over all, of a video every `stride`-th frame: `[H, W, 3]`."""
     if path.is_dir():
-        for file in sorted(path.iterdir()):
-            if file.suffix.lower() in PHOTO_SUFFIXES:
-                yield read_image(file)
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in PHOTO_SUFFIXES)
+        yield from map(read_image, files if most is None else spread(files, most))
+    elif path.suffix.lower() in PHOTO_SUFFIXES:
+        yield read_image(path)
     else:
-        for i, frame in enumerate(read_video(path)):
-            if i % stride == 0:
-                yield frame
+        yield from islice(read_video(path), 0, None, stride)
 
 
-def _shrink(frame: torch.Tensor, width: int) -> np.ndarray:
-    """Bytes `[h, width, 3]`; a photo is never enlarged."""
+def shrunk(frame: torch.Tensor, width: int) -> torch.Tensor:
+    """A picture `[H, W, 3]` that is at most so wide; a photo is never enlarged."""
     h, w = frame.shape[:2]
-    if w > width:
-        frame = F.interpolate(frame.permute(2, 0, 1)[None], (round(h * width / w), width), mode="area")[0].permute(1, 2, 0)
-    return (frame * 255).round().to(torch.uint8).numpy()
+    if w <= width:
+        return frame
+    return F.interpolate(frame.permute(2, 0, 1)[None], (round(h * width / w), width), mode="area")[0].permute(1, 2, 0)
