@@ -139,4 +139,4 @@ def _why(rendered: bool, instances: str | Path | None, told: bool) -> str:
         return "these weights find the told objects right, or too small to judge"
     if rendered:
         return "these weights' network rests, as it gained too little where it had not been"
-    return "if it shows renders, say --rendered; if something was put in, where, by --instances; if all is in wrong colours, --like photos"
+    return "if it shows renders, say --rendered; if something was put in, say where by --instances; if all is in other colours, say --like"

@@ -1,12 +1,15 @@
-"""What is done to told objects, frame by frame: their colours and missing shadows, as `ObjectNet` finds them, held steady over a clip."""
+"""What is done to told objects, frame by frame: their colours and missing shadows, as `ObjectNet` finds them, and what they have of noise
+and sharpening beyond what is around them; held steady over a clip."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 
-from enhance.objects import COEFFICIENTS, Box, Evidence, ObjectNet, along, boxes, changed, evidence, spots, whole_of
+from enhance.grain import Excess, Grain, of_object, usual_of, without
+from enhance.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, spots, whole_of
 from enhance.seam import ENDS, fitted
 from enhance.shade import NONE, optical_depths, read_ground, shaded
 
@@ -20,9 +23,39 @@ FILLS = 0.8
 DEEP = 0.3
 """Optical depth that a missing shadow has somewhere; an object that lacks less has its shadow."""
 
-Corrections = Mapping[int, tuple[torch.Tensor, int]]
-"""By object the mean over the last frames of its coefficients and the optical depths of its missing shadow, and in how many frames it
-was seen."""
+
+@dataclass(frozen=True)
+class Correction:
+    """Of one object, the mean over the last frames: coefficients `[15]` of its colours, optical depths of its missing shadow, its grain and
+    what that should be (None where too little tells); and in how many frames it was seen."""
+
+    colours: torch.Tensor
+    depths: torch.Tensor
+    grain: tuple[Grain, Grain] | None
+    count: int
+
+    def followed(self, new: Correction | None) -> Correction:
+        """After one more frame, in which it was looked at anew, or not."""
+        if new is None:
+            return replace(self, count=self.count + 1)
+        share = 1 / min(self.count + 1, STEADY)
+        colours, depths = torch.lerp(self.colours, new.colours, share), torch.lerp(self.depths, new.depths, share)
+        grain = self.grain or new.grain
+        if self.grain is not None and new.grain is not None:
+            grain = self.grain[0].toward(new.grain[0], share), self.grain[1].toward(new.grain[1], share)
+        return Correction(colours, depths, grain, self.count + 1)
+
+    def excess(self) -> Excess | None:
+        """What it has of noise and sharpening that is no texture; None where nothing."""
+        if self.grain is None:
+            return None
+        given, wanted = self.grain
+        excess = Excess.of(given, wanted).beyond(usual_of(given.power))
+        return excess if excess.any() else None
+
+
+Corrections = Mapping[int, Correction]
+"""By object."""
 
 
 @torch.no_grad()
@@ -34,6 +67,7 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
         return rgb, {}
     after = _looked_at(net, rgb, instance, found, before)
     out = rgb.clone()
+    _calm(out, instance, found, after)
     _shade(out, instance, found, after)
     _recolour(out, instance, found, after)
     return out, after
@@ -45,15 +79,13 @@ def _fills(instance: torch.Tensor, i: int, box: Box) -> bool:
     return part.numel() > FILLS * instance.numel() and int((part == i).sum()) > FILLS * instance.numel()
 
 
-def _looked_at(
-    net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], before: Corrections
-) -> dict[int, tuple[torch.Tensor, int]]:
+def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], before: Corrections) -> Corrections:
     """Objects' corrections after this frame: those that are due are looked at anew."""
-    counts = {i: before[i][1] if i in before else 0 for i in found}
+    counts = {i: before[i].count if i in before else 0 for i in found}
     due = [i for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0]  # not all in the same frame
-    new: dict[int, torch.Tensor] = {}
+    new: dict[int, Correction] = {}
     if due:
-        whole, read, around, seams = whole_of(rgb), [], [], []
+        whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
         for i in due:
             box = found[i]
             part, ids = rgb[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns]
@@ -64,24 +96,28 @@ def _looked_at(
             seams.append((part, ids, i, at.edges, box))
             places, (y, x) = box.ground(ids <= 0)
             around.append(read_ground(rgb[:, y, x].T, places))
+            grains.append(of_object(part.permute(1, 2, 0), mask, ids <= 0))
         guesses, shades = net(Evidence.stacked(read)), net.shade(torch.stack(around))
-        for i, seam, guess, shade in zip(due, seams, guesses, shades, strict=True):
+        for i, seam, guess, shade, grain in zip(due, seams, guesses, shades, grains, strict=True):
             colours, left = fitted(*seam, guess, net.usual)
-            new[i] = torch.cat([colours, shade if left > ENDS else torch.zeros_like(shade)])
-    after = {}
-    for i, count in counts.items():
-        mean = before[i][0] if i in before else new[i]
-        if i in new:
-            mean = mean + (new[i] - mean) / min(count + 1, STEADY)
-        after[i] = mean, count + 1
-    return after
+            new[i] = Correction(colours, shade if left > ENDS else torch.zeros_like(shade), grain, 1)
+    return {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
+
+
+def _calm(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
+    """Take from all objects, in the picture `out` `[3, H, W]`, what they have of noise and sharpening beyond what is around them."""
+    for i, box in found.items():
+        excess = after[i].excess()
+        if excess is not None:
+            part, mask = out[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns] == i
+            part.copy_(torch.where(mask, without(part.permute(1, 2, 0), excess).permute(2, 0, 1), part))
 
 
 def _shade(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
     """Darken, in the picture `out` `[3, H, W]`, the ground around the objects that lack a shadow."""
     total = torch.zeros_like(out[0])
     for i, box in found.items():
-        depths = after[i][0][COEFFICIENTS:]
+        depths = after[i].depths
         if depths.max() < DEEP:
             continue
         lines = along(box.outer_rows, box.rows, out.device), along(box.outer_columns, box.columns, out.device)
@@ -95,6 +131,6 @@ def _recolour(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], 
     for i, box in found.items():
         part, mask = out[:, box.rows, box.columns], instance[box.rows, box.columns] == i
         given, height = part.permute(1, 2, 0), along(box.rows, box.rows, out.device)
-        change = changed(given, height[:, None].expand(mask.shape), after[i][0][None, :COEFFICIENTS])
+        change = changed(given, height[:, None].expand(mask.shape), after[i].colours[None])
         if (change.square().mean(-1) * mask).sum() > SLIGHT**2 * mask.sum():
             part.copy_(torch.where(mask, (given + change).clamp(0, 1).permute(2, 0, 1), part))

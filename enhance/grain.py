@@ -20,6 +20,18 @@ NORMAL = 0.6745**2
 AROUND = 5
 """Pixels, across, of a window in which Lee's filter tells detail from noise."""
 
+FEWEST = 300
+"""Pixels that tell the grain of an object, or of what is around it."""
+
+KEPT_FINE, KEPT_COARSE = 0.8, 0.22
+"""Part of what sharpening by a Gaussian of one pixel adds again, of the finest detail and of the next."""
+
+FLAT, ROUGH = 0.125, 2.0
+"""An object's floor, to its power and to the floor around it, up to which it is its texture."""
+
+USUAL_GAIN, USUAL_NOISE = 1.2, 0.2
+"""Excess that right objects seem to have beside what is around them, nine of ten up to there: of noise, to their power."""
+
 
 @dataclass(frozen=True)
 class Grain:
@@ -31,9 +43,13 @@ class Grain:
     @classmethod
     def of(cls, rgb: torch.Tensor, counts: torch.Tensor | None = None) -> Grain:
         """Of `[H, W, 3]`; of the pixels that count, bool `[H, W]`, all where None."""
-        size = _detail(rgb).abs()
-        size = size.flatten(1) if counts is None else size[:, counts]
-        return cls(size.square().mean(1).double().cpu(), size.median(1).values.square().double().cpu())
+        detail = _detail(rgb)
+        return cls.of_detail(detail.flatten(1) if counts is None else detail[:, counts])
+
+    @classmethod
+    def of_detail(cls, detail: torch.Tensor) -> Grain:
+        """Of `[3, N]`."""
+        return cls(detail.square().mean(1).double().cpu(), detail.abs().median(1).values.square().double().cpu())
 
     @classmethod
     def mean_of(cls, several: Sequence[Grain]) -> Grain:
@@ -65,6 +81,28 @@ class Excess:
 
     def any(self) -> bool:
         return bool((self.gain > 1).any() or (self.noise > 0).any())
+
+
+def of_object(rgb: torch.Tensor, mask: torch.Tensor, around: torch.Tensor) -> tuple[Grain, Grain] | None:
+    """The grain of an object, bool `[h, w]`, in a picture `[h, w, 3]`, and what it should be by what is `around` it; None where too little
+    tells. How much finest detail there is to the next coarser is the camera's; how much of that, the object's."""
+    inner = F.max_pool2d((~mask)[None, None].float(), AROUND, 1, AROUND // 2)[0, 0] == 0
+    if int(inner.sum()) < FEWEST or int(around.sum()) < FEWEST:
+        return None
+    fine = _detail(rgb)
+    image = (rgb.permute(2, 0, 1) - fine)[None]
+    coarse = (image - gaussian_blur2d(image, (9, 9), (2.0, 2.0), border_type="replicate"))[0]
+    given, beside = Grain.of_detail(fine[:, inner]), Grain.of_detail(fine[:, around])
+    mine, theirs = (coarse[:, where].square().mean(1).double().cpu().clamp_min(1e-9) for where in (inner, around))
+    power = mine * beside.power / theirs
+    root = (given.power / power.clamp_min(1e-9)).sqrt().clamp(1, 3)
+    power = power / (1 + KEPT_COARSE * (root - 1) / (KEPT_FINE - KEPT_COARSE * root)).square()
+    return given, Grain(power, torch.maximum(FLAT * NORMAL * power, ROUGH * beside.floor))
+
+
+def usual_of(power: torch.Tensor) -> Excess:
+    """What right objects of such power seem to have in excess."""
+    return Excess(torch.full_like(power, USUAL_GAIN), USUAL_NOISE * power)
 
 
 def without(rgb: torch.Tensor, excess: Excess) -> torch.Tensor:

@@ -258,14 +258,14 @@ def test_after_a_cut_objects_begin_anew():
     shipped, memory = Enhancer.load(), None
     for _ in range(12):
         better, memory = shipped.step(told(1, (0.5, 1.4, 0.5)), memory)
-    assert memory.objects[1][1] == 12
+    assert memory.objects[1].count == 12
     after, memory = shipped.step(told(2), memory)
     alone, fresh = shipped.step(told(2))
-    assert torch.equal(after, alone) and memory.objects[1][1] == fresh.objects[1][1] == 1
+    assert torch.equal(after, alone) and memory.objects[1].count == fresh.objects[1].count == 1
 
 
 def test_what_moves_on_is_no_cut():
     shipped, memory = Enhancer.load(), None
     for i in range(4):
         _, memory = shipped.step(told(1, shift=2 * i), memory)
-    assert memory.objects[1][1] == 4
+    assert memory.objects[1].count == 4

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from enhance.corrections import STEADY, correct
+from enhance.corrections import STEADY, Correction, correct
 from enhance.object_samples import PIXELS, ObjectSampler
 from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
 from enhance.shade import KNOTS
@@ -93,18 +93,20 @@ def test_an_object_s_corrections_are_averaged_over_frames():
     _, once = correct(net, first, instance, {})
     _, alone = correct(net, second, instance, {})
     _, both = correct(net, second, instance, once)
-    assert torch.allclose(both[5][0], (once[5][0] + alone[5][0]) / 2, atol=1e-6) and both[5][1] == 2
+    for found in ("colours", "depths"):
+        mean = (getattr(once[5], found) + getattr(alone[5], found)) / 2
+        assert torch.allclose(getattr(both[5], found), mean, atol=1e-6) and both[5].count == 2
     _, gone = correct(net, second, torch.zeros_like(instance), both)
     assert gone == {}
 
 
 def test_an_object_long_known_is_looked_at_rarely():
     net, (rgb, instance) = stirred(), scene()
-    known = {5: (torch.zeros(COEFFICIENTS + KNOTS), STEADY)}
+    known = {5: Correction(torch.zeros(COEFFICIENTS), torch.zeros(KNOTS), None, STEADY)}
     looks = []
     for _ in range(2 * STEADY):
         _, after = correct(net, rgb, instance, known)
-        looks.append(not torch.equal(after[5][0], known[5][0]))
+        looks.append(not torch.equal(after[5].colours, known[5].colours))
         known = after
     assert sum(looks) == 2
 
