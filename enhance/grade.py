@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from enhance.grain import Excess, Grain, without
 from enhance.objects import LUMA
 from enhance.past import LONG, alike
-from enhance.samples import frames_of, shrunk
+from enhance.samples import PHOTO_SUFFIXES, frames_of, shrunk
 from enhance.step import Steps, checked
 from render.frame_types import Frame
 
@@ -137,7 +137,8 @@ class Grade:
         photos = (shrunk(photo, width) for photo in frames_of(Path(source), STRIDE, MOST))
         first = next(photos, None)
         if first is None:
-            raise ValueError(f"{source} holds no photos")
+            below = next((f.parent for f in sorted(Path(source).rglob("*")) if f.suffix.lower() in PHOTO_SUFFIXES), None)
+            raise ValueError(f"{source} holds no photos ({', '.join(PHOTO_SUFFIXES)})" + (f"; {below} does" if below else ""))
         return cls(chain([first], photos))
 
     def nearest(self, ranks: torch.Tensor, but: int | None = None) -> tuple[Colours, Grain]:

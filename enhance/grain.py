@@ -20,14 +20,20 @@ NORMAL = 0.6745**2
 AROUND = 5
 """Pixels, across, of a window in which Lee's filter tells detail from noise."""
 
-FEWEST = 300
+ROUNDING = (0.3 / 255) ** 2
+"""Variance of noise that pictures of bytes have anyway."""
+
+FEWEST = 1000
 """Pixels that tell the grain of an object, or of what is around it."""
 
 KEPT_FINE, KEPT_COARSE = 0.8, 0.22
 """Part of what sharpening by a Gaussian of one pixel adds again, of the finest detail and of the next."""
 
-FLAT, ROUGH = 0.125, 2.0
-"""An object's floor, to its power and to the floor around it, up to which it is its texture."""
+FLAT, ROUGH, ALL = 0.125, 2.0, 0.5
+"""An object's floor, to its power and to the floor around it, up to which it is its texture; and to its power at most."""
+
+MOST = 9.0
+"""Times that sharpening multiplies the power of finest detail at most."""
 
 USUAL_GAIN, USUAL_NOISE = 1.2, 0.2
 """Excess that right objects seem to have beside what is around them, nine of ten up to there: of noise, to their power."""
@@ -70,8 +76,9 @@ class Excess:
     def of(cls, given: Grain, wanted: Grain) -> Excess:
         """power = gain wanted.power + noise, floor = gain wanted.floor + NORMAL noise, solved for both."""
         apart = (wanted.power - wanted.floor / NORMAL).clamp_min(1e-9)
-        gain = ((given.power - given.floor / NORMAL) / apart).clamp_min(1)
-        return cls(gain, ((given.floor - gain * wanted.floor) / NORMAL).clamp_min(0))
+        gain = ((given.power - given.floor / NORMAL) / apart).clamp(1, MOST)
+        noise = (given.floor - gain * wanted.floor) / NORMAL
+        return cls(gain, torch.where(noise > ROUNDING, noise, 0.0))
 
     def beyond(self, usual: Excess) -> Excess:
         """The less of it, the less it is more than usual: none up to there."""
@@ -97,7 +104,8 @@ def of_object(rgb: torch.Tensor, mask: torch.Tensor, around: torch.Tensor) -> tu
     power = mine * beside.power / theirs
     root = (given.power / power.clamp_min(1e-9)).sqrt().clamp(1, 3)
     power = power / (1 + KEPT_COARSE * (root - 1) / (KEPT_FINE - KEPT_COARSE * root)).square()
-    return given, Grain(power, torch.maximum(FLAT * NORMAL * power, ROUGH * beside.floor))
+    floor = torch.maximum(FLAT * NORMAL * power, ROUGH * beside.floor)
+    return given, Grain(power, torch.minimum(floor, ALL * NORMAL * power))
 
 
 def usual_of(power: torch.Tensor) -> Excess:

@@ -146,6 +146,8 @@ def test_photos_that_are_not_there_are_refused_before_anything_is_written(tmp_pa
     for like, why in (("nowhere", "no such photos"), ("empty", "holds no photos")):
         with pytest.raises((ValueError, FileNotFoundError), match=why):
             enhance_video(tmp_path / "clip", tmp_path / "out", like=tmp_path / like)
+    with pytest.raises(ValueError, match="clip does"):
+        enhance_video(tmp_path / "clip", tmp_path / "out", like=tmp_path)
     assert not (tmp_path / "out").exists()
     with pytest.raises(ValueError, match="no photos"):
         Grade([])
