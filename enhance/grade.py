@@ -106,7 +106,7 @@ SAME = Map(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64
 class Grade:
     """Colours and grain of photos of one place.
 
-    usual       mean square by which a photo is changed that is given the colours of others
+    usual        mean square by which a photo is changed that is given the colours of others
     usual_grain  excess that nine of ten photos have over others
     """
 
@@ -153,12 +153,12 @@ class Grade:
 
 @dataclass(frozen=True)
 class Settled:
-    """What is remembered between frames: the means so far, of how many frames, of the map, and of the grain of frames and of photos like
-    them; the last frame in small; and what the enhancer remembers."""
+    """What is remembered between frames: the means so far of the map, of frames' own grain and of that of photos like them, and of how many
+    frames; the last frame in small; and what the enhancer remembers."""
 
     map: Map
+    own: Grain
     grain: Grain
-    wanted: Grain
     count: int
     last: torch.Tensor
     inner: Any
@@ -180,24 +180,26 @@ class Graded:
         counts = None if given.instance is None else given.instance.to(self.device) <= 0
         counts = None if counts is None or not counts.any() else counts
         small = _small(rgb)
-        wanted, grain_wanted = self.grade.nearest(_ranks(small))
-        colours = Colours.of(small.flatten(0, 1) if counts is None else _counted(small, counts))
-        now = Map.between(colours, wanted)
-        last, inner, count = small.permute(2, 0, 1)[None], None if memory is None else memory.inner, 0
-        follows = memory is not None and memory.last.shape == last.shape and bool(alike(last, memory.last)[0])
-        if memory is not None and follows:
-            count = min(memory.count, STEADY - 1)
-            now = memory.map.toward(now, 1 / (count + 1))
-        change = now.changes(colours)
+        last = small.permute(2, 0, 1)[None]
+        before = memory if memory is not None and memory.last.shape == last.shape and alike(last, memory.last)[0] else None
+        share = 1.0 if before is None else 1 / min(before.count + 1, STEADY)
+
+        colours, grain = self.grade.nearest(_ranks(small))
+        mine = Colours.of(small.flatten(0, 1) if counts is None else _counted(small, counts))
+        by = Map.between(mine, colours) if before is None else before.map.toward(Map.between(mine, colours), share)
+        change = by.changes(mine)
         surely = max(0.0, 1 - self.grade.usual / change) if change > 0 else 0.0
-        better = SAME.toward(now, surely)(rgb) if surely else rgb
-        grain = Grain.of(better, counts)
-        if memory is not None and follows:
-            grain, grain_wanted = memory.grain.toward(grain, 1 / (count + 1)), memory.wanted.toward(grain_wanted, 1 / (count + 1))
-        excess = Excess.of(grain, grain_wanted).beyond(self.grade.usual_grain)
+        better = SAME.toward(by, surely)(rgb) if surely else rgb
+
+        own = Grain.of(better, counts)
+        own, grain = (own, grain) if before is None else (before.own.toward(own, share), before.grain.toward(grain, share))
+        excess = Excess.of(own, grain).beyond(self.grade.usual_grain)
         better = without(better, excess) if excess.any() else better
-        better, inner = self.enhancer.step(replace(frame, rgb=better) if isinstance(frame, Frame) else better, inner)
-        return better, Settled(now, grain, grain_wanted, count + 1, last, inner)
+
+        better, inner = self.enhancer.step(
+            replace(frame, rgb=better) if isinstance(frame, Frame) else better, None if memory is None else memory.inner
+        )
+        return better, Settled(by, own, grain, 1 if before is None else min(before.count + 1, STEADY), last, inner)
 
 
 def _counted(small: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:

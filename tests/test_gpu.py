@@ -85,7 +85,7 @@ def test_pairs_training_and_evaluation(desk, monkeypatch):
 @ON_A_GPU
 def test_a_video_enhanced(desk, monkeypatch):
     call(desk, monkeypatch, "render", "scene", *SHOT, "-o", "clip.mp4", "-w")
-    call(desk, monkeypatch, "enhance", "clip.mp4", "-o", "clean.mp4", "--rendered", "--device", "cuda")
+    call(desk, monkeypatch, "enhance", "clip.mp4", "-o", "clean.mp4", "--rendered", "--like", "clip.mp4", "--device", "cuda")
     assert pictures(desk / "clean.mp4").shape == pictures(desk / "clip.mp4").shape
 
 

@@ -1,13 +1,19 @@
 """Clips in other colours than their place has, graded as photos of it."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from enhance.clip import enhance_video
+from enhance.enhancer import Enhancer
+from enhance.evaluate import GRADED, evaluate
 from enhance.grade import STEADY, Colours, Grade, Graded, Map
 from enhance.isp import Isp
+from enhance.photo_pairs import make_photo_pairs
+from enhance.shards import PairSet
 from enhance.step import frame_of
 from render.compare import psnr
 from render.video import VideoWriter, read_image, write_image
@@ -137,6 +143,20 @@ def test_a_clip_is_given_the_colours_of_photos(tmp_path, source):
     for i in range(3):
         wanted = place(1, 6 + i)
         assert psnr(read_image(tmp_path / "out" / f"{i}.png"), wanted) > psnr(altered(wanted), wanted) + 6
+
+
+def test_whole_frames_are_measured_graded_like_the_cameras_other_clips(tmp_path, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    for i in range(4):
+        write_image(tmp_path / "photos" / f"{i}.png", place(1, 2 * i))
+    pairs, made_of = PairSet(make_photo_pairs([tmp_path / "photos"], tmp_path / "pairs", width=160)), []
+    monkeypatch.setattr(sys.modules["enhance.evaluate"], "Grade", lambda photos: made_of.append(photos) or Grade(photos))
+    rows = {(r.kind, r.method): r for r in evaluate(pairs, Enhancer.load())}
+    for others, shard in zip(made_of[-4:], pairs.of("isp_frame"), strict=True):
+        own = shard.window(0, 1).target[0].permute(1, 2, 0)
+        assert len(others) == 3 and not any(torch.equal(other, own) for other in others)
+    graded, identity = (rows["isp_frame", method] for method in (GRADED, "identity"))
+    assert np.mean(graded.gain(identity)) > 5 and ("clean", GRADED) in rows and ("isp", GRADED) not in rows
 
 
 def test_photos_that_are_not_there_are_refused_before_anything_is_written(tmp_path):
