@@ -1,14 +1,14 @@
 """A clip in other colours than its place has: graded as photos that were taken there.
 
 Exposure, white balance, tone and saturation of a whole picture are set by the linear map that moves its colours least to have the mean and
-covariance of the photos' (Monge and Kantorovich; Pitié and Kokaram 2007, eq. 4). Of the photos those count that show most nearly the same:
+covariance of the photos' (Monge and Kantorovich; Pitié and Kokaram 2007). Of the photos those count that show most nearly the same:
 ranks of brightness over a coarse grid tell, which no exposure and no curve of tone changes. Then goes what the clip has of noise and
 sharpening beyond those photos (`enhance/grain.py`). What changes no more than the photos differ among themselves is left alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.colour_map import SAME, Colours, Map
 from enhance.grain import Excess, Grain, without
 from enhance.objects import LUMA
 from enhance.past import LONG, alike
@@ -37,70 +38,11 @@ MOST = 200
 STEADY = 50
 """Frames over which a clip's map is averaged, at most: a camera's settings change slowly."""
 
-FLAT = 1e-4
-"""Variance that every picture is taken to have in all directions, so that a grey one has a map."""
-
 STRIDE = 8
 """Every how many frames of a video are looked at."""
 
 OFTEN = 0.9
 """Part of the photos whose excess of grain over others is usual."""
-
-STRETCH = 4.0
-"""Times that a map makes differences of colours larger or smaller, at most: beyond, it is noise that grows."""
-
-
-@dataclass(frozen=True)
-class Colours:
-    """Mean `[3]` and covariance `[3, 3]` of a picture's colours, float64."""
-
-    mean: torch.Tensor
-    spread: torch.Tensor
-
-    @classmethod
-    def of(cls, rgb: torch.Tensor) -> Colours:
-        """Of pixels `[N, 3]`."""
-        rgb = rgb.double().cpu()
-        mean = rgb.mean(0)
-        return cls(mean, (rgb - mean).T @ (rgb - mean) / max(len(rgb), 1))
-
-    @classmethod
-    def mean_of(cls, several: Sequence[Colours]) -> Colours:
-        return cls(torch.stack([c.mean for c in several]).mean(0), torch.stack([c.spread for c in several]).mean(0))
-
-
-@dataclass(frozen=True)
-class Map:
-    """rgb -> matrix rgb + offset; float64 `[3, 3]`, `[3]`."""
-
-    matrix: torch.Tensor
-    offset: torch.Tensor
-
-    @classmethod
-    def between(cls, given: Colours, wanted: Colours) -> Map:
-        """From colours to colours by the shortest way."""
-        grey = FLAT * torch.eye(3, dtype=torch.float64)
-        root = _power(given.spread + grey, 0.5)
-        back = _power(given.spread + grey, -0.5)
-        matrix = back @ _power(root @ (wanted.spread + grey) @ root, 0.5) @ back
-        values, axes = torch.linalg.eigh(matrix)
-        matrix = axes @ torch.diag(values.clamp(1 / STRETCH, STRETCH)) @ axes.T
-        return cls(matrix, wanted.mean - matrix @ given.mean)
-
-    def changes(self, colours: Colours) -> float:
-        """Mean square of what it changes in a picture of such colours."""
-        by = self.matrix - torch.eye(3, dtype=torch.float64)
-        return float((by @ colours.spread @ by.T).trace() + (by @ colours.mean + self.offset).square().sum()) / 3
-
-    def toward(self, other: Map, share: float) -> Map:
-        return Map(torch.lerp(self.matrix, other.matrix, share), torch.lerp(self.offset, other.offset, share))
-
-    def __call__(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Of `[..., 3]`, cut to 0..1."""
-        return (rgb @ self.matrix.T.to(rgb) + self.offset.to(rgb)).clamp(0, 1)
-
-
-SAME = Map(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
 class Grade:
@@ -222,9 +164,3 @@ def _ranks(small: torch.Tensor) -> torch.Tensor:
     luma = F.adaptive_avg_pool2d((small @ small.new_tensor(LUMA))[None, None], GRID).flatten().cpu()
     ranks = luma.argsort(stable=True).argsort().double()
     return F.normalize(ranks - ranks.mean(), dim=0)
-
-
-def _power(matrix: torch.Tensor, exponent: float) -> torch.Tensor:
-    """Of a symmetric positive one."""
-    values, axes = torch.linalg.eigh(matrix)
-    return axes @ torch.diag(values.clamp_min(1e-12) ** exponent) @ axes.T

@@ -8,9 +8,10 @@ import torch
 from PIL import Image
 
 from enhance.clip import enhance_video
+from enhance.colour_map import Colours, Map
 from enhance.enhancer import Enhancer
 from enhance.evaluate import GRADED, evaluate
-from enhance.grade import STEADY, Colours, Grade, Graded, Map
+from enhance.grade import STEADY, Grade, Graded
 from enhance.isp import Isp
 from enhance.photo_pairs import make_photo_pairs
 from enhance.shards import PairSet
