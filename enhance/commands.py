@@ -161,12 +161,13 @@ class Enhance:
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     instances: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Tells where objects were put in, whose colours and shadows are then set right: a .png or .npy for each frame, in which each object
-    has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too: set
-    these to 0; out.json says which were inserted."""
+    """Tells where objects were put in, whose colours, shadows and noise are then set right: a .png or .npy for each frame, in which each
+    object has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too:
+    set these to 0; out.json says which were inserted."""
     like: Annotated[Path | None, arg(metavar="PHOTOS")] = None
     """Photos of the same place, as a folder of them, one, or a video: the whole clip is given their exposure, white balance, contrast and
-    saturation. A scene's own are in its photos/CAMERA. What differs no more than they do among themselves stays."""
+    saturation, and loses noise and sharpening that they have not. A scene's own are in its photos/CAMERA. What differs no more than they do
+    among themselves stays."""
     rendered: Flag = False
     """The video shows renders of splats: repair them. Without this, --instances and --like the built-in weights leave it as it is."""
     device: Literal["cpu", "cuda"] = "cpu"
