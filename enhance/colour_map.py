@@ -3,10 +3,11 @@ Kantorovich between two Gaussians (Pitié and Kokaram 2007), A^-1/2 (A^1/2 B A^1
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+
+from enhance.averaged import Averaged
 
 FLAT = 1e-4
 """Variance that every picture is taken to have in all directions, so that a grey one has a map."""
@@ -16,7 +17,7 @@ STRETCH = 4.0
 
 
 @dataclass(frozen=True)
-class Colours:
+class Colours(Averaged):
     """Mean `[3]` and covariance `[3, 3]` of a picture's colours, float64."""
 
     mean: torch.Tensor
@@ -29,13 +30,9 @@ class Colours:
         mean = rgb.mean(0)
         return cls(mean, (rgb - mean).T @ (rgb - mean) / max(len(rgb), 1))
 
-    @classmethod
-    def mean_of(cls, several: Sequence[Colours]) -> Colours:
-        return cls(torch.stack([c.mean for c in several]).mean(0), torch.stack([c.spread for c in several]).mean(0))
-
 
 @dataclass(frozen=True)
-class Map:
+class Map(Averaged):
     """rgb -> matrix rgb + offset; float64 `[3, 3]`, `[3]`."""
 
     matrix: torch.Tensor
@@ -56,9 +53,6 @@ class Map:
         """Mean square of what it changes in a picture of such colours."""
         by = self.matrix - torch.eye(3, dtype=torch.float64)
         return float((by @ colours.spread @ by.T).trace() + (by @ colours.mean + self.offset).square().sum()) / 3
-
-    def toward(self, other: Map, share: float) -> Map:
-        return Map(torch.lerp(self.matrix, other.matrix, share), torch.lerp(self.offset, other.offset, share))
 
     def __call__(self, rgb: torch.Tensor) -> torch.Tensor:
         """Of `[..., 3]`, cut to 0..1."""

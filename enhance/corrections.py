@@ -60,8 +60,9 @@ Corrections = Mapping[int, Correction]
 
 @torch.no_grad()
 def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: Corrections) -> tuple[torch.Tensor, Corrections]:
-    """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there and the shadows that they
-    lacked, and their corrections, to be passed with the next frame. Pixels that are neither an object's nor shaded stay as they are."""
+    """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there, without noise and sharpening
+    that nothing around them has, and with the shadows that they lacked; and their corrections, to be passed with the next frame. Pixels
+    that are neither an object's nor shaded stay as they are."""
     found = {i: box for i, box in boxes(instance).items() if not _fills(instance, i, box)}
     if not found:
         return rgb, {}

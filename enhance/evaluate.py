@@ -38,13 +38,12 @@ SMALLEST = 200
 
 TOLD, PUT_IN = "ours + instances", "ours + what was put in"
 METHODS = ("identity", "ours", TOLD)
-WHOLE = ("isp_frame", "clean")
 """TOLD is told all actors; PUT_IN, of kinds that change some, those alone, as `render --enhance` does with what was inserted."""
 ALONE, ALL_TOLD, PUT_IN_TOLD = "references alone", "ours + instances + references", "ours + what was put in + references"
 PHOTOS = (ALONE, ALL_TOLD, PUT_IN_TOLD)
 """Where a rendered scene, or an asset put back, has photos: what those say of the frame, and that enhanced."""
-GRADED = "ours, graded like other photos"
-"""Of whole frames in other colours, and of right ones: given the colours of what the same camera's other clips should be."""
+GRADED, WHOLE_FRAMES = "ours, graded like other photos", ("isp_frame", "clean")
+"""Of these kinds, whole frames in other colours and right ones: given the colours of what the same camera's other clips should be."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def evaluate(
         shards = pairs.of(kind, split)
         shards = shards if limit is None else spread(shards, limit)
         put_in = any("instances" in s.meta for s in shards)
-        graded = (GRADED,) if kind in WHOLE and all(_siblings(s, pairs, split) for s in shards) else ()
+        graded = (GRADED,) if kind in WHOLE_FRAMES and all(_siblings(s, pairs, split) for s in shards) else ()
         photos = (ALONE, PUT_IN_TOLD if put_in else ALL_TOLD) if kind in RENDERED or any(s.referenced for s in shards) else ()
         mine = enhancer if kind in RENDERED else of_photos
         for method in (*METHODS, *((PUT_IN,) if put_in else ()), *graded, *photos, *others) if shards else ():

@@ -7,12 +7,13 @@ follow from two linear equations. Noise then goes by Lee's filter (1980), sharpe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from kornia.filters import gaussian_blur2d
 from torch.nn import functional as F
+
+from enhance.averaged import Averaged
 
 NORMAL = 0.6745**2
 """Square of the median of a normal distribution's absolute values, to its variance."""
@@ -40,7 +41,7 @@ USUAL_GAIN, USUAL_NOISE = 1.2, 0.2
 
 
 @dataclass(frozen=True)
-class Grain:
+class Grain(Averaged):
     """Of a picture's finest detail, by channel, float64 `[3]`: the mean of its squares, and the square of the median of its size."""
 
     power: torch.Tensor
@@ -56,13 +57,6 @@ class Grain:
     def of_detail(cls, detail: torch.Tensor) -> Grain:
         """Of `[3, N]`."""
         return cls(detail.square().mean(1).double().cpu(), detail.abs().median(1).values.square().double().cpu())
-
-    @classmethod
-    def mean_of(cls, several: Sequence[Grain]) -> Grain:
-        return cls(torch.stack([g.power for g in several]).mean(0), torch.stack([g.floor for g in several]).mean(0))
-
-    def toward(self, other: Grain, share: float) -> Grain:
-        return Grain(torch.lerp(self.power, other.power, share), torch.lerp(self.floor, other.floor, share))
 
 
 @dataclass(frozen=True)
