@@ -169,6 +169,6 @@ def _retimed(track: Track, scanned: np.ndarray, usual: float) -> tuple[Track, np
     # one odd median must not make a car jump: neighbours in time are scanned at nearly the same phase of the sweep
     smooth = np.array([np.median(offset[np.abs(track.times_us - time) <= ALIKE_US]) for time in track.times_us])
     times = np.round(track.times_us + smooth).astype(np.int64)
-    rising = np.concatenate([[True], np.diff(times) > 1000])
+    rising = np.concatenate([[True], times[1:] > np.maximum.accumulate(times)[:-1] + 1000])
     poses = track.world_from_box[torch.from_numpy(rising)]
     return replace(track, times_us=times[rising], world_from_box=poses, sensor=track.sensor[rising]), times

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from recon.fit.fit import Fit
-from recon.report import DRIVING
+from recon.report import DRIVING, EQUAL_DB
 from render.compare import psnr
 from scenes.spread import spread
 
@@ -36,7 +36,8 @@ class Live:
             return
         place = fit.step_count // EVERY % len(self.views)
         view = self.views[place]
-        self._seen[place] = psnr(fit.picture(view), view.image.float() / 255, None if view.ego is None else ~view.ego)
+        alike = psnr(fit.picture(view), view.image.float() / 255, None if view.ego is None else ~view.ego)
+        self._seen[place] = min(alike, EQUAL_DB)
         if len(self._seen) == len(self.views) and place == 0:
             self.curve.append([fit.step_count, round(seconds, 1), round(self._mean(), 2)])
 

@@ -20,6 +20,9 @@ from scenes.scene import Scene
 DRIVING = 0.5
 """Metres a second above which the car counts as driving: while it stands, nearly the same picture has been trained on."""
 
+EQUAL_DB = 100.0
+"""PSNR that is reported of equal pictures: JSON, which a scene keeps it in, has no infinity."""
+
 
 def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> list[dict]:
     """A row a camera, all held-out frames and those while driving: PSNR and SSIM of the scene and of the mean training image.
@@ -42,7 +45,7 @@ def held_out_table(scene: Scene, frames: Frames, rig: dict[str, RigCamera]) -> l
                 rgb = render_frame(read_out(scene, camera, rig[name]), camera).rgb
             assert rgb is not None
             rgb, street = rgb.cpu(), None if view.ego is None else ~view.ego
-            figures = [metric(shown, recorded, street) for shown in (rgb, mean) for metric in (psnr, ssim)]
+            figures = [min(metric(shown, recorded, street), EQUAL_DB) for shown in (rgb, mean) for metric in (psnr, ssim)]
             scored.append((view, *figures))
         rows += [_row(name, "all", scored), _row(name, "driving", [s for s in scored if _driving(scene, s[0])])]
     return [r for r in rows if r is not None]

@@ -39,6 +39,9 @@ LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0,
 READOUT_US, MIDDLE_US = 30_000, -10_000
 """How long an image is read out, and its middle row against its stamp. PandaSet does not say; SplatAD (Hess et al. 2025) takes these."""
 
+ASTRAY_S = 1.0
+"""Seconds between a sweep's stamp and its points' times that no lidar explains: clocks of two kinds, or a file of another place."""
+
 PICKLES = (".pkl.gz", ".pkl")
 FRONT = ("front_camera", "front_left_camera", "front_right_camera")
 
@@ -59,7 +62,7 @@ def read_pandaset(path: Path) -> Log:
     cameras = dict(sorted(cameras.items(), key=lambda item: (item[0] != "front_camera", item[0])))
     ego = lengthened(lidar_times, home @ body)
     sweeps = tuple(
-        Sweep(i, int(t), partial(_points, file, origin.numpy()))
+        Sweep(i, int(t), partial(_points, file, int(t), origin.numpy()))
         for i, t in enumerate(lidar_times)
         if (file := _pickle(path / "lidar", i)) is not None
     )
@@ -126,7 +129,7 @@ def _pickle(folder: Path, index: int) -> Path | None:
     return next((folder / f"{index:02d}{end}" for end in PICKLES if (folder / f"{index:02d}{end}").is_file()), None)
 
 
-def _points(file: Path, origin: np.ndarray) -> LidarPoints:
+def _points(file: Path, stamp: int, origin: np.ndarray) -> LidarPoints:
     table = read_frame(file)
     missing = [k for k in "xyzt" if k not in table]
     if missing:
@@ -134,7 +137,10 @@ def _points(file: Path, origin: np.ndarray) -> LidarPoints:
     xyz = np.stack([table[k].astype(np.float64) for k in "xyz"], 1) - origin
     keep = np.isfinite(xyz).all(1) & np.isfinite(table["t"].astype(np.float64))
     sensor = table["d"].astype(np.int64) if "d" in table else np.zeros(len(xyz), np.int64)
-    return LidarPoints(xyz[keep], np.round(table["t"][keep].astype(np.float64) * 1e6).astype(np.int64), sensor[keep])
+    times = np.round(table["t"][keep].astype(np.float64) * 1e6).astype(np.int64)
+    if len(times) and abs(off := float(np.median(times - stamp)) / 1e6) > ASTRAY_S:
+        raise ValueError(f"{file}: its points were taken {abs(off):.3g} s {'after' if off > 0 else 'before'} its stamp in timestamps.json")
+    return LidarPoints(xyz[keep], times, sensor[keep])
 
 
 def _geodetic(path: Path) -> dict:

@@ -127,6 +127,14 @@ def test_a_date_is_smoothed_by_those_of_neighbours_in_time(split):
     assert (_retimed(often, often.times_us + late, 0.0)[1] - often.times_us)[2] == -30_000
 
 
+def test_boxes_scanned_out_of_turn_are_left_out(split):
+    """However late one was, those that follow it come later than it, too."""
+    mover = next(t for t in split[0].tracks if t.moving)
+    track = replace(mover, times_us=500_000 * np.arange(8))  # apart enough not to be smoothed
+    kept, _ = _retimed(track, track.times_us + np.array([0, 0, 1_200_000, 0, 0, 0, 0, 0]) - 10_000, 0.0)
+    assert (np.diff(kept.times_us) > 0).all() and len(kept.times_us) == len(kept.world_from_box) == 6
+
+
 def test_what_moves_is_where_it_is_at_a_moment():
     poses = torch.stack([translation(10.0 * i, 0.0, 0.0) @ yaw(0.5 * np.pi * i) for i in range(2)])
     track = Track("veh_1", "car", True, np.array([4.0, 2.0, 1.6]), np.array([0, 700_000]), poses, np.zeros(2), ())

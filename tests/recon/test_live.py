@@ -3,11 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from recon import open_log, reconstruct
 from recon.build import begin, choose
 from recon.fit.config import FitConfig
 from recon.live import EVERY, Live
+from recon.report import EQUAL_DB
 
 CONFIG = FitConfig(steps=4 * EVERY, budget=9000, stages=((0.0, 2), (0.5, 1)), grow_every=10)
 SIZE = (96, 54)
@@ -63,6 +65,14 @@ def test_an_interrupted_curve_goes_on(drive):
     seen = [fit.picture(view) for view in live.views]
     shown = np.mean([float(-10 * (s - v.image / 255).square().mean().log10()) for s, v in zip(seen, live.views, strict=True)])
     assert live.curve[-1][2] == pytest.approx(shown, abs=0.02)
+
+
+def test_pictures_that_are_all_alike_have_figures_that_a_scene_can_keep(own_drive, tmp_path):
+    for file in own_drive.glob("camera/*/*.jpg"):
+        Image.new("RGB", SIZE).save(file)  # the lens cap was on: nothing is easier
+    scene = reconstruct(open_log(own_drive), tmp_path / "s", size=SIZE, held_out=4, config=replace(CONFIG, steps=EVERY))
+    assert [row["mean_psnr"] for row in scene.meta["held_out"]] == [EQUAL_DB] * len(scene.meta["held_out"])
+    assert all(0 < row["psnr"] <= EQUAL_DB for row in scene.meta["held_out"])
 
 
 def test_what_is_the_recording_car_does_not_count(drive):

@@ -124,6 +124,14 @@ def test_a_sweep_without_its_columns_is_named_when_read(own_drive):
         log.sweeps[0].read()
 
 
+def test_a_sweep_of_another_clock_is_named_when_read(own_drive):
+    file = own_drive / "lidar" / "00.pkl.gz"
+    table = pd.read_pickle(file)
+    table.assign(t=table.t - 37.0).to_pickle(file)  # GPS time has no leap seconds, or too many
+    with pytest.raises(ValueError, match=r"00.pkl.gz: its points were taken 37 s before its stamp in timestamps.json"):
+        open_log(own_drive).sweeps[0].read()
+
+
 def test_points_without_a_place_or_a_time_are_left_out(own_drive):
     file = own_drive / "lidar" / "00.pkl.gz"
     all_there = open_log(own_drive).sweeps[0].read()
