@@ -25,6 +25,9 @@ from scenes.trajectory import Trajectory
 
 STEP_US = 500_000
 
+APART = 300.0
+"""Metres between a picture and the next from which on a model is none of a place: nothing ties its pictures to each other."""
+
 
 def find_model(folder: Path) -> Path | None:
     """The model's folder in a COLMAP workspace: `folder` itself, its sparse/0, or another one up to two levels down; the fullest."""
@@ -54,6 +57,11 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     mine = [k for k, i in enumerate(model.images) if i.camera == lead]
     order = sorted(mine, key=lambda k: moments[k])
     ego = Trajectory(torch.tensor([moments[k] for k in order]), placed[order] @ CAM_FROM_FLU)
+    steps = ego.world_from_body[:, :3, 3].diff(dim=0).norm(dim=1)
+    if len(steps) and (step := float(steps.median())) > APART:
+        fix = "check the scale that was given" if metres_per_unit else "take pictures closer together, of more that stands still"
+        fix += f", and delete {path} to begin again" if path.suffix == ".sfm" else ""
+        raise ValueError(f"{where} has its pictures {step:.3g} m from one to the next, which is astray; {fix}")
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
     for key in sorted(names, key=lambda k: (k != lead, names[k])):
@@ -81,7 +89,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         "metric": gauge.metric,
         "world_from_model": {"rotation": gauge.rotation.tolist(), "origin": gauge.origin.tolist(), "scale": gauge.scale},
     }
-    return Log(meta["name"], path, cameras, (), (), ego, meta, tuple(cameras), SparsePoints(gauge.points(model.xyz), seen))
+    points = SparsePoints(gauge.points(model.xyz), seen) if len(model.xyz) else None  # poses alone: then pictures are asked for points
+    return Log(meta["name"], path, cameras, (), (), ego, meta, tuple(cameras), points)
 
 
 def lens_of(camera: ModelCamera, where: Path) -> Lens:

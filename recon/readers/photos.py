@@ -38,7 +38,13 @@ NARROWEST, WIDEST, SAME = math.radians(5), math.radians(150), 0.01
 
 
 def is_photos(path: Path) -> bool:
-    return path.is_dir() and sum(p.suffix.lower() in PHOTOS for p in path.iterdir()) >= FEWEST
+    return path.is_dir() and len(_photos(path)) >= FEWEST
+
+
+def _photos(path: Path) -> list[Path]:
+    """A folder's photos in the order they were taken in; what a Mac leaves on a foreign disk (._01.jpg) is none."""
+    found = [p for p in path.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith(".")]
+    return sorted(found, key=lambda p: recorded(p.name))
 
 
 def is_video(path: Path) -> bool:
@@ -125,7 +131,7 @@ def _upright(path: Path, names: list[str], folder: Path) -> Path:
 
 def _of_one_size(path: Path) -> list[str]:
     """The photos that share the most common size when upright; the others, from another camera or turned, are left out and said."""
-    sizes = {p.name: _size(p) for p in sorted(path.iterdir(), key=lambda p: recorded(p.name)) if p.suffix.lower() in PHOTOS}
+    sizes = {p.name: _size(p) for p in _photos(path)}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     most = max(counts, key=lambda size: counts[size])
     others = [name for name, size in sizes.items() if size != most]

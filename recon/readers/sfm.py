@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.log import image_size
+from recon.readers.one_lens import is_one_a_picture, share_lenses
 from render.progress import Progress
 
 PARTS = ("cameras", "images", "points3D")
@@ -60,6 +61,8 @@ class Model:
 def pycolmap():
     """The module; ModuleNotFoundError's fix as ValueError where it is not installed."""
     try:
+        import zlib  # noqa: F401  # first: pycolmap 4.2 brings one of its own, and the interpreter's, loaded after it, crashes
+
         import pycolmap as module
     except ModuleNotFoundError:
         raise ValueError(FIX) from None
@@ -80,11 +83,14 @@ def read_model(folder: Path) -> Model:
             lost = next(p for p in PARTS if p not in have)
             raise FileNotFoundError(f"{folder / f'{lost}{end}'} is missing; a COLMAP model has {', '.join(p + end for p in PARTS)}")
     try:
-        found = pycolmap().Reconstruction(str(folder))
+        colmap = pycolmap()
+        found = colmap.Reconstruction(str(folder))
     except (RuntimeError, ValueError, IndexError, MemoryError) as problem:
         if FIX in str(problem):
             raise
         raise ValueError(f"{folder} is not a whole COLMAP model ({_first_line(problem)}); export it again") from None
+    if is_one_a_picture(found):
+        found = share_lenses(colmap, found, folder)
     place = {key: i for i, key in enumerate(sorted(found.points3D))}
     xyz = np.array([found.points3D[key].xyz for key in place], dtype=np.float64).reshape(-1, 3)
     cameras = {key: ModelCamera(c.model_name, c.width, c.height, tuple(map(float, c.params))) for key, c in found.cameras.items()}

@@ -257,6 +257,65 @@ def test_a_lens_that_is_not_read_is_named_with_the_fix(own):
         open_log(own)
 
 
+def lens_each(folder, focals):
+    """A text model of one lens, given a lens for each picture with these focal lengths in its place."""
+    model = folder / "sparse/0"
+    _, kind, width, height, _, _, cx, cy = (model / "cameras.txt").read_text().splitlines()[0].split()
+    (model / "cameras.txt").write_text("".join(f"{k} {kind} {width} {height} {f} {f} {cx} {cy}\n" for k, f in enumerate(focals, 1)))
+    lines = (model / "images.txt").read_text().splitlines()
+    for k in range(len(focals)):
+        words = lines[2 * k].split()
+        lines[2 * k] = " ".join([*words[:8], str(k + 1), words[9]])
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_photos_that_have_a_lens_each_share_one(own, workspace):
+    """As COLMAP's feature_extractor makes them by itself: one camera took them, and what it found of each picture is a little off."""
+    as_one = open_log(workspace, metres_per_unit=1 / UNIT).camera("camera")
+    lens_each(own, as_one.lens.fx * (1 + 0.01 * np.random.default_rng(0).standard_normal(12)))
+    log = open_log(own, metres_per_unit=1 / UNIT)
+    assert list(log.cameras) == ["camera"] and len(log.camera("camera").files) == 12
+    camera = log.camera("camera")
+    assert camera.lens.fx == pytest.approx(as_one.lens.fx, rel=2e-3)
+    torch.testing.assert_close(relative(camera.world_from_cam)[:, :3, :3], relative(as_one.world_from_cam)[:, :3, :3], atol=2e-3, rtol=0)
+    before, after = (sum(map(len, one.points.seen["camera"])) for one in (open_log(workspace), log))
+    assert 0.95 * before < after <= before  # points that one picture shows are held by nothing
+
+
+def test_lenses_that_are_alike_are_one_without_points_too(own):
+    lens_each(own, [57.6] * 12)
+    (own / "sparse/0/points3D.txt").write_text("")
+    lines = (own / "sparse/0/images.txt").read_text().splitlines()
+    (own / "sparse/0/images.txt").write_text("".join(f"{line}\n\n" for line in lines[::2]))
+    assert list(open_log(own, metres_per_unit=1.0).cameras) == ["camera"]
+    lens_each(own, [57.6] * 11 + [58.0])
+    with pytest.raises(ValueError, match=r"no points by which they could share one.*single_camera_per_folder 1"):
+        open_log(own, metres_per_unit=1.0)
+
+
+def test_poses_without_points_are_a_drive(own, workspace):
+    """As those have who know their poses and write them for COLMAP: pictures are asked for points then."""
+    (own / "sparse/0/points3D.txt").write_text("")
+    lines = (own / "sparse/0/images.txt").read_text().splitlines()
+    (own / "sparse/0/images.txt").write_text("".join(f"{line}\n\n" for line in lines[::2]))
+    log = open_log(own, metres_per_unit=1 / UNIT)
+    assert log.points is None and log.meta["metric"] is True and not log.sweeps
+    known = open_log(workspace, metres_per_unit=1 / UNIT).camera("camera").world_from_cam
+    torch.testing.assert_close(log.camera("camera").world_from_cam, known)
+
+
+def test_photos_through_several_lenses_are_refused(own):
+    lens_each(own, [57.6, 115.2] * 6)
+    images = own / "sparse/0/images.txt"
+    lines = images.read_text().splitlines()
+    for k in range(3, len(lines), 4):  # what every second one shows is twice as large
+        seen = np.array(lines[k].split(), dtype=float).reshape(-1, 3)
+        lines[k] = " ".join(f"{2 * u - 48} {2 * v - 27} {int(p)}" for u, v, p in seen)
+    images.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError, match=r"a lens for each picture, its points are .* pixels off.*zoomed"):
+        open_log(own)
+
+
 def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
     import sys
 

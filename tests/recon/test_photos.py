@@ -88,6 +88,21 @@ def test_photos_of_another_size_are_left_out_and_said(walk, solved, tmp_path, ca
     assert len(solved[0][0]) == 6 and "left out turned.png: not 96x54" in capsys.readouterr().err
 
 
+def test_what_a_mac_leaves_among_photos_is_none(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    (tmp_path / "walk/._000.png").write_bytes(b"\x00\x05\x16\x07")
+    open_log(tmp_path / "walk")
+    assert solved[0][0] == [f"{i:03d}.png" for i in range(6)]
+
+
+def test_photos_that_nothing_ties_together_are_refused(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    with pytest.raises(ValueError, match=r"m from one to the next, which is astray; check the scale"):
+        open_log(tmp_path / "walk", metres_per_unit=1e5)
+    with pytest.raises(ValueError, match=r"astray; take pictures closer together.*delete .*walk.sfm to begin again"):
+        open_log(tmp_path / "walk", camera_height=2000.0)  # as where the ground seems to lie right beneath
+
+
 def _lie_down(folder: Path) -> None:
     """Store all photos but the first as a phone held upright does: turned to the left, with EXIF that says so."""
     for file in sorted(folder.iterdir())[1:]:
