@@ -22,6 +22,7 @@ from recon.album import at_once
 from recon.align import as_aligned
 from recon.build import assemble, begin, choose
 from recon.fit.config import FitConfig
+from recon.frames import size_like
 from recon.log import Log, LogCamera, Track
 from render import render_frame
 from render.progress import Progress
@@ -168,24 +169,25 @@ def by_turns(log: Log) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tuple[int, int]) -> Log:
-    """A recording of the scene from so many metres to the left, its pictures rendered into `folder`."""
+    """A recording of the scene from so many metres to the left, its pictures rendered into `folder`, the first camera's of a `size`."""
     ego = scene.ego.shifted(lateral=metres)
-    cameras = {}
+    first, cameras = next(iter(log.cameras.values())), {}
     with Progress("cycle views", total=sum(map(len, log.cameras.values()))) as steps:
         for name, camera in log.cameras.items():
+            width, height = size_like(camera, first, size)
             views = [scene.camera(name, int(t), ego) for t in camera.times_us]
             files = tuple(folder / f"{name}_{i:04d}.png" for i in range(len(views)))
             for file, view in zip(files, views, strict=True):
                 if not file.exists():
                     folder.mkdir(parents=True, exist_ok=True)
                     with torch.no_grad():
-                        frame = render_frame(scene, view.resized(*size))
+                        frame = render_frame(scene, view.resized(width, height))
                     assert frame.rgb is not None
                     write_image(file, frame.rgb.cpu())
                 steps.step()
-            lens = camera.lens.scaled(size[0] / camera.width, size[1] / camera.height)
+            lens = camera.lens.scaled(width / camera.width, height / camera.height)
             poses = torch.stack([v.world_from_cam for v in views])
-            own = replace(camera, lens=lens, width=size[0], height=size[1], files=files, world_from_cam=poses)
+            own = replace(camera, lens=lens, width=width, height=height, files=files, world_from_cam=poses)
             # renders take all rows at once, and show nothing of the car
             cameras[name] = replace(own, shutter="global", readout_us=0, ego_mask=np.zeros((1, 1), bool))
     return replace(log, ego=ego, cameras=cameras)

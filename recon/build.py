@@ -15,14 +15,14 @@ from recon.adjust import adjusted
 from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
-from recon.fit.config import FitConfig, check_size
+from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
 from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
 from recon.fit.run import run
 from recon.fit.strides import stride_of
-from recon.frames import Frames, load_frames
+from recon.frames import Frames, check_size, load_frames
 from recon.live import Live
 from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
@@ -83,11 +83,11 @@ def reconstruct(
 ) -> Scene:
     """Fit a scene to a log's images and write it to the folder `output`.
 
-    cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the pictures that
-    are fitted, `fit_size` where None; config: `fit_config` where None. Every `held_out`th frame takes no part and is reported in
-    `meta["held_out"]` and on stderr; neither does every `held_out`th lidar sweep, against which the scene is measured on the path and
-    beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a minute old; `resume` goes on from it, with the
-    same result as if it had never stopped.
+    cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the first camera's
+    pictures that are fitted (`size_like` has the others'), `fit_size` where None; config: `fit_config` where None. Every `held_out`th
+    frame takes no part and is reported in `meta["held_out"]` and on stderr; neither does every `held_out`th lidar sweep, against which
+    the scene is measured on the path and beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a minute old;
+    `resume` goes on from it, with the same result as if it had never stopped.
     half: splats in half precision, where the file's size matters. overwrite: a scene that is there gives way once the new one is whole.
     device: where the fit runs and what is reported is rendered; one that was interrupted may go on elsewhere.
 
@@ -100,6 +100,8 @@ def reconstruct(
     names, span = choose(log, cameras, start_us, duration_us)
     size, config = size or fit_size(log, names), config or fit_config(log, names, span)
     check_size(size)
+    if size[0] > (first := log.camera(names[0])).width or size[1] > first.height:
+        raise ValueError(f"--size {size[0]}x{size[1]} is more than {first.name} recorded, {first.width}x{first.height}; give that at most")
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)
@@ -193,7 +195,7 @@ def choose(
     log: Log, cameras: Sequence[str] | None = None, start_us: int = 0, duration_us: int | None = None
 ) -> tuple[list[str], tuple[int, int]]:
     """The cameras to fit, the front ones where None, and the span of time in microseconds. ValueError for what the log has not."""
-    names = list(cameras or log.front or list(log.cameras)[:1])
+    names = list(dict.fromkeys(cameras or log.front or list(log.cameras)[:1]))
     return names, _span(log, names, start_us, duration_us)
 
 

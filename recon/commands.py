@@ -33,7 +33,7 @@ class Recon:
     duration: TimeOrAll = None
     """How much of the drive to use."""
     size: FitSize = None
-    """Size of the pictures that are fitted."""
+    """Size of the first camera's pictures that are fitted; others of other proportions get as many pixels."""
     camera_height: LengthOrNone = None
     """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
     metres_per_unit: Ratio = None
@@ -52,7 +52,7 @@ class Recon:
         from recon import open_log, reconstruct
         from recon.build import check_free
         from recon.checkpoint import checkpoint_path
-        from recon.fit.config import check_size
+        from recon.frames import check_size
 
         shelf = self.output.parent
         if not shelf.exists() and shelf.parent.is_dir():

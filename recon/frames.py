@@ -17,22 +17,37 @@ from recon.log import Log, LogCamera
 from recon.skies import SkyKind, sky_mask
 from recon.sky_kind import coarse_sky, under_their_sky
 from recon.view import View
-from scenes.camera import followed
+from scenes.camera import Camera, followed
+
+SMALLEST = 16
+"""Pixels that a picture's sides have at least, shrunk or not: the window of its similarity wants some."""
+
+ALIKE = 0.02
+"""Part by which the proportions of two cameras' pictures may differ that are fitted at one size."""
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """ValueError where pictures of a width and height cannot be fitted to."""
+    if min(size) < SMALLEST:
+        raise ValueError(f"pictures of {size[0]}x{size[1]} are too small to fit to; the smallest size is {SMALLEST}x{SMALLEST}")
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The views of a fit; all cameras at one size. Every `held_out`th frame of each camera takes no part in it.
+    """The views of a fit, those of camera `names[c]` of width and height `sizes[c]`. Every `held_out`th of each takes no part.
 
     From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
     shows at its edges, no other one does. `under` is one of `SkyKind`.
     """
 
     names: list[str]
-    width: int
-    height: int
+    sizes: list[tuple[int, int]]
     views: list[View]
     under: SkyKind = "blue"
+
+    def camera(self, log: Log, view: View) -> Camera:
+        """A view's camera, at the size of its picture and where the log says that it stood."""
+        return log.camera(self.names[view.camera]).camera(view.index, *self.sizes[view.camera])
 
     def training(self) -> list[View]:
         return [v for v in self.views if not v.held_out]
@@ -75,22 +90,24 @@ def load_frames(
     report: Callable[[], None] = lambda: None,
     gains: bool = True,
 ) -> Frames:
-    """Read the images of cameras `names` whose times lie in `span_us`, resized to `size` (width, height) by area.
+    """Read the images of cameras `names` whose times lie in `span_us`, resized by area: the first one's to `size` (width, height), the
+    others' to `size_like` that.
 
     `report` is called after each. Photos of a log without lidar are brought to one exposure (`balanced`); where lidar tells that a
     camera's exposure follows the light, its views say their `gain`, if `gains` are asked for. Raises ValueError where a camera has no
     frame left to train on, or a file does not decode.
     """
     first = held_out // 2 if log.points is not None else 0
+    sizes = [size_like(log.camera(name), log.camera(names[0]), size) for name in names]
     views = []
     for c, name in enumerate(names):
         camera = log.camera(name)
         chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
         images = {}
         for i in chosen:
-            images[i] = torch.from_numpy(camera.image(i, *size).copy())
+            images[i] = torch.from_numpy(camera.image(i, *sizes[c]).copy())
             report()
-        ego = _ego(camera, images, size)
+        ego = _ego(camera, images, sizes[c])
         for i, image in images.items():
             views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, coarse_sky(image, ego), ego))
         if not any(v.camera == c and not v.held_out for v in views):
@@ -101,7 +118,18 @@ def load_frames(
         views = balanced(log, names, views)
     elif gains:
         views = exposed(log, names, views)
-    return Frames(names, *size, views, under)
+    return Frames(names, sizes, views, under)
+
+
+def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tuple[int, int]:
+    """Width and height for a camera's pictures where the first one's have `size`: the same, but for a camera of other proportions, which
+    has as many pixels in its own, and no more than it recorded. (One of Argoverse 2's looks ahead upright, the others are wide.)"""
+    wider = camera.width * first.height / (camera.height * first.width)
+    if abs(wider - 1) < ALIKE:
+        return size
+    width, height = size[0] * wider**0.5, size[1] / wider**0.5
+    shrink = min(1.0, camera.width / width, camera.height / height)
+    return max(SMALLEST, round(width * shrink)), max(SMALLEST, round(height * shrink))
 
 
 def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -159,10 +159,10 @@ class Log:
             raise ValueError(unknown("camera", name, str(self.path), list(self.cameras)))
         return self.cameras[name]
 
-    def rig(self, width: int, height: int, names: list[str] | None = None) -> dict[str, RigCamera]:
-        """The cameras as fixed to the body, at one working size: each extrinsic is the mean over its frames."""
+    def rig(self, sizes: Mapping[str, tuple[int, int]]) -> dict[str, RigCamera]:
+        """The cameras named as fixed to the body, at working sizes (width, height): each extrinsic is the mean over its frames."""
         rig = {}
-        for name in names or list(self.cameras):
+        for name, (width, height) in sizes.items():
             cam = self.camera(name)
             lens = cam.lens.scaled(width / cam.width, height / cam.height)
             began = cam.times_us - cam.readout_us // 2

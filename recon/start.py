@@ -77,7 +77,7 @@ def prepare(
 
     exposures: of the cameras, affine `[C, 3, 4]`, where they are known. ValueError where a drive has no lidar point in view.
     """
-    rig = log.rig(frames.width, frames.height, frames.names)
+    rig = log.rig(dict(zip(frames.names, frames.sizes, strict=True)))
     ego = body_path(log, frames, rig)
     sweeps = log.sweeps_within(span_us)
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
@@ -227,9 +227,9 @@ def _fill(log: Log, frames: Frames, background: Gaussians, actors: list[Gaussian
     """Background with splats added where views show neither splats nor sky, and the sky `[H, 2H, 3]`."""
     picture = SkyPicture(SKY_HEIGHT, _usual(frames, gains))
     world = torch.eye(4, dtype=torch.float64)
-    for c, name in enumerate(frames.names):
+    for c in range(len(frames.names)):
         views = frames.of(c)
-        search = Search(views, [log.camera(name).camera(v.index, frames.width, frames.height) for v in views], gains[c], ground, tracks)
+        search = Search(views, [frames.camera(log, v) for v in views], gains[c], ground, tracks)
         for view, camera, hidden in search:
             placed = [Placed(background, world)]
             for track, splats in zip(tracks, actors, strict=True):

@@ -6,15 +6,6 @@ from dataclasses import dataclass, replace
 
 from recon.fit.motion import REFINED
 
-SMALLEST = 16
-"""Pixels that a picture's sides have at least, shrunk or not: the window of its similarity wants some."""
-
-
-def check_size(size: tuple[int, int]) -> None:
-    """ValueError where pictures of a width and height cannot be fitted to."""
-    if min(size) < SMALLEST:
-        raise ValueError(f"pictures of {size[0]}x{size[1]} are too small to fit to; the smallest size is {SMALLEST}x{SMALLEST}")
-
 
 @dataclass(frozen=True)
 class FitConfig:

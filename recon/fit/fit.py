@@ -96,7 +96,7 @@ class Fit:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.recent_loss = 0.0
-        self.targets = Targets(frames.width, frames.height)
+        self.targets = Targets(frames.sizes)
         self.turns = Turns(self._weights(), self.generator)
         self.openings = Openings(frames, motion, self.device)
         self.ground, self.swept = ground, swept.to(self.device)
@@ -136,11 +136,11 @@ class Fit:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
         self._tend()
         view = self.training[self.turns.next()]
-        camera = self.motion.camera(view).resized(*self.targets.size(self.shrink()))
+        camera = self.motion.camera(view).resized(*self.targets.size(view, self.shrink()))
         target = self.targets.picture(view, self.shrink())
         aside = None
         if self.step_count % ASIDE_EVERY == 0:
-            aside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(2 * self.shrink()))
+            aside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
         ends = self.motion.readout(view, camera)
         rates = self._rates()
         which = self._in_sight(view, camera, ends, aside)
@@ -202,7 +202,7 @@ class Fit:
 
     def _drawn(self, view: View, *outputs: str) -> dict[str, torch.Tensor]:
         """Outputs of a view at full size."""
-        camera = self.motion.camera(view).resized(self.frames.width, self.frames.height)
+        camera = self.motion.camera(view).resized(*self.frames.sizes[view.camera])
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
         return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), outputs=outputs)
@@ -268,7 +268,7 @@ class Fit:
         self._renew(*kept(self.splats, self.descent.tensors(), ~self.swept.holds(self.splats)))
         part = torch.zeros_like(self.splats.reach)
         for view in self.training:
-            camera = self.motion.camera(view).resized(*self.targets.size(4))
+            camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
             which = self._in_sight(view, camera, [], None)
             shown = torch.cat(shown_parts(self._placed(self.splats.select(which, 1), view, camera), camera))
             part[which] = torch.maximum(part[which], shown)
@@ -328,7 +328,7 @@ class Fit:
         path, sh_count = self.motion.path(), self.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
-            cameras = [self.motion.camera(v).resized(self.frames.width, self.frames.height) for v in views]
+            cameras = [self.motion.camera(v).resized(*self.frames.sizes[c]) for v in views]
             search = Search(views, cameras, gain, self.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 reach = reach_of(more, path, self.motion.rig).to(self.device)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from recon.fit.config import SMALLEST
+from recon.frames import SMALLEST
 from recon.view import View
 from scenes.camera import Camera
 
 
 class Targets:
-    """Pictures of `width` x `height`, shrunk by a factor; those of the present factor are kept."""
+    """Pictures of cameras, of width and height `sizes[c]`, shrunk by a factor; those of the present factor are kept."""
 
-    def __init__(self, width: int, height: int):
-        self.width, self.height = width, height
+    def __init__(self, sizes: list[tuple[int, int]]):
+        self.sizes = sizes
         self._kept: dict[tuple[int, int, int], torch.Tensor] = {}
 
-    def size(self, shrink: int) -> tuple[int, int]:
-        """Width and height of shrunk pictures."""
-        return max(SMALLEST, self.width // shrink), max(SMALLEST, self.height // shrink)
+    def size(self, view: View, shrink: int) -> tuple[int, int]:
+        """Width and height of a view's shrunk picture."""
+        width, height = self.sizes[view.camera]
+        return max(SMALLEST, width // shrink), max(SMALLEST, height // shrink)
 
     def picture(self, view: View, shrink: int) -> torch.Tensor:
         """A view's picture `[h, w, 3]` in 0..1, area-averaged."""
@@ -27,7 +28,7 @@ class Targets:
             return view.image.float().mul_(1 / 255)
         key = (shrink, view.camera, view.index)
         if key not in self._kept:
-            width, height = self.size(shrink)
+            width, height = self.size(view, shrink)
             small = F.interpolate(view.image.permute(2, 0, 1)[None].float(), (height, width), mode="area")[0].permute(1, 2, 0)
             self._kept = {k: v for k, v in self._kept.items() if k[0] == shrink}
             self._kept[key] = small.contiguous()

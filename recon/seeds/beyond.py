@@ -44,7 +44,7 @@ def beyond_lidar(
 
     struck: what it measured of each; gains: the cameras' exposures `[C, 3]`.
     """
-    grids = {(c, i): grid_of(log.camera(frames.names[c]).camera(i, frames.width, frames.height)) for c, i in struck.views}
+    grids = {(c, i): grid_of(log.camera(frames.names[c]).camera(i, *frames.sizes[c])) for c, i in struck.views}
     found = believed(log, frames, _points(log, frames, struck, grids), ground, movers)
     kept = [own.only(_beyond(own, struck)) for own in found]
     kept = [own.only(~_seen_through(own, struck, grids)) for own in kept]

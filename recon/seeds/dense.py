@@ -117,7 +117,7 @@ def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: l
     made = []
     for view in frames.training():
         name = frames.names[view.camera]
-        camera = log.camera(name).camera(view.index, frames.width, frames.height)
+        camera = frames.camera(log, view)
         points = sparse.xyz[sparse.seen[name][view.index]]
         row, column, depth, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
         inside &= (depth < nearest_box(camera, movers)[row, column]) & view.shows_street(row, column)
@@ -130,7 +130,7 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
     found = []
     for c, name in enumerate(frames.names):
         views = frames.of(c)
-        cameras = [log.camera(name).camera(v.index, frames.width, frames.height) for v in views]
+        cameras = [frames.camera(log, v) for v in views]
         plates = [plate_of(v.image, camera) for v, camera in zip(views, cameras, strict=True)]
         points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
         chosen = _chosen(plates, points)

@@ -103,7 +103,7 @@ def _soon(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> It
     for k, views in near.items():
         static = split.static[split.static_sweep == sweeps[k].index]
         for view in views:
-            yield sweeps[k], static, view, grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
+            yield sweeps[k], static, view, grid_of(frames.camera(log, view))
 
 
 def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np.ndarray:

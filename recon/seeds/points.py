@@ -49,8 +49,8 @@ def colours(log: Log, frames: Frames, points: np.ndarray, taken_us: np.ndarray, 
     """
     out = np.full((len(frames.names), len(points), 3), np.nan, dtype=np.float32)
     moments, of_moment = np.unique(taken_us, return_inverse=True)  # sweeps are few and points many
-    for c, name in enumerate(frames.names):
-        camera, views = log.camera(name), frames.of(c)
+    for c in range(len(frames.names)):
+        views = frames.of(c)
         times = np.array([v.time_us for v in views])
         # the points are sorted by the view that shows them
         nearest = np.abs(moments[:, None] - times[None]).argmin(1).astype(np.int32)[of_moment]
@@ -59,7 +59,7 @@ def colours(log: Log, frames: Frames, points: np.ndarray, taken_us: np.ndarray, 
         for view, mine in zip(views, np.split(order, begins[1:-1]), strict=True):
             if not len(mine):
                 continue
-            cam = camera.camera(view.index, frames.width, frames.height)
+            cam = frames.camera(log, view)
             back = inverse(cam.world_from_cam)
             if local_pose is not None:
                 placed = local_pose(view)

@@ -43,7 +43,7 @@ def by_all_sweeps(log: Log, frames: Frames, split: Split, movers: list[Track]) -
     points = thin(Cloud(split.static, split.static), path.query(split.static)[0], POINTS)[0].xyz
     found = {}
     for view in frames.training():
-        camera = grid_of(log.camera(frames.names[view.camera]).camera(view.index, frames.width, frames.height))
+        camera = grid_of(frames.camera(log, view))
         local = camera_rays(camera).double()
         rays = (local @ camera.world_from_cam[:3, :3].T).numpy()
         level = np.hypot(rays[..., 0], rays[..., 1])

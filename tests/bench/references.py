@@ -48,7 +48,7 @@ def measured(scene: Scene, references: References, drive: Path, size: tuple[int,
     kept = {shot.camera.time_us for shot in references.shots}
     for name in scene.rig:
         held_out = [t for t in scene.frame_times(name).tolist() if t not in kept]
-        rig = log.rig(*size, [name])[name]
+        rig = log.rig({name: size})[name]
         for time_us in held_out[::every]:
             camera = scene.rig_camera(name).resized(*size).along(scene.ego, time_us)
             index = int((log.cameras[name].times_us - time_us).abs().argmin())

@@ -69,7 +69,7 @@ def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
     assert isinstance(log.camera("front").lens, OpenCV)
     shutters = {name: (c.shutter, c.readout_us) for name, c in log.cameras.items()}
     assert shutters == {"front": ("rows", READOUT_US), "front_right": ("columns", -READOUT_US)}  # the right one from right to left
-    assert log.rig(96, 54)["front_right"].times_us[0] == log.camera("front_right").times_us[0] + READOUT_US // 2
+    assert log.rig({"front_right": (96, 54)})["front_right"].times_us[0] == log.camera("front_right").times_us[0] + READOUT_US // 2
     assert open_log(waymo).name == log.name  # the only segment needs no name
 
 

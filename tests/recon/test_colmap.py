@@ -137,7 +137,7 @@ def test_two_cameras_share_the_moments_of_equal_names(street, tmp_path):
     log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
     assert list(log.cameras) == ["front", "left"] == list(log.front)
     assert log.cameras["front"].times_us.tolist() == log.cameras["left"].times_us.tolist()
-    rig = log.rig(96, 54)
+    rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
     apart = inverse(rig["front"].body_from_cam) @ rig["left"].body_from_cam
     truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
     torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)

@@ -308,7 +308,7 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
     fit.step_count = BLAME_EVERY * 4
     view = fit.training[0]
     fit.turns.shares = torch.eye(len(fit.training))[0]  # the view that is drawn
-    camera = fit.motion.camera(view).resized(*fit.targets.size(fit.shrink()))
+    camera = fit.motion.camera(view).resized(*fit.targets.size(view, fit.shrink()))
     everything = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
     ones, ends, sky = torch.ones(len(fit.splats), 1), fit.motion.readout(view, camera), partial(sample_equirect, fit.sky)
     with torch.no_grad():

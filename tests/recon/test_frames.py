@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -7,8 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from recon import open_log
-from recon.frames import load_frames
+from recon import open_log, reconstruct
+from recon.fit.config import FitConfig
+from recon.frames import load_frames, size_like
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse
@@ -114,3 +116,36 @@ def test_a_span_of_one_frame_that_is_held_out_is_refused_saying_so(drive):
     time = int(log.camera("front_camera").times_us[0])
     with pytest.raises(ValueError, match="1 of its 8 lie there, held out as one of every 8; choose a longer one"):
         load_frames(log, ["front_camera"], (time, time), (96, 54), 8)
+
+
+def test_cameras_of_other_proportions_keep_them():
+    def one(width: int, height: int) -> LogCamera:
+        return LogCamera("front", Pinhole(120, 120, 60, 60), width, height, (), torch.zeros(0), torch.zeros(0, 4, 4))
+
+    ahead, wide = one(1550, 2048), one(2048, 1550)  # as in Argoverse 2
+    assert size_like(ahead, ahead, (626, 828)) == (626, 828) and size_like(wide, ahead, (626, 828)) == (827, 627)
+    assert size_like(one(960, 540), one(1920, 1080), (640, 360)) == (640, 360)
+    assert size_like(one(1920, 886), one(1920, 1280), (882, 588)) == (1060, 489)  # as Waymo's to the sides
+    assert size_like(one(400, 100), one(1920, 1080), (1920, 1080)) == (400, 100), "no more than was recorded"
+    assert size_like(one(200, 100), one(100, 100), (50, 100)) == (71, 71), "what is squeezed in one is squeezed in all"
+
+
+def test_a_drive_whose_cameras_have_other_proportions_keeps_them(own_drive, tmp_path):
+    folder = own_drive / "camera/left_camera"
+    for file in folder.glob("*.jpg"):
+        with Image.open(file) as picture:
+            picture.crop((30, 0, 66, 54)).save(file, quality=95)  # upright
+    lens = json.loads((folder / "intrinsics.json").read_text())
+    (folder / "intrinsics.json").write_text(json.dumps(lens | {"cx": lens["cx"] - 30}))
+    log = open_log(own_drive)
+    frames = load_frames(log, ["front_camera", "left_camera"], ALL, (96, 54), 4)
+    assert frames.sizes == [(96, 54), (36, 54)]
+    scene = reconstruct(
+        log, tmp_path / "s", ["front_camera", "left_camera"], size=(64, 36), held_out=4, config=FitConfig(steps=40, budget=6000)
+    )
+    camera = scene.rig["left_camera"]
+    assert camera.height > camera.width and camera.lens.focal()[0] == pytest.approx(camera.lens.focal()[1], rel=0.02)
+    row = next(r for r in scene.meta["held_out"] if r["camera"] == "left_camera")
+    assert row["psnr"] > row["mean_psnr"] - 3
+    with pytest.raises(ValueError, match="--size 200x54 is more than front_camera recorded, 96x54"):
+        reconstruct(log, tmp_path / "large", size=(200, 54))

@@ -65,7 +65,7 @@ def test_a_photo_read_row_by_row_is_brought_to_one_moment():
 def motion(readout_us=0):
     scene, times = street(), [START_US + 100_000 * i for i in range(8)]
     views = [View(0, i, t, torch.zeros(1, 1, 3), False, torch.zeros(1, 1, dtype=torch.bool)) for i, t in enumerate(times)]
-    frames = Frames(["front_camera"], 96, 54, views)
+    frames = Frames(["front_camera"], [(96, 54)], views)
     cameras = {"front_camera": replace(rig()["front_camera"], shutter="rows", readout_us=readout_us)}
     tracks = [
         Track(a.track, "car", True, a.asset.size.numpy(), a.trajectory.times_us.numpy(), a.trajectory.world_from_body, np.zeros(0), ())
