@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import check_device
-from scenes.options import AngleOrNone, FitSize, Flag, LengthOrNone, Names, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+from scenes.options import AngleOrNone, FitSize, Flag, FrontNames, LengthOrNone, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 from scenes.stops import stopped_saying
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class Recon:
     or a video."""
     output: Output
     """Folder of the new scene."""
-    cameras: Names = None
+    cameras: FrontNames = None
     """Cameras to use."""
     start: Time = 0
     """Where in the drive to begin."""

@@ -80,6 +80,7 @@ TimeOrAll = Annotated[int | None, written(units.duration_us, "TIME", "the rest")
 Size = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded")]
 FitSize = Annotated[tuple[int, int] | None, written(_size, "WxH", "as recorded, at most as many pixels as 960x540")]
 Names = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "all")]
+FrontNames = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "those that look ahead")]
 Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
 Way = Annotated[str, written(parse_path, "straight|lane", "straight")]
