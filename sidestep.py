@@ -27,10 +27,12 @@ from scenes.names import unknown
 from scenes.opening import UsageError, check_device, fresh, open_scene, open_view, warn
 from scenes.options import (
     Angle,
-    Csv,
+    Axis,
+    FileOrNone,
     Flag,
     Insertion,
     Length,
+    OneOfRig,
     Output,
     Overwrite,
     Place,
@@ -68,7 +70,7 @@ class Insert:
     """Speed along its heading, as 8m/s."""
     path: Way = "straight"
     """Straight on, or in a lane beside the recorded path, to which --yaw then is relative; yaw 180deg is oncoming traffic."""
-    trajectory: Csv = None
+    trajectory: FileOrNone = None
     """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw and --speed: seconds after --start, metres forward and left."""
     start: Time = 0
     """When the place holds, after the drive's first moment."""
@@ -104,9 +106,9 @@ class Render:
     """Scene folder, or a splat file or asset."""
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
-    camera: str | None = None
+    camera: OneOfRig = None
     """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file."""
-    up: str | None = None
+    up: Axis = None
     """Of a file's splats, the axis that points up: x, -x, y, ...; z where left out, and -y of most that were trained from photos."""
     lateral_shift: Length = 0.0
     """Metres to the left of the recorded path, as 2m; -2m is to the right."""

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from scenes import units
 from scenes.opening import UsageError, check_device, fresh
-from scenes.options import Flag, Names, Output, Overwrite, written
+from scenes.options import FileOrNone, Flag, FolderOrNone, Names, Output, Overwrite, WeightsOrNone, written
 from scenes.stops import stopped_saying
 
 
@@ -31,10 +31,10 @@ class Pairs:
     """Cameras to use; the front camera's pairs are never trained on, where there are others."""
     skies: tuple[Path, ...] = ()
     """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
-    relit: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    relit: FolderOrNone = None
     """Folder in which NVIDIA's DiffusionRenderer, run by yourself, is handed photos and gives them back under other skies, for relight;
     this command says what to run. Without, relight goes by the splats' normals."""
-    databank: Path | None = None
+    databank: FolderOrNone = None
     """Assets that shadow puts in, beside those cut out of the scene."""
     photos: tuple[Path, ...] = ()
     """Folders of images, and videos, of places never trained on: pairs of single frames with a region in other colours."""
@@ -105,11 +105,11 @@ class Train:
     """How long to train, as 7200s."""
     seed: int = 0
     """Seed of the first weights and of every sample."""
-    start: str | None = None
+    start: WeightsOrNone = None
     """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
     only: Names = None
     """What of prior, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
-    vgg: Path | None = None
+    vgg: FileOrNone = None
     """torchvision's vgg16 weights, a file of your own, whose features the perceptual loss compares; the autoencoder's own without."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train; the weights run on either."""
@@ -160,11 +160,11 @@ class Enhance:
     """The enhanced video, as clean.mp4; of a folder of pictures, the folder of the enhanced ones."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
-    instances: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    instances: FolderOrNone = None
     """Tells where objects were put in, whose colours, shadows and noise are then set right: a .png or .npy for each frame, in which each
     object has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too:
     set these to 0; out.json says which were inserted."""
-    like: Annotated[Path | None, arg(metavar="PHOTOS")] = None
+    like: Annotated[Path | None, written(Path, "PHOTOS", "none")] = None
     """Photos of the same place, as a folder of them, one, or a video: the whole clip is given their exposure, white balance, contrast and
     saturation, and loses noise and sharpening that they have not. A scene's own are in its photos/CAMERA. What differs no more than they do
     among themselves stays."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import check_device
-from scenes.options import AngleOrNone, FitSize, Flag, FrontNames, LengthOrNone, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+from scenes.options import AngleOrNone, Axis, FitSize, Flag, FrontNames, LengthOrNone, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
 from scenes.stops import stopped_saying
 
 if TYPE_CHECKING:
@@ -155,10 +155,10 @@ class Add:
     """What it is: car, pickup, van, truck, bus, motorcycle, bicycle, pedestrian, cone, sign, tree, or a name of its own."""
     scale: Ratio = None
     """Metres a unit of the file."""
-    up: str | None = None
+    up: Axis = None
     """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, and else -y, as cameras
     have it."""
-    forward: str | None = None
+    forward: Axis = None
     """The axis that points forward: a mesh's is z, as in glTF; of splats -y in .glb, x in USD with z up, and else z."""
     licence: str = ""
     """Its licence, as "CC BY 3.0"."""

@@ -84,7 +84,11 @@ FrontNames = Annotated[tuple[str, ...] | None, written(names, "NAME,NAME", "thos
 Rate = Annotated[float | None, written(_rate, "FPS", "as recorded")]
 Place = Annotated[tuple[float, float] | None, written(parse_at, "X,Y", "none")]
 Way = Annotated[str, written(parse_path, "straight|lane", "straight")]
-Csv = Annotated[Path | None, written(Path, "FILE", "none")]
+FileOrNone = Annotated[Path | None, written(Path, "FILE", "none")]
+FolderOrNone = Annotated[Path | None, written(Path, "FOLDER", "none")]
+OneOfRig = Annotated[str | None, written(str, "NAME", "first")]
+Axis = Annotated[str | None, written(str, "AXIS", "usual")]
+WeightsOrNone = Annotated[str | None, written(str, "builtin|FILE", "none")]
 Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V][,path=lane]", "none")]
 Shift = Annotated[
     tuple[str, tuple[float, float]], written(lambda text: _of_track(text, parse_at, "veh_3=0m,1.5m"), "ACTOR=FORWARD,LEFT", "none")

@@ -368,6 +368,17 @@ def test_nan_in_a_scene_is_refused_or_dropped(door, tmp_path, monkeypatch):
     assert "dropped 1 splat with" in json.loads((tmp_path / "x.json").read_text())["warnings"][0]
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["recon", "assets extract", "assets add", "assets list", "assets show", "assets check", "insert", "edit", "render", "pairs", "train",
+     "enhance", "convert", "info", "validate", "doctor", "demo"],
+)  # fmt: skip
+def test_help_speaks_of_values_as_they_are_written(door, words):
+    """Not as Python has them: {None}|STR is nothing that can be typed."""
+    told = door([*words.split(), "--help"], 0)[0]
+    assert "--" in told and "None" not in told and "STR]" not in told
+
+
 def test_existing_outputs_are_replaced_with_w(door, tmp_path):
     words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "--duration", "100ms"]
     (tmp_path / "out.json").write_text("precious")
