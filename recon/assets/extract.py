@@ -32,6 +32,7 @@ from scenes.scene import Scene, dimmed
 from scenes.seen import SECTORS, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
+from scenes.usd_scene import load_recorded
 
 FLOOR = 0.06
 """Metres above the base of a box under which splats are road, not wheel."""
@@ -89,6 +90,7 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
         loaded = load(scene)
         if not isinstance(loaded, Scene):
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
+        loaded = load_recorded(scene)  # what photos show is where it was, whatever was edited since
         shots, scene = shots_in(scene, loaded), loaded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids, far = Databank(databank), [], [c.track for c in found if not c.asset.meta["views"]]
@@ -114,7 +116,7 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
     share["source"] = scene.meta.get("source", scene.meta.get("name", ""))
     views = Views(scene)
     for instance, actor in enumerate(scene.actors, 1):
-        if actor.asset.meta.get("inserted"):
+        if not actor.recorded:
             continue  # it came from a databank
         sight = sight_of(views, actor.trajectory, actor.asset.size)
         half = len(actor.trajectory) // 2

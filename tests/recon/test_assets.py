@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from street import box, rig
+from street import box, car, rig
 
 from recon import extract_assets
 from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned, within_box
@@ -15,10 +15,12 @@ from render import rasterize, render_frame
 from render.album import keep_photos
 from render.references import Shot
 from render.video import from_bytes, to_bytes
-from scenes import Asset, Databank, Gaussians, Placed, Trajectory, save
+from scenes import Asset, Databank, Gaussians, Placed, Trajectory, load, save
+from scenes.edit import Edit
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw
 from scenes.report import validate
+from scenes.usd_edit import add_change
 
 CAMERA = "front_camera"
 
@@ -186,6 +188,22 @@ def test_a_scene_folder_with_photos_gives_its_assets_theirs(parked_street, tmp_p
     keep_photos(tmp_path / "s1", [(CAMERA, s.camera.time_us, from_bytes(s.read(384, 216))) for s in _shots(scene)[:8]])
     loaded = [bank.load(id) for id in extract_assets(tmp_path / "s1", tmp_path / "bank")]
     assert all(asset.photos for asset in loaded) and not validate(tmp_path / "bank")
+
+
+def test_assets_are_cut_from_what_was_recorded_whatever_was_edited_since(parked_street, tmp_path):
+    save(parked_street, tmp_path / "as_it_was")
+    save(parked_street, tmp_path / "edited")
+    extract_assets(tmp_path / "as_it_was", tmp_path / "wanted")
+    bank = Databank(tmp_path / "other")
+    van = bank.load(bank.add(car("van", (0.9, 0.9, 0.1))))
+    track = parked_street.actors[0].track
+    add_change(tmp_path / "edited", "edit", load(tmp_path / "edited"), Edit(replace={track: van}), {"kind": "edit"})
+    assert load(tmp_path / "edited").actors[0].asset.label == "van"
+    extract_assets(tmp_path / "edited", tmp_path / "got")
+    wanted, got = (Databank(tmp_path / name) for name in ("wanted", "got"))
+    assert [e.id for e in got.entries()] == [e.id for e in wanted.entries()]
+    assert all(torch.equal(got.load(e.id).gaussians.sh, wanted.load(e.id).gaussians.sh) for e in got.entries())
+    assert track not in [c.track for c in candidates(load(tmp_path / "edited"))], "nor is the van an asset of this drive in memory"
 
 
 def test_what_no_photo_shows_is_no_asset(parked_street, tmp_path, capsys):
