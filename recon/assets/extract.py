@@ -22,7 +22,7 @@ from render.album import shots_in
 from render.references import Shot
 from scenes.asset import Actor, Asset, AssetPhoto
 from scenes.databank import Databank
-from scenes.files import load
+from scenes.files import kind_of
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, turned
 from scenes.match import ground_linear
@@ -77,8 +77,8 @@ class Candidate:
 
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
     """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first: those of which
-    the fewest sides are unseen, and of these those of the most splats. Where a scene folder keeps its photos, each asset keeps those that
-    show it, and one that is half hidden in all of them is not good enough.
+    the fewest sides are unseen, and of these those of the most splats. A scene folder's are cut out as recorded, whatever was edited
+    since; where it keeps its photos, each asset keeps those that show it, and one that is half hidden in all of them is not good enough.
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
@@ -87,11 +87,10 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
     shots: list[Shot] = []
     if not isinstance(scene, Scene):
         scene = scene_folder(scene)
-        loaded = load(scene)
-        if not isinstance(loaded, Scene):
+        if kind_of(scene) != "scene":
             raise ValueError(f"{scene} is not a scene; assets are cut from a folder that sidestep recon wrote")
-        loaded = load_recorded(scene)  # what photos show is where it was, whatever was edited since
-        shots, scene = shots_in(scene, loaded), loaded
+        recorded = load_recorded(scene)
+        shots, scene = shots_in(scene, recorded), recorded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
     bank, ids, far = Databank(databank), [], [c.track for c in found if not c.asset.meta["views"]]
     if far:

@@ -96,7 +96,7 @@ class Fit:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.recent_loss = 0.0
-        self.targets = Targets(frames.sizes)
+        self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
         self.openings = Openings(frames, motion, self.device)
         self.ground, self.swept = ground, swept.to(self.device)
@@ -202,7 +202,7 @@ class Fit:
 
     def _drawn(self, view: View, *outputs: str) -> dict[str, torch.Tensor]:
         """Outputs of a view at full size."""
-        camera = self.motion.camera(view).resized(*self.frames.sizes[view.camera])
+        camera = self.motion.camera(view)
         ends = self.motion.readout(view, camera)
         shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
         return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), outputs=outputs)
@@ -328,7 +328,7 @@ class Fit:
         path, sh_count = self.motion.path(), self.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
-            cameras = [self.motion.camera(v).resized(*self.frames.sizes[c]) for v in views]
+            cameras = [self.motion.camera(v) for v in views]
             search = Search(views, cameras, gain, self.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 reach = reach_of(more, path, self.motion.rig).to(self.device)

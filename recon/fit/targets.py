@@ -11,15 +11,14 @@ from scenes.camera import Camera
 
 
 class Targets:
-    """Pictures of cameras, of width and height `sizes[c]`, shrunk by a factor; those of the present factor are kept."""
+    """Views' pictures, shrunk by a factor; those of the present factor are kept."""
 
-    def __init__(self, sizes: list[tuple[int, int]]):
-        self.sizes = sizes
+    def __init__(self) -> None:
         self._kept: dict[tuple[int, int, int], torch.Tensor] = {}
 
     def size(self, view: View, shrink: int) -> tuple[int, int]:
         """Width and height of a view's shrunk picture."""
-        width, height = self.sizes[view.camera]
+        height, width = view.image.shape[:2]
         return max(SMALLEST, width // shrink), max(SMALLEST, height // shrink)
 
     def picture(self, view: View, shrink: int) -> torch.Tensor:

@@ -74,9 +74,8 @@ def main() -> None:
             spent.clear()
             for _ in range(count):
                 fit.step()
-        print(
-            f"{fit.frames.sizes[0][0] // factor}x{fit.frames.sizes[0][1] // factor}, {len(fit.splats)} splats{'wall ms':>22}{'CPU ms':>10}"
-        )
+        width, height = fit.targets.size(fit.training[0], factor)
+        print(f"{width}x{height}, {len(fit.splats)} splats{'wall ms':>22}{'CPU ms':>10}")
         for key in (f"{owner.__name__.split('.')[-1]}.{name}" for owner, name in PARTS):
             print(f"  {key:<36}{1e3 * wall[key] / asked.steps:>10.1f}{1e3 * spent[key] / asked.steps:>10.1f}")
 
