@@ -18,12 +18,15 @@ from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
 from recon.readers.order import recorded
 from recon.readers.sfm import Model, ModelCamera, is_model, read_model
+from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
 from scenes.poses import CAM_FROM_FLU
 from scenes.trajectory import Trajectory
 
 STEP_US = 500_000
+FASTEST_US = 100
+"""Microseconds between a picture and the next, below which a clock counts seconds or milliseconds."""
 
 APART = 300.0
 """Metres between a picture and the next from which on a model is none of a place: nothing ties its pictures to each other."""
@@ -100,7 +103,8 @@ def lens_of(camera: ModelCamera, where: Path) -> Lens:
     if make is None:
         fix = "undistort the pictures with: colmap image_undistorter"
         raise ValueError(f"{where} has a camera with the lens {camera.lens}; read are {', '.join(LENSES)}. For others, {fix}")
-    return make(*p)
+    with stating(f"{where}, camera with the lens {camera.lens}"):
+        return make(*p)
 
 
 LENSES: dict[str, Callable[..., Lens]] = {
@@ -161,9 +165,13 @@ def _moments(where: Path, model: Model) -> list[int]:
     if clock.is_file():
         try:
             times = json.loads(clock.read_text())
-            moments = [int(times[i.name]) for i in model.images]
+            told = [times[i.name] for i in model.images]
+            moments = [int(t) for t in told]
         except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, ValueError) as problem:
             raise ValueError(f"{clock} must give whole microseconds by picture name ({problem!r})") from None
+        rising = np.unique(moments)
+        if moments != told or len(rising) > 1 and np.median(np.diff(rising)) < FASTEST_US:
+            raise ValueError(f"{clock} must give whole microseconds by picture name; it has {told[0]!r} for {model.images[0].name}")
         fix = f"give them different times in {clock}"
     else:
         names = _without_cameras(model)
