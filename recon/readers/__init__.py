@@ -30,6 +30,8 @@ def open_log(
     are given to a log that has its own.
     """
     path = Path(path)
+    if path.name in ("", ".."):
+        path = path.resolve()  # what is found is kept beside it, under its name
     read = metric_reader(path)
     if read is not None:
         given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
