@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import overload
 
 import torch
@@ -26,6 +27,9 @@ from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.poses import inverse
+
+STRETCHED = 0.01
+"""What R R^T of a pose's turn is off the unit matrix, summed, from which on it is none; poses that are optimised drift by less."""
 
 
 @overload
@@ -189,6 +193,8 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
     if mask is not None:
         check_tensor("mask", mask, (camera.height, camera.width), torch.bool)
     if crop is not None:
+        if len(crop) != 4 or not all(isinstance(n, Integral) for n in crop):
+            raise ValueError(f"crop must be four whole numbers of pixels, x, y, width, height, got {crop}")
         x, y, width, height = crop
         if not (x >= 0 and y >= 0 and width >= 1 and height >= 1 and x + width <= camera.width and y + height <= camera.height):
             size = f"{camera.width}x{camera.height}"
@@ -218,10 +224,15 @@ def _check(placed, camera, outputs, flow_to, model) -> None:
 
 def _check_poses(placed: list[Placed], camera: Camera) -> None:
     given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
-    if not torch.isfinite(torch.stack(given).sum()):  # one value that is not finite makes the sum so
-        for name, pose in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, strict=True):
+    stacked = torch.stack(given).detach()
+    turns = stacked[:, :3, :3]
+    off = (turns @ turns.mT - torch.eye(3, dtype=turns.dtype, device=turns.device)).abs().sum((1, 2))
+    if not (off + 0 * stacked.sum((1, 2)) < STRETCHED).all():  # one value that is not finite makes the sum so
+        for name, pose, bent in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, off.tolist(), strict=True):
             if not torch.isfinite(pose).all():
                 raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
+            if bent >= STRETCHED:
+                raise ValueError(f"the pose of {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
 
 
 def _check_shared(placed: list[Placed], there: list[Placed]) -> None:

@@ -13,6 +13,7 @@ from tests import oracle
 from tests.bench.presets import random_splats
 
 CAMERA = Camera(Pinhole(60.0, 62.0, 34.0, 22.0), 70, 50, pose_from([1, 0.02, 0.01, -0.03], [0.1, 0.2, -0.3]))
+TWICE = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
 MODELS = [SplatModel(projection=p, antialias=a) for p in ("ewa", "ut") for a in (False, True)]
 EXACT = RenderConfig(alpha_cutoff=1e-8, termination=0)
 
@@ -320,6 +321,10 @@ def test_depth_far_behind_faint_splats_is_still_divided_by_its_weight():
         (lambda: rasterize(random_splats(3, 0), CAMERA, background=torch.ones(5, 5, 3)), "background must have shape"),
         (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam_end=CAMERA.world_from_cam)), "global shutter"),
         (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=CAMERA.world_from_cam * torch.nan)), "not finite"),
+        (lambda: rasterize(random_splats(3, 0), replace(CAMERA, world_from_cam=CAMERA.world_from_cam @ TWICE)), "pose of camera scales or"),
+        (lambda: rasterize(Placed(random_splats(3, 0), TWICE, instance=7), CAMERA), "pose of instance 7 scales or shears"),
+        (lambda: rasterize(random_splats(3, 0), CAMERA, crop=(0, 0, 4)), "crop must be four whole numbers"),
+        (lambda: rasterize(random_splats(3, 0), CAMERA, crop=(0, 0, 4.5, 4)), "crop must be four whole numbers"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(change, message):
