@@ -146,5 +146,5 @@ def _inserted(scene: Scene) -> list[dict]:
             "world_from_asset": [actor.trajectory.world_from_body[0].tolist(), actor.trajectory.world_from_body[-1].tolist()],
         }
         for i, actor in enumerate(scene.actors)
-        if actor.asset.meta.get("inserted")
+        if not actor.recorded
     ]

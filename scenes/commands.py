@@ -110,6 +110,7 @@ class Edit:
             raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
         from scenes import Databank
         from scenes import edit as edits
+        from scenes.match import other_model
         from scenes.usd_edit import add_change, free_name, undo
 
         went: list[str] = []
@@ -128,7 +129,8 @@ class Edit:
         told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
         name = self.name or free_name(self.scene, "edit")
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
-        warn(edits.absences(edit, scene))
+        others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
+        warn([*others, *edits.absences(edit, scene)])
         layer = self.scene / "edits" / f"{name}.usda"
         print(f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it")
 

@@ -14,7 +14,7 @@ from scenes.collide import collisions
 from scenes.detail import coarser
 from scenes.edit import named
 from scenes.lane import Lane
-from scenes.match import matched
+from scenes.match import matched, other_model
 from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
@@ -71,8 +71,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         warnings.append(f"{placement.asset}: the scene has no ground, so its height is that of the lowest splats around it")
     elif beyond > 0:
         warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
-    if asset.model != scene.model:
-        warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
+    warnings += other_model(placement.asset, asset, scene)
     lit = matched(asset, scene, xy[int((times - start_us).abs().argmin())])
     path = Trajectory(times, torch.stack(poses))
     splats = coarser(lit.gaussians, finest_pixel(scene, path) / 2)  # what half a pixel holds cannot be told apart

@@ -80,8 +80,8 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     painted, colours = bared(recorded, edit.remove)
 
     def files(folder: Path) -> None:
-        for track, asset in edit.replace.items():
-            save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
+        for actor in (a for a in changed if a.track in edit.replace):
+            save_asset(folder / f"{Path(prims[actor.track]).name}.usdc", actor.asset, half)
         if hidden or len(painted):
             _save_background(path, folder / "hidden.usda", hidden, painted.tolist(), colours.tolist())
 

@@ -18,7 +18,7 @@ import street as made
 import torch
 
 from render.video import VideoWriter, read_video
-from scenes import Databank, Gaussians, Placed, load, save
+from scenes import Databank, Gaussians, Placed, SplatModel, load, save
 from scenes.usd_splats import save_gaussians
 
 REPOSITORY = Path(__file__).parents[1]
@@ -121,6 +121,14 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
     assert load(street).actors == ()
     assert "again as it was" in door(["edit", street, "--undo", "gone", "--undo", "edit"])[0]
     assert load(street).actors[0].asset.label == "car"
+
+
+def test_another_asset_of_another_splat_model_is_said(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    bank = Databank(tmp_path / "bank")
+    bank.add(replace(made.car(), model=SplatModel("ewa")))
+    _, errors = door(["edit", str(tmp_path / "street"), "--replace", "veh_1=car/0001", "--databank", str(bank.path)])
+    assert "warning: car/0001 was trained with SplatModel(projection='ewa'" in errors
 
 
 def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):

@@ -179,6 +179,17 @@ def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
     assert place() == pytest.approx(-3.0)
 
 
+def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(saved):
+    dark = replace(VAN, meta={**VAN.meta, "id": "van/0001", "ground_linear": [0.03, 0.04, 0.05]})
+    add_change(saved, "mine", load(saved), Edit(replace={"veh_3": dark}), {})
+    put_in = insert(load(saved), dark, Placement("van/0001", 15.0, 5.0)).actor.asset
+    for asset in (load(saved).actors[2].asset, edited(busy(), Edit(replace={"veh_3": dark})).actors[2].asset):
+        assert asset.meta["light_gain"] == put_in.meta["light_gain"] and asset.meta["id"] == "van/0001"
+        assert len(asset.gaussians) == len(VAN.gaussians) and rgb_from_sh(asset.gaussians.sh[:, 0]).mean() > 0.7
+    undo(saved, "mine")
+    same(load(saved), busy())
+
+
 def shown(scene: Scene) -> torch.Tensor:
     return scene.background.gaussians.logit_opacities > HIDDEN + 1e-3
 
