@@ -72,11 +72,15 @@ def save_scene(path: Path, scene: Scene, replace: bool = False, half: bool = Fal
 
 
 def load_scene(path: Path, clean: Clean = Gaussians.checked) -> Scene:
-    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta, changed ones `edited`."""
+    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta, changed ones `edited`.
+
+    An edit whose layer was deleted is undone; ValueError where one is damaged, or its layer lacks a file.
+    """
     meta = read_metadata(path)
     with open_stage(path / "scene.usda") as stage:
         if RECORDED in list(stage.GetRootLayer().subLayerPaths) and not (path / RECORDED).is_file():
             raise FileNotFoundError(f"{path} lacks what was recorded: {path / RECORDED} is missing")
+        _check_edits(stage, path)
         return _read_scene(stage, path, meta, clean)
 
 
@@ -145,6 +149,18 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
         told = json.loads(data.get("sidestep_edit", "{}")) if layer else {"missing": True}
         out.append({**told, "name": Path(sub).stem})
     return out
+
+
+def _check_edits(stage: Usd.Stage, path: Path) -> None:
+    """ValueError where an edit's layer is there, and USD left it or one below it out."""
+    root = stage.GetRootLayer()
+    for sub in (s for s in root.subLayerPaths if s != RECORDED and (path / s).exists()):
+        layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
+        below = {path / "edits" / s: Sdf.Layer.Find(layer.ComputeAbsolutePath(s)) for s in layer.subLayerPaths} if layer else {}
+        for file in (file for file, found in {path / sub: layer, **below}.items() if not found):
+            how, name = "damaged" if file.exists() else "missing", Path(sub).stem
+            fix = f"restore it, or undo the edit: sidestep edit {path} --undo {name}"
+            raise ValueError(f"{file} is {how}, so the edit {name} cannot be applied; {fix}")
 
 
 def defines(layers: Iterable[Sdf.Layer], prim: Usd.Prim) -> bool:

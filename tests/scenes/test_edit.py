@@ -1,5 +1,6 @@
 """Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
 
+import os
 import shutil
 from dataclasses import replace
 
@@ -251,6 +252,28 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     after = load(saved)
     assert [a.track for a in after.actors][-2:] == ["a", "b"]
     assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
+
+
+@pytest.mark.parametrize(
+    ("file", "left", "said"),
+    [
+        ("mine.usda", 300, "mine.usda is damaged"),
+        ("mine.usda", 0, "mine.usda is damaged"),
+        ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
+        ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
+    ],
+)
+def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, left, said):
+    add_change(saved, "mine", load(saved), ALL, {})
+    if left is None:
+        (saved / "edits" / file).unlink()
+    else:
+        os.truncate(saved / "edits" / file, left)
+    with pytest.raises(ValueError, match=f"{said}.*restore it, or undo the edit: sidestep edit {saved} --undo mine"):
+        load(saved)
+    assert any(said in problem for problem in validate(saved)) and not any("deleted" in problem for problem in validate(saved))
+    undo(saved, "mine")
+    same(load(saved), busy())
 
 
 def put_in(scene, name="new"):
