@@ -147,6 +147,18 @@ def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
     assert "the edit edit removed it; --undo edit brings it back" in errors
 
 
+def test_undoing_and_changing_at_once_is_all_or_nothing(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    street = str(tmp_path / "street")
+    door(["edit", street, "--shift", "veh_1=0m,1m", "--name", "aside"])
+    _, errors = door(["edit", street, "--undo", "aside", "--remove", "veh_2"], 1)
+    assert 'actor "veh_2" is not in' in errors and [e["name"] for e in load(street).meta["edits"]] == ["aside"]
+    door(["edit", street, "--undo", "aside", "--shift", "veh_1=0m,2m", "--name", "aside"])
+    door(["edit", street, "--retime", "veh_1=+0.1s", "--name", "late"])
+    out, _ = door(["edit", street, "--undo", "aside"])
+    assert "as it was without aside; but late still moves veh_1 from where aside had put it: undo that too, and give it anew" in out
+
+
 def test_an_asset_can_follow_a_csv(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.5,15,0\n")
@@ -239,6 +251,7 @@ DATA = [
     ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
     (["edit", "street", "--remove", "veh_2"], 'actor "veh_2" is not in street; it has veh_1. Did you mean veh_1?'),
     (["edit", "street", "--undo", "edit"], 'edit "edit" is not in street'),
+    (["edit", "stret", "--remove", "veh_1"], "stret does not exist. Did you mean street?"),
     (["assets", "show", "cra/0001", "--databank", "bank"], "Did you mean car/0001?"),
     (["enhance", "street/metadata.json", "-o", "x.mp4"], "street/metadata.json cannot be decoded as video"),
     (["enhance", "gone.mp4", "-o", "x.mp4"], "gone.mp4"),

@@ -16,7 +16,7 @@ from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
 from scenes.usd import new_stage, usd_problems
-from scenes.usd_edit import add_change, add_edit, undo
+from scenes.usd_edit import add_change, add_edit, undo, undone
 from scenes.usd_root import RECORDED, add_sublayer
 
 
@@ -189,6 +189,39 @@ def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(s
         assert len(asset.gaussians) == len(VAN.gaussians) and rgb_from_sh(asset.gaussians.sh[:, 0]).mean() > 0.7
     undo(saved, "mine")
     same(load(saved), busy())
+
+
+def test_undoing_says_which_later_edits_go_on_from_where_it_put_an_actor(saved):
+    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0), "veh_3": (1.0, 0.0)}), {})
+    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
+    add_change(saved, "gone", load(saved), Edit(remove=("veh_3",)), {})
+    with undone(saved, ["shift"]) as (edit,):
+        assert edit.held == {"retime": ["veh_2"]}
+    assert float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3]) == pytest.approx(-2.0)
+    with undone(saved, ["gone", "retime"]) as edits:
+        assert [e.held for e in edits] == [{}, {}]
+    same(load(saved), busy())
+
+
+def test_an_edit_that_goes_with_a_later_one_leaves_nothing_of_it(saved):
+    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
+    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
+    with undone(saved, ["shift", "retime"]) as edits:
+        assert [e.held for e in edits] == [{}, {}]
+    same(load(saved), busy())
+
+
+def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
+    put_in(saved)
+    add_change(saved, "aside", load(saved), Edit(shift={"new": (1.0, 0.0)}), {})
+    add_change(saved, "mine", load(saved), ALL, {})
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match='"veh_9" is not in'), undone(saved, ["new", "mine"]):
+        add_change(saved, "mine", load(saved), Edit(remove=("veh_9",)), {})
+    with pytest.raises(ValueError, match='edit "typo" is not in'), undone(saved, ["mine", "typo"]):
+        pass
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+    assert {p.name for p in saved.iterdir()} == {p.relative_to(saved).parts[0] for p in before}
 
 
 def shown(scene: Scene) -> torch.Tensor:
