@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -119,8 +119,17 @@ def edited(scene: Scene, edit: Edit) -> Scene:
     painted, colours = bared(scene, edit.remove)
     sh[painted] = colours
     hidden = replace(scene.background, gaussians=replace(splats, logit_opacities=logits, sh=sh))
-    left = [p for p in scene.meta.get("parked", []) if p["track"] not in edit.remove]
-    return replace(scene, actors=actors, background=hidden, meta={**scene.meta, **({"parked": left} if "parked" in scene.meta else {})})
+    return replace(scene, actors=actors, background=hidden, meta=unparked(scene.meta, edit.remove))
+
+
+def unparked(meta: Mapping, tracks: Collection[str]) -> dict:
+    """A scene's meta with the entries of these `parked` vehicles among `parked_once`: they are gone, but what shadows the street has beside
+    them still tells of the sun (scenes/light.py)."""
+    gone = [p for p in meta.get("parked", []) if p["track"] in tracks]
+    if not gone:
+        return dict(meta)
+    left = [p for p in meta["parked"] if p["track"] not in tracks]
+    return {**meta, "parked": left, "parked_once": [*meta.get("parked_once", []), *gone]}
 
 
 def parked(scene: Scene) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:

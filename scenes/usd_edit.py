@@ -70,7 +70,8 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
 
     A removed actor becomes inactive, and the splats of a removed parked vehicle transparent, the street below it
     as beside it; another one's path and asset are outweighed;
-    `edited` in their asset's meta names the edit. An edit stands on what it found: of two that change the same actor, the later one counts.
+    `edited` in their asset's meta names the edit, and `remove` in its own meta who is gone.
+    An edit stands on what it found: of two that change the same actor, the later one counts.
     Raises as `add_edit` and `check_edit`.
     """
     path = Path(path)
@@ -105,7 +106,7 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
         if hidden or len(painted):
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
-    _write(path, name, meta, files, author)
+    _write(path, name, {**meta, "remove": list(edit.remove)} if edit.remove else meta, files, author)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, Vt
 from scenes.asset import Actor
 from scenes.atomic import atomic_folder
 from scenes.camera import RigCamera
+from scenes.edit import unparked
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.hdr import load_hdr, save_hdr
@@ -104,6 +105,7 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
     edits = read_edits(stage)
     if edits:
         own_meta["edits"] = edits
+        own_meta = unparked(own_meta, [track for edit in edits for track in edit.get("remove", ())])
     return Scene(
         Placed(splats, local_pose(background)),
         tuple(_load_actor(p, path, origin, clean) for p in _actor_prims(stage, [e["name"] for e in edits])),

@@ -58,7 +58,7 @@ def test_an_edit_on_disk_does_what_it_does_in_memory(saved):
     after = load(saved)
     same(after, edited(busy(), ALL))
     assert [a.asset.meta.get("edited") for a in after.actors] == ["mine", "mine"]
-    assert after.meta["edits"] == [{"kind": "edit", "name": "mine"}]
+    assert after.meta["edits"] == [{"kind": "edit", "remove": ["veh_1"], "name": "mine"}]
 
 
 def test_an_edit_is_undone_by_deleting_its_layer_and_tidied_up_by_undo(saved):
@@ -128,11 +128,15 @@ def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path
     add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(remove=("veh_7",)), {})
     after = load(tmp_path / "s1")
     same(after, edited(scene, Edit(remove=("veh_7",))))
+    assert after.meta["parked"] == [] == edited(scene, Edit(remove=("veh_7",))).meta["parked"]
+    with pytest.raises(ValueError, match="veh_7 is not in street any more: the edit mine removed it"):
+        add_change(tmp_path / "s1", "again", after, Edit(remove=("veh_7",)), {})
     hidden = edited(scene, Edit(remove=("veh_7",))).background.gaussians.logit_opacities == HIDDEN
     own = torch.arange(len(hidden)) >= len(busy().background.gaussians)
     assert (hidden[own] | (scene.background.gaussians.means[own][:, 2] <= 0.08)).all() and not hidden[~own].any()
     undo(tmp_path / "s1", "mine")
     same(load(tmp_path / "s1"), scene)
+    assert load(tmp_path / "s1").meta["parked"] == scene.meta["parked"]
 
 
 @pytest.mark.parametrize(("by", "said"), [(0, None), (300_000, "0.2s to 1.1s only"), (20_000_000, "of a drive of 0.8s: never")])
