@@ -212,6 +212,9 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
     if not scene.rig:
         yield f"{where}: there is no camera"
     for name, camera in scene.rig.items():
+        if (camera.times_us.diff() <= 0).any():
+            at = int((camera.times_us.diff() <= 0).nonzero()[0]) + 1
+            yield f"{where}: the times of camera {name} must rise, but frame {at} is taken no later than the one before"
         early = [int(t) for t in camera.times_us if not scene.ego.covers(int(t))]
         if early:
             yield f"{where}: camera {name} took {len(early)} frames when the body's pose is unknown, the first at {early[0]} us"

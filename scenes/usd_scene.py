@@ -98,6 +98,7 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
         origin, model = int(meta["origin_us"]), SplatModel(**meta["model"])
         rig = {name: _load_camera(stage, entry, name) for name, entry in meta["cameras"].items()}
         own_meta = dict(meta["meta"])
+        _check_parked(own_meta.get("parked", []), path / "metadata.json")
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path / 'metadata.json'} is corrupt: {type(error).__name__} {error}") from error
     background = _prim(stage, "/World/Background", path)
@@ -116,6 +117,19 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
         _load_ground(stage, path),
         own_meta,
     )
+
+
+def _check_parked(entries: list[dict], file: Path) -> None:
+    """ValueError where an entry of a scene's `parked` vehicles is no box of finite numbers with a track and a label."""
+    for i, entry in enumerate(entries):
+        try:
+            named = isinstance(entry["track"], str) and isinstance(entry["label"], str)
+            box = *np.asarray(entry["size"], float).reshape(3), *np.asarray(entry["world_from_box"], float).reshape(16)
+        except (KeyError, TypeError, ValueError):
+            named, box = False, ()
+        if not named or not np.isfinite(box).all():
+            needs = "a track, a label, a size of 3 and a world_from_box of 4x4 finite numbers"
+            raise ValueError(f"{file} is corrupt: entry {i} of parked needs {needs}; restore the file, or take the entry out")
 
 
 def is_scene(path: Path) -> bool:
