@@ -48,10 +48,13 @@ class MeshFit:
 def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0) -> Mesh:
     """A mesh file in the frame of an asset: x forward, z up, metres, origin at the base centre of its box.
 
-    up, forward: the file's own axes, as "y", "-z"; glTF's are y and z. ValueError for a file without triangles or axes that are not two.
+    up, forward: the file's own axes, as "y", "-z"; glTF's are y and z. ValueError for a file without triangles that can be seen, for
+    values that are not finite, and for axes that are not two.
     """
     import trimesh
 
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give one mesh file of it, as {path / 'car.glb'}")
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
@@ -63,17 +66,17 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     parts: list[trimesh.Trimesh] = [p for p in found if isinstance(p, trimesh.Trimesh) and len(p.faces)]
     if not parts:
         raise ValueError(f"{path} holds no triangles")
+    if not all(np.isfinite(p.vertices).all() for p in parts):
+        raise ValueError(f"{path} has vertices that are not finite")
     turn = turn_to_asset(up, forward)
     vertices = [p.vertices @ turn.T * scale for p in parts]
-    if not all(np.isfinite(v).all() for v in vertices):
-        raise ValueError(f"{path} has vertices that are not finite")
     low, high = np.concatenate(vertices).min(0), np.concatenate(vertices).max(0)
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     starts = np.cumsum([0, *(len(v) for v in vertices)])
     # copies, as dump makes them, have lost the vertex colours that come on top of a material
     visuals = [loaded.geometry[p.metadata["name"]].visual if isinstance(loaded, trimesh.Scene) else p.visual for p in parts]
     looks = [_look(v, p.faces, path.suffix.lower() in GLTF) for v, p in zip(visuals, parts, strict=True)]
-    return Mesh(
+    mesh = Mesh(
         vertices=(np.concatenate(vertices) - base).astype(np.float32),
         faces=np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=False)]).astype(np.int32),
         normals=np.concatenate([(p.vertex_normals @ turn.T)[p.faces] for p in parts]),
@@ -82,6 +85,19 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
         texture=np.concatenate([np.full(len(p.faces), i) for i, p in enumerate(parts)]),
         textures=tuple(t for _, _, t in looks),
     )
+    _check_seen(mesh, path)
+    return mesh
+
+
+def _check_seen(mesh: Mesh, path: Path) -> None:
+    """ValueError where nothing of a mesh can be seen, or cannot be told."""
+    for what, values in {"normals": mesh.normals, "texture coordinates": mesh.uvs, "vertex colours": mesh.tints}.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{path} has {what} that are not finite; export it again, without them or with whole ones")
+    if not _areas(mesh).any():
+        raise ValueError(f"{path} has no triangle of any area; export it again, with its surface")
+    if not len(_sampled(mesh, 4000)):
+        raise ValueError(f"{path} is see-through all over: its materials have no alpha of {mesh.opaque_from} or more; make them opaque")
 
 
 def turn_to_asset(up: str, forward: str) -> np.ndarray:
@@ -158,15 +174,20 @@ def _in_the_open(splats: Gaussians, blockers: Blockers) -> torch.Tensor:
     return (sides[0] > 0.01) | (sides[1] > 0.01)
 
 
+def _areas(mesh: Mesh) -> np.ndarray:
+    """Square metres `[F]` of a mesh's faces."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+
+
 def _sampled(mesh: Mesh, count: int) -> Gaussians:
     """Splats evenly over all of a mesh's surface that is not see-through."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(a, b)
-    area = np.linalg.norm(cross, axis=1) / 2
-    ends = np.cumsum(area)
+    ends = np.cumsum(_areas(mesh))
     # even steps along the area, and within a triangle the R2 sequence (Roberts 2018): as even as random, without its clumps
-    face = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1]).clip(0, len(area) - 1)
+    face = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1]).clip(0, len(ends) - 1)
     u, v = np.modf(np.arange(count) * 0.7548776662466927)[0], np.modf(np.arange(count) * 0.5698402909980532)[0]
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)

@@ -15,6 +15,7 @@ from scenes.harmonics import rgb_from_sh
 from scenes.poses import matrix_from_quat
 
 SIZE = (4.0, 1.8, 1.5)  # length, width, height
+PBR = trimesh.visual.material.PBRMaterial
 
 
 def write_box(path: Path, inner: bool = False) -> Path:
@@ -137,6 +138,39 @@ def test_a_file_that_is_no_mesh_says_so(tmp_path):
         read_mesh(tmp_path / "a.glb")
     with pytest.raises(FileNotFoundError):
         read_mesh(tmp_path / "b.glb")
+    with pytest.raises(ValueError, match="is a folder; give one mesh file of it"):
+        read_mesh(tmp_path)
+
+
+def wide_box(path: Path, uv: float, **material) -> Path:
+    box = trimesh.creation.box((1.8, 1.5, 4.2))
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), uv), material=PBR(**material))
+    trimesh.Scene([box]).export(path)
+    return path
+
+
+def test_what_cannot_be_seen_is_refused_before_it_is_fitted(tmp_path):
+    from PIL import Image
+
+    file, picture = tmp_path / "car.glb", Image.new("RGB", (4, 4), (188, 30, 30))
+    with pytest.raises(ValueError, match="car.glb has texture coordinates that are not finite"):
+        read_mesh(wide_box(file, float("nan"), baseColorTexture=picture))
+    with pytest.raises(ValueError, match="car.glb is see-through all over"):
+        read_mesh(wide_box(file, 0.5, baseColorFactor=[255, 255, 255, 0], alphaMode="BLEND"))
+    line = np.array([[-0.9, 0, -2], [0.9, 1.5, 2], [0, 0.75, 0]])
+    trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "line.glb")
+    with pytest.raises(ValueError, match="line.glb has no triangle of any area"):
+        read_mesh(tmp_path / "line.glb")
+
+
+@pytest.mark.filterwarnings("error")
+def test_vertices_that_are_not_finite_are_refused_without_further_words(tmp_path):
+    box = trimesh.creation.box((1.8, 1.5, 4.2))
+    vertices = box.vertices.copy()
+    vertices[0] = np.inf
+    trimesh.Trimesh(vertices, box.faces, process=False).export(tmp_path / "car.ply")
+    with pytest.raises(ValueError, match="car.ply has vertices that are not finite"):
+        read_mesh(tmp_path / "car.ply")
 
 
 def _textures(path: Path) -> np.ndarray:
@@ -194,9 +228,6 @@ def gltf_box(path: Path, material=None, colours=None) -> Path:
     return path
 
 
-PBR = trimesh.visual.material.PBRMaterial
-
-
 @pytest.mark.parametrize(
     ("material", "colours", "seen"),
     [
@@ -205,7 +236,7 @@ PBR = trimesh.visual.material.PBRMaterial
         ({}, [128, 26, 255, 255], [188, 90, 255, 255]),
         (None, [128, 26, 255, 0], [188, 90, 255, 255]),
         ({"baseColorFactor": [128, 128, 128, 255]}, [128, 128, 128, 0], [137, 137, 137, 255]),
-        ({"baseColorFactor": [255, 255, 255, 128], "alphaMode": "BLEND"}, [255, 255, 255, 128], [255, 255, 255, 64]),
+        ({"baseColorFactor": [255, 255, 255, 204], "alphaMode": "BLEND"}, [255, 255, 255, 204], [255, 255, 255, 163]),
     ],
     ids=["no factor", "no material", "colours", "colours without a material", "opaque", "blended"],
 )
