@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import torch
 
 from scenes.asset import Asset
-from scenes.databank import Databank, Entry
+from scenes.databank import Databank, Entry, read_entry
 from scenes.files import as_is, kind_of, read, splats_of
 from scenes.formats import USD, found
 from scenes.formats.trained import model_of
@@ -242,9 +242,10 @@ def _databank_problems(path: Path, clean: Callable[[Gaussians, str], Gaussians])
         lost = _missing(path, entry)
         yield from (f"{entry.id} lacks its file {file}" for file in lost)
         file = path / entry.asset
-        if file in lost:
+        if {file, file.with_name("asset.json")} & set(lost):
             continue
         try:
+            read_entry(file.with_name("asset.json"))
             asset = bank.load(entry.id, clean)
         except (ValueError, OSError) as error:
             yield str(error)
@@ -268,7 +269,8 @@ def _photo_problems(asset: Asset, where: str) -> Iterator[str]:
 
 
 def _missing(bank: Path, entry: Entry) -> list[Path]:
-    return [bank / file for file in (entry.asset, entry.thumb) if file and not (bank / file).is_file()]
+    told = str(PurePosixPath(entry.asset).with_name("asset.json"))
+    return [bank / file for file in (entry.asset, told, entry.thumb) if file and not (bank / file).is_file()]
 
 
 def _usd_files(path: Path) -> list[Path]:

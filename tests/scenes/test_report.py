@@ -112,6 +112,13 @@ def test_missing_and_foreign_files_are_problems(saved, bank, tmp_path):
     assert all(len(validate(tmp_path / name)) == 1 for name in ("a.ply", "a.txt", "folder"))
 
 
+def test_an_assets_own_entry_that_is_lost_or_empty_is_a_problem(bank):
+    (bank / "assets/car/0001/asset.json").write_text("{}")
+    (bank / "assets/bus/0001/asset.json").unlink()
+    lost, corrupt = validate(bank)
+    assert lost == f"bus/0001 lacks its file {bank / 'assets/bus/0001/asset.json'}" and "car/0001/asset.json is corrupt" in corrupt
+
+
 def test_an_index_that_disagrees_with_an_asset_is_a_problem(bank):
     index = bank / "index.json"
     index.write_text(index.read_text().replace('"splats": 6', '"splats": 7'))
