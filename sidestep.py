@@ -71,7 +71,8 @@ class Insert:
     path: Way = "straight"
     """Straight on, or in a lane beside the recorded path, to which --yaw then is relative; yaw 180deg is oncoming traffic."""
     trajectory: FileOrNone = None
-    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw and --speed: seconds after --start, metres forward and left."""
+    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw, --speed and --path: seconds after --start, metres forward and
+    left."""
     start: Time = 0
     """When the place holds, after the drive's first moment."""
     databank: Path = Path("databank")
@@ -80,6 +81,8 @@ class Insert:
     def run(self) -> None:
         if (self.at is None) == (self.trajectory is None):
             raise UsageError("say where the asset goes with --at X,Y, as --at 20m,-3.5m, or with --trajectory t.csv; one of the two")
+        if self.trajectory is not None and (self.yaw or self.speed or self.path != "straight"):
+            raise UsageError("--trajectory says it all, also where the asset heads and how fast; leave --yaw, --speed and --path out")
         from scenes import Databank
         from scenes.insert import insert
         from scenes.seen import seeing, unseen_warning

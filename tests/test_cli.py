@@ -216,6 +216,8 @@ USAGE = [
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
     ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
     ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
+    ([*INSERT, "--trajectory", "t.csv", "--speed", "5m/s"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
+    ([*INSERT, "--trajectory", "t.csv", "--path", "lane"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
     (["assets", "lst"], "lst", "list"),
     (["edit", "street"], "say what to change", "--remove veh_12"),
     (["edit", "street", "--shift", "veh_1"], "--shift", "as veh_3=0m,1.5m"),
