@@ -62,6 +62,21 @@ def test_odd_sizes_gain_the_row_and_column_that_h264_needs(tmp_path, enhancer):
     assert next(iter(read_video(tmp_path / "out.mp4"))).shape == (20, 34, 3)
 
 
+def test_that_the_sound_is_left_out_is_said_with_how_to_put_it_back(tmp_path, enhancer, capsys):
+    with av.open(str(tmp_path / "in.mp4"), "w") as container:
+        sound, picture = container.add_stream("aac", rate=48_000), container.add_stream("libx264", rate=10)
+        picture.width, picture.height, picture.pix_fmt = 48, 32, "yuv420p"
+        silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        silence.sample_rate = 48_000
+        for stream, frame in ((sound, silence), (picture, av.VideoFrame.from_ndarray(np.full((32, 48, 3), 90, np.uint8), format="rgb24"))):
+            container.mux([*stream.encode(frame), *stream.encode(None)])
+    enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer)
+    told = capsys.readouterr().err
+    assert told.count("is without the sound of") == 1 and f"-i {tmp_path / 'in.mp4'} -map 0:v -map 1:a" in told
+    enhance_video(tmp_path / "out.mp4", tmp_path / "again.mp4", enhancer)
+    assert "without the sound" not in capsys.readouterr().err
+
+
 def test_an_undecodable_clip_is_refused_and_leaves_nothing(tmp_path, enhancer):
     (tmp_path / "in.mp4").write_bytes(b"no video at all" * 50)
     with pytest.raises(ValueError, match="in.mp4"):
