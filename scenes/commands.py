@@ -78,6 +78,8 @@ class Convert:
     """Replace an existing file."""
 
     def run(self) -> None:
+        if self.target.exists() and not self.overwrite:
+            raise FileExistsError(f"{self.target} exists; give -w to replace it, or another name as the second")  # there is no -o here
         fresh(self.target, self.overwrite)
         from scenes.convert import convert
         from scenes.formats.trained import model_of
@@ -125,6 +127,7 @@ class Edit:
         """Write the edit's layer; what to warn of, and what was done."""
         from scenes import Databank
         from scenes import edit as edits
+        from scenes.astray import astray
         from scenes.match import other_model
         from scenes.usd_edit import add_change, free_name
 
@@ -139,7 +142,7 @@ class Edit:
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
         layer = self.scene / "edits" / f"{name}.usda"
         done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
-        return [*others, *edits.absences(edit, scene)], [done]
+        return [*others, *astray(edit, scene), *edits.absences(edit, scene)], [done]
 
 
 def _without(scene: Path, edit: Undone) -> str:

@@ -10,6 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
+from scenes.astray import astray
 from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
@@ -137,6 +138,12 @@ def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path
     undo(tmp_path / "s1", "mine")
     same(load(tmp_path / "s1"), scene)
     assert load(tmp_path / "s1").meta["parked"] == scene.meta["parked"]
+
+
+@pytest.mark.parametrize(("by", "said"), [(5.0, []), (30.0, ["13.5 m"]), (1e30, ["1e+30 m"])])
+def test_it_is_said_when_an_actor_is_shifted_off_the_known_ground(by, said):
+    told = astray(Edit(shift={"veh_1": (0.0, -by), "veh_2": (1.0, 0.0)}), busy())
+    assert [f"veh_1 is shifted {far} beyond the known ground and keeps the height of its edge there" for far in said] == told
 
 
 @pytest.mark.parametrize(("by", "said"), [(0, None), (300_000, "0.2s to 1.1s only"), (20_000_000, "of a drive of 0.8s: never")])
