@@ -151,7 +151,8 @@ class Render:
             raise UsageError(f"--weights {self.weights} would do nothing without --enhance; add it, or leave --weights out")
         from render.aside import shift_warning
         from render.clip import clip_cameras, clip_times, cut_warning
-        from render.record import record
+        from render.record import record, stale_warning
+        from render.video import odd_warning
         from scenes import Databank
         from scenes.files import kind_of
         from scenes.insert import insert
@@ -174,6 +175,8 @@ class Render:
             witnesses = seeing(result.actor, cameras)
             warnings += absence_warning(result.actor, cameras, witnesses)
             warnings += unseen_warning(result.actor, witnesses)
+        warnings += odd_warning(self.output, *(self.size or (cameras[0].width, cameras[0].height)))
+        warnings += stale_warning(self.output, self.outputs)
         warn(warnings)
         width, height = self.size or (None, None)
         stages: Stages = {}

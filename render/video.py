@@ -140,6 +140,14 @@ def read_video(path: str | os.PathLike) -> Video:
     return Video(path)
 
 
+def odd_warning(path: str | os.PathLike, width: int, height: int) -> list[str]:
+    """What to tell of a video whose sides in pixels are not even: a sentence, or none."""
+    if width % 2 == height % 2 == 0:
+        return []
+    size = f"{width + width % 2}x{height + height % 2}"
+    return [f"{path} has {size} pixels for {width}x{height}: H.264 needs even sides, so a last row or column is there twice"]
+
+
 class VideoWriter:
     """Writes H.264 in yuv420p, BT.709, frame by frame; the file appears whole when the block ends, or not at all.
 

@@ -350,7 +350,7 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     out, _ = door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.spz")])
     assert "a.spz: " in out and "bytes each; off by at most" in out
     errors = door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "a.spz")], 1)[1]
-    assert "a.spz exists; give -w" in errors and "-o" not in errors
+    assert "a.spz exists; give -w to replace it, or another name as the second" in errors
     door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.compressed.ply")])
     assert json.loads(door(["info", str(tmp_path / "b.compressed.ply"), "--json"])[0])["format"] == "compressed PLY"
     assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]
@@ -410,6 +410,16 @@ def test_existing_outputs_are_replaced_with_w(door, tmp_path):
     assert not (tmp_path / "out.mp4").exists()
     door([*words, "-w"])
     assert json.loads((tmp_path / "out.json").read_text())["size"] == [32, 18]
+
+
+def test_what_a_new_clip_does_not_replace_or_widens_is_said(door, tmp_path):
+    words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--duration", "100ms", "-w"]
+    assert "warning" not in door([*words, "--size", "32x18", "--outputs", "rgb"])[1]
+    _, errors = door([*words, "--size", "33x17"])
+    assert "out.mp4 has 34x18 pixels for 33x17: H.264 needs even sides" in errors
+    assert f"{tmp_path / 'out'} holds frames of an earlier clip, not of this out.mp4; --outputs" in errors
+    assert len(json.loads((tmp_path / "out.json").read_text())["warnings"]) == 2
+    assert "warning" not in door([*words, "--size", "32x18", "--outputs", "rgb"])[1]
 
 
 def begin(folder: Path, desk: Path) -> subprocess.Popen:
