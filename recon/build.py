@@ -29,6 +29,7 @@ from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.skies import seen_sky
+from recon.sound import check_path
 from recon.start import Start, prepare
 from recon.tracks import LIMBED
 from render.progress import Progress
@@ -98,6 +99,7 @@ def reconstruct(
     output = check_free(output, resume, overwrite)
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
+    check_path(log, span)
     size, config = size or fit_size(log, names), config or fit_config(log, names, span)
     check_size(size)
     if size[0] > (first := log.camera(names[0])).width or size[1] > first.height:
@@ -107,6 +109,9 @@ def reconstruct(
     checkpoint = checkpoint_path(output)
     saved = load_checkpoint(checkpoint, options) if resume else None
 
+    within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
+    for sweep in within:
+        sweep.read()  # they are used after the fit: a damaged one is told before it
     log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size)
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
@@ -135,7 +140,6 @@ def reconstruct(
     scene.meta["held_out"] = rows
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(seconds(), 1), "live": live.curve}
     print(table_text(rows), file=sys.stderr)
-    within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     if within:
         scene.meta["off_path"] = off_path_table(there, log, within)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)

@@ -16,6 +16,9 @@ REACH = 60.0
 CLOSE = 4.0
 """Metres from the path within which the ground is as far below it as everywhere else."""
 
+MOST = 4_000_000
+"""Cells of a height field: of a drive across more than a kilometre each way they are larger."""
+
 RING = 2.0
 """Metres by which what is known to be ground grows outwards at a time."""
 
@@ -35,42 +38,43 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     """
     path = ego.world_from_body[:, :3, 3].numpy()
     low, high = path[:, :2].min(0) - REACH, path[:, :2].max(0) + REACH
-    shape = tuple(int(n) for n in np.ceil((high - low) / CELL)[::-1] + 1)
-    distance, level = _beside(path, low, shape)
+    cell = max(CELL, float(np.sqrt((high - low).prod() / MOST)))
+    shape = tuple(int(n) for n in np.ceil((high - low) / cell)[::-1] + 1)
+    distance, level = _beside(path, low, shape, cell)
     heights = np.full(shape, np.nan)
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
-    column, row = np.round((points[:, :2] - low) / CELL).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
+    column, row = np.round((points[:, :2] - low) / cell).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
     near = np.abs(points[:, 2] - level[row, column]) < 4 + STEEPEST * distance[row, column]
-    points, cell = points[near], (row * shape[1] + column)[near]
+    points, place = points[near], (row * shape[1] + column)[near]
     if len(points):
-        order = np.lexsort((points[:, 2], cell))
-        cells, first, counts = np.unique(cell[order], return_index=True, return_counts=True)
+        order = np.lexsort((points[:, 2], place))
+        cells, first, counts = np.unique(place[order], return_index=True, return_counts=True)
         heights.flat[cells] = points[order, 2][first + (counts * 0.05).astype(np.int64)]
     off = heights - level
     close = np.isfinite(off) & (distance < CLOSE)
     known = off[close] if close.any() else off[np.isfinite(off)]
     level = level + (float(np.percentile(known, 30)) if len(known) else 0.0)
     # what is filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
-    heights = level + _filled(_without_objects(heights - level, distance), 0.0)
-    return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), CELL)
+    heights = level + _filled(_without_objects(heights - level, distance, cell), 0.0, cell)
+    return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
 
 
-def _beside(path: np.ndarray, low: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _beside(path: np.ndarray, low: np.ndarray, shape: tuple[int, ...], cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Each cell's distance from the path in metres, and the path's height where it is nearest."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
     moving = np.concatenate([[True], np.diff(way) > 1e-6])  # np.interp wants a way that rises
-    at = np.linspace(0.0, way[-1], max(2, int(2 * way[-1] / CELL)))
+    at = np.linspace(0.0, way[-1], max(2, int(2 * way[-1] / cell)))
     fine = np.stack([np.interp(at, way[moving], path[moving, k]) for k in range(3)], 1)
-    column, row = np.round((fine[:, :2] - low) / CELL).astype(np.int64).T
+    column, row = np.round((fine[:, :2] - low) / cell).astype(np.int64).T
     count, total = np.zeros(shape), np.zeros(shape)
     np.add.at(count, (row, column), 1)
     np.add.at(total, (row, column), fine[:, 2])
     distance, nearest = ndimage.distance_transform_edt(count == 0, return_indices=True)
     level = total / np.maximum(count, 1)
-    return distance * CELL, level[tuple(nearest)]
+    return distance * cell, level[tuple(nearest)]
 
 
-def _without_objects(heights: np.ndarray, distance: np.ndarray) -> np.ndarray:
+def _without_objects(heights: np.ndarray, distance: np.ndarray, cell: float) -> np.ndarray:
     """Drop cells that are not road or pavement: grow outwards from the path, where the ground is about 0."""
     there = np.isfinite(heights)
     ground = there & (distance < CLOSE) & (np.abs(heights) < STEP)
@@ -78,25 +82,25 @@ def _without_objects(heights: np.ndarray, distance: np.ndarray) -> np.ndarray:
         ring = there & (distance >= outer) & (distance < outer + RING)
         if not ring.any():
             continue
-        guess, weight = _averages(ground, heights, 2.5)
+        guess, weight = _averages(ground, heights, 2.5, cell)
         slack, alone = np.full(heights.shape, STEP), weight <= 1e-3
         if (ring & alone).any():  # nothing is known around: what is wider around, and the farther from the path the less surely
-            wider, weight = _averages(ground, heights, 10.0)
+            wider, weight = _averages(ground, heights, 10.0, cell)
             guess = np.where(alone, np.where(weight > 1e-4, wider, 0.0), guess)
             slack = np.where(alone, STEP + 0.04 * distance, STEP)
         ground |= ring & (np.abs(heights - guess) < slack)
-    smooth = _filled(np.where(ground, heights, np.nan), 0.0, start=2.5)
+    smooth = _filled(np.where(ground, heights, np.nan), 0.0, cell, start=2.5)
     return np.where(ground & (np.abs(heights - smooth) < 0.3), heights, np.nan)
 
 
-def _averages(known: np.ndarray, values: np.ndarray, metres: float) -> tuple[np.ndarray, np.ndarray]:
+def _averages(known: np.ndarray, values: np.ndarray, metres: float, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Gaussian averages of the known cells, and what part of its window each is made of."""
-    weight = ndimage.gaussian_filter(known.astype(np.float32), metres / CELL, mode="nearest", truncate=3)
-    mean = ndimage.gaussian_filter(np.where(known, values, 0.0).astype(np.float32), metres / CELL, mode="nearest", truncate=3)
+    weight = ndimage.gaussian_filter(known.astype(np.float32), metres / cell, mode="nearest", truncate=3)
+    mean = ndimage.gaussian_filter(np.where(known, values, 0.0).astype(np.float32), metres / cell, mode="nearest", truncate=3)
     return mean / np.maximum(weight, 1e-9), weight
 
 
-def _filled(heights: np.ndarray, default: float, start: float = 0.7) -> np.ndarray:
+def _filled(heights: np.ndarray, default: float, cell: float, start: float = 0.7) -> np.ndarray:
     """Gaps (and noise) filled by averages of known cells over 0.7 m, 1.4 m, ... 12 m, and beyond by the nearest filled cell."""
     known = np.isfinite(heights)
     if not known.any():
@@ -104,7 +108,7 @@ def _filled(heights: np.ndarray, default: float, start: float = 0.7) -> np.ndarr
     out = np.full(heights.shape, np.nan)
     metres = start
     while np.isnan(out).any() and metres < 12:
-        mean, weight = _averages(known, heights, metres)
+        mean, weight = _averages(known, heights, metres, cell)
         take = np.isnan(out) & (weight > 0.05)
         out[take] = mean[take]
         metres *= 2

@@ -14,7 +14,7 @@ import torch
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import Lens
 from scenes.names import unknown
-from scenes.poses import interpolate, inverse
+from scenes.poses import interpolate, inverse, nearest_rotation
 from scenes.trajectory import Trajectory
 
 FETCH = "fetch the file again"
@@ -208,9 +208,7 @@ def lengthened(times_us: np.ndarray, poses: torch.Tensor) -> Trajectory:
 
 
 def mean_pose(poses: torch.Tensor) -> torch.Tensor:
-    """The mean of nearby poses `[F, 4, 4]`: mean position, and the rotation nearest to the mean matrix (by SVD)."""
-    u, _, v = torch.linalg.svd(poses[:, :3, :3].mean(0))
-    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ v))], dtype=torch.float64)) @ v
+    """The mean of nearby poses `[F, 4, 4]`: mean position, and the rotation nearest to the mean matrix."""
     out = torch.eye(4, dtype=torch.float64)
-    out[:3, :3], out[:3, 3] = rotation, poses[:, :3, 3].mean(0)
+    out[:3, :3], out[:3, 3] = nearest_rotation(poses[:, :3, :3].mean(0)), poses[:, :3, 3].mean(0)
     return out

@@ -78,7 +78,7 @@ def prepare(
     exposures: of the cameras, affine `[C, 3, 4]`, where they are known. ValueError where a drive has no lidar point in view.
     """
     rig = log.rig(dict(zip(frames.names, frames.sizes, strict=True)))
-    ego = body_path(log, frames, rig)
+    ego, driven = body_path(log, frames, rig), log.ego.within(span_us)
     sweeps = log.sweeps_within(span_us)
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
     told = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
@@ -88,13 +88,13 @@ def prepare(
     report("colouring points")
     sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
-        ground = estimate_ground(sparse.xyz, log.ego)
+        ground = estimate_ground(sparse.xyz, driven)
         gains = np.ones((len(frames.names), 3)) if told is None else told
         cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers, gains)
-        ground = estimate_ground(cloud.xyz, log.ego)
+        ground = estimate_ground(cloud.xyz, driven)
         beyond = Cloud.cat([])
     else:
-        ground = estimate_ground(split.static, log.ego)
+        ground = estimate_ground(split.static, driven)
         seen = colours(log, frames, split.static, taken, list(split.tracks))
         gains = first_exposures(seen) if told is None else told
         rgb = merged_colours(seen, gains)

@@ -26,6 +26,14 @@ def matrix_from_quat(quat: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, -1).reshape(*quat.shape[:-1], 3, 3)
 
 
+def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
+    """The rotations `[..., 3, 3]` nearest to matrices that are nearly some (Higham 1986, by SVD)."""
+    u, _, v = torch.linalg.svd(matrix)
+    last = torch.det(u @ v).sign()
+    flip = torch.stack([torch.ones_like(last), torch.ones_like(last), last], -1)
+    return (u * flip[..., None, :]) @ v
+
+
 def quat_from_matrix(rotation: torch.Tensor) -> torch.Tensor:
     """Unit quaternions wxyz `[..., 4]`, w >= 0, from rotations `[..., 3, 3]` (Shepperd's method: the largest term leads)."""
     m = rotation

@@ -92,6 +92,13 @@ class Trajectory:
         """`world_from_body` `[n, 4, 4]` at times int64 `[n]`, or at the nearest that are covered, as `near` gives them one by one."""
         return self.at_each(times_us.clamp(*self.span_us()))
 
+    def within(self, span_us: tuple[int, int]) -> Trajectory:
+        """The poses of a span of time, with the last one before it and the first after it."""
+        first = int(torch.searchsorted(self.times_us, int(span_us[0]), right=True)) - 1
+        last = int(torch.searchsorted(self.times_us, int(span_us[1])))
+        part = slice(min(max(first, 0), len(self) - 1), max(last, 0) + 1)
+        return Trajectory(self.times_us[part], self.world_from_body[part])
+
     def shifted(self, lateral: float = 0.0, vertical: float = 0.0, forward: float = 0.0) -> Trajectory:
         """Every pose moved by metres along its own body axes: forward x, left y, up z."""
         return replace(self, world_from_body=self.world_from_body @ translation(forward, lateral, vertical))

@@ -51,7 +51,8 @@ TILE = 0.1
 def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
     """The log with what moves in `sweeps` as its tracks, at the stamps of all its sweeps. `report` is called after each."""
     read = _read(sweeps)
-    ground = estimate_ground(np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for p in read.values()]), log.ego)
+    some = np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for p in read.values()])
+    ground = estimate_ground(some, log.ego.within((min(read), max(read))))
     images = [(t, range_image(_of(p, k), log.ego, log.lidars[k])) for t, p in read.items() for k in _known(p, log)]
     followed: list[Followed] = []
     asked: dict[int, np.ndarray] = {}

@@ -15,6 +15,7 @@ from recon.readers.pandaset import is_pandaset, read_pandaset
 from recon.readers.photos import is_photos, is_video, read_photos
 from recon.readers.waymo import is_waymo, read_waymo
 from recon.recorder import without_recorder
+from recon.sound import sound
 
 
 def open_log(
@@ -29,22 +30,24 @@ def open_log(
     are given to a log that has its own.
     """
     path = Path(path)
+    if path.name in ("", ".."):
+        path = path.resolve()  # what is found is kept beside it, under its name
     read = metric_reader(path)
     if read is not None:
         given = "--camera-height" if camera_height is not None else "--metres-per-unit" if metres_per_unit is not None else ""
         if given:
             raise ValueError(f"{path} is in metres already; leave out {given}, which is for COLMAP folders, photos and videos")
         _knows_its_lenses(path, angle_of_view)
-        return without_recorder(read(path))
+        return without_recorder(sound(read(path)))
     if is_video(path):
-        return read_photos(path, camera_height, metres_per_unit, angle_of_view)
+        return sound(read_photos(path, camera_height, metres_per_unit, angle_of_view))
     if not path.is_dir():
         raise FileNotFoundError(f"{path} is neither a folder nor a video; give the folder of one drive, as pandaset/002")
     if find_model(path) is not None:
         _knows_its_lenses(path, angle_of_view)
-        return read_colmap(path, camera_height, metres_per_unit)
+        return sound(read_colmap(path, camera_height, metres_per_unit))
     if is_photos(path):
-        return read_photos(path, camera_height, metres_per_unit, angle_of_view)
+        return sound(read_photos(path, camera_height, metres_per_unit, angle_of_view))
     if lacks_oxts(path):
         raise FileNotFoundError(f"{path / 'oxts'} is missing; it says where a KITTI drive's car was: fetch it too")
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))

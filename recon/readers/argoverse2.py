@@ -16,9 +16,10 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, lengthened
 from recon.readers.arrow import read_table
+from recon.readers.stated import posed, stating
 from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
-from scenes.poses import pose_from, translation
+from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
 FRONT = ("ring_front_center", "ring_front_left", "ring_front_right")
@@ -41,7 +42,9 @@ def read_argoverse2(path: Path) -> Log:
     where = path / "city_SE3_egovehicle.feather"
     table = read_table(where, ("timestamp_ns", *POSE))
     order = np.argsort(table["timestamp_ns"])
-    bodies = _poses(table)[torch.from_numpy(order)]
+    if not len(order):
+        raise ValueError(f"{where} has no row; fetch it again")
+    bodies = _poses(table, where)[torch.from_numpy(order)]
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())
     times, first = np.unique(_us(table["timestamp_ns"][order]), return_index=True)
@@ -49,8 +52,9 @@ def read_argoverse2(path: Path) -> Log:
 
     lens_keys = ("sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
     lenses = read_table(path / "calibration" / "intrinsics.feather", lens_keys)
-    mounts = read_table(path / "calibration" / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
-    mount_of = dict(zip(mounts["sensor_name"], _poses(mounts), strict=True))
+    mounted = path / "calibration" / "egovehicle_SE3_sensor.feather"
+    mounts = read_table(mounted, ("sensor_name", *POSE))
+    mount_of = dict(zip(mounts["sensor_name"], _poses(mounts, mounted), strict=True))
     cameras = {}
     for row, name in enumerate(lenses["sensor_name"]):
         files = _stamped(path / "sensors" / "cameras" / str(name), ".jpg")
@@ -58,8 +62,9 @@ def read_argoverse2(path: Path) -> Log:
         if not files:  # a log may come with some of its cameras only
             continue
         if name not in mount_of:
-            raise ValueError(f"{path / 'calibration/egovehicle_SE3_sensor.feather'} does not say where {name} stands")
-        lens = Pinhole(*(float(lenses[k][row]) for k in ("fx_px", "fy_px", "cx_px", "cy_px")))
+            raise ValueError(f"{mounted} does not say where {name} stands")
+        with stating(f"{path / 'calibration' / 'intrinsics.feather'}, {name}"):
+            lens = Pinhole(*(float(lenses[k][row]) for k in ("fx_px", "fy_px", "cx_px", "cy_px")))
         stamps = torch.tensor([t for t, _ in files])
         poses = ego.at_each(stamps) @ mount_of[name]
         size = int(lenses["width_px"][row]), int(lenses["height_px"][row])
@@ -83,9 +88,9 @@ def _us(nanoseconds: np.ndarray) -> np.ndarray:
     return (np.asarray(nanoseconds, dtype=np.int64) + 500) // 1000
 
 
-def _poses(table: dict[str, np.ndarray]) -> torch.Tensor:
+def _poses(table: dict[str, np.ndarray], path: Path) -> torch.Tensor:
     quats, places = (torch.from_numpy(np.stack([table[k] for k in keys], 1).astype(np.float64)) for keys in (POSE[:4], POSE[4:]))
-    return pose_from(quats, places)
+    return posed(quats, places, str(path))
 
 
 def _stamped(folder: Path, end: str) -> list[tuple[int, Path]]:
@@ -111,7 +116,7 @@ def _tracks(path: Path, ego: Trajectory) -> tuple:
     stamps = torch.from_numpy(_us(table["timestamp_ns"]))
     sizes = np.stack([table[k] for k in ("length_m", "width_m", "height_m")], 1).astype(np.float64)
     covered = ego.covers_each(stamps)
-    poses = ego.near_each(stamps) @ from_middles(_poses(table), sizes[:, 2])
+    poses = ego.near_each(stamps) @ from_middles(_poses(table, path), sizes[:, 2])
     found = []
     for uuid in dict.fromkeys(table["track_uuid"].tolist()):
         mine = np.flatnonzero((table["track_uuid"] == uuid) & covered.numpy())

@@ -1,13 +1,13 @@
 """Reads a COLMAP model with its pictures (Schönberger and Frahm 2016; the files as in COLMAP's doc/format.rst).
 
-A model has no clock: pictures follow each other half a second apart in the order of their names (and of the numbers in them), unless
-`times.json` beside the model's files gives microseconds by picture name. The body is the first camera, turned to x forward, y left, z up.
+A model has no clock: recon/readers/moments.py tells when its pictures were taken. The body is the first camera, turned to x forward, y
+left, z up.
 """
 
 from __future__ import annotations
 
-import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,14 +16,13 @@ import torch
 
 from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
-from recon.readers.order import recorded
+from recon.readers.moments import moments_of
 from recon.readers.sfm import Model, ModelCamera, is_model, read_model
+from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
 from scenes.poses import CAM_FROM_FLU
 from scenes.trajectory import Trajectory
-
-STEP_US = 500_000
 
 APART = 300.0
 """Metres between a picture and the next from which on a model is none of a place: nothing ties its pictures to each other."""
@@ -48,9 +47,9 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         raise FileNotFoundError(f"{path} holds no COLMAP model; it has cameras.bin, images.bin and points3D.bin, as in {path / 'sparse/0'}")
     model = read_model(where)
     names = camera_names(model)
-    moments = _moments(where, model)
-    poses = np.stack([np.linalg.inv(i.cam_from_world) for i in model.images])
     lead = _lead(model)
+    moments = moments_of(where, model, lead)
+    poses = np.stack([np.linalg.inv(i.cam_from_world) for i in model.images])
     gauge = find_gauge(poses[[i.camera == lead for i in model.images]], model.xyz, camera_height, metres_per_unit)
     placed = gauge.poses(poses)
 
@@ -68,6 +67,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         chosen = [k for k, i in enumerate(model.images) if i.camera == key and ego.covers(moments[k])]
         chosen.sort(key=lambda k: moments[k])
         if not chosen:
+            fix = f"name pictures of one moment alike, as front/001.jpg and left/001.jpg, or give times in {where / 'times.json'}"
+            print(f"{path}: camera {names[key]} is left out, for it took no picture while {names[lead]} did; {fix}", file=sys.stderr)
             continue
         files = tuple(pictures / model.images[k].name for k in chosen)
         for file in files:
@@ -89,7 +90,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         "metric": gauge.metric,
         "world_from_model": {"rotation": gauge.rotation.tolist(), "origin": gauge.origin.tolist(), "scale": gauge.scale},
     }
-    points = SparsePoints(gauge.points(model.xyz), seen) if len(model.xyz) else None  # poses alone: then pictures are asked for points
+    observed = any(len(shown) for frames in seen.values() for shown in frames)
+    points = SparsePoints(gauge.points(model.xyz), seen) if observed else None  # poses alone: then pictures are asked for points
     return Log(meta["name"], path, cameras, (), (), ego, meta, tuple(cameras), points)
 
 
@@ -100,7 +102,8 @@ def lens_of(camera: ModelCamera, where: Path) -> Lens:
     if make is None:
         fix = "undistort the pictures with: colmap image_undistorter"
         raise ValueError(f"{where} has a camera with the lens {camera.lens}; read are {', '.join(LENSES)}. For others, {fix}")
-    return make(*p)
+    with stating(f"{where}, camera with the lens {camera.lens}"):
+        return make(*p)
 
 
 LENSES: dict[str, Callable[..., Lens]] = {
@@ -152,45 +155,6 @@ def _lead(model: Model) -> int:
     count = {key: sum(i.camera == key for i in model.images) for key in keys}
     ahead = {key: any("front" in i.name.lower() for i in model.images if i.camera == key) for key in keys}
     return max(keys, key=lambda k: (count[k], ahead[k], -k))
-
-
-def _moments(where: Path, model: Model) -> list[int]:
-    """Microseconds of every picture. Those of one frame of a rig share a moment, as do those of several cameras whose names differ in the
-    cameras' folders alone. ValueError where that makes a camera take two pictures at one moment."""
-    clock = where / "times.json"
-    if clock.is_file():
-        try:
-            times = json.loads(clock.read_text())
-            moments = [int(times[i.name]) for i in model.images]
-        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, ValueError) as problem:
-            raise ValueError(f"{clock} must give whole microseconds by picture name ({problem!r})") from None
-        fix = f"give them different times in {clock}"
-    else:
-        names = _without_cameras(model)
-        keys = [str(i.frame) if model.rigid else name for i, name in zip(model.images, names, strict=True)]
-        first: dict[str, str] = {}
-        for key, name in zip(keys, names, strict=True):
-            first.setdefault(key, name)
-        order = {key: i for i, key in enumerate(sorted(first, key=lambda k: recorded(first[k])))}
-        moments = [order[key] * STEP_US for key in keys]
-        fix = f"give microseconds by picture name in {clock}"
-    taken: dict[tuple[int, int], str] = {}
-    for image, moment in zip(model.images, moments, strict=True):
-        other = taken.setdefault((image.camera, moment), image.name)
-        if other != image.name:
-            raise ValueError(f"{where} has one camera take {other} and {image.name} at one moment; {fix}")
-    return moments
-
-
-def _without_cameras(model: Model) -> list[str]:
-    """The pictures' names; those of several cameras without the folders that all pictures of the camera share, and without suffix."""
-    names = [i.name for i in model.images]
-    cameras = {i.camera for i in model.images}
-    if len(cameras) == 1:
-        return names
-    shared = {key: set.intersection(*(set(Path(i.name).parts[:-1]) for i in model.images if i.camera == key)) for key in cameras}
-    paths = [Path(name).with_suffix("") for name in names]
-    return ["/".join(p for p in path.parts if p not in shared[i.camera]) for path, i in zip(paths, model.images, strict=True)]
 
 
 def _picture_folder(path: Path, where: Path, name: str) -> Path:

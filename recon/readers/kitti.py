@@ -21,6 +21,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
 from recon.readers.spin import untwisted
+from recon.readers.stated import rigid, stating
 from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse, translation, yaw
@@ -54,7 +55,8 @@ def read_kitti_raw(path: Path) -> Log:
         raise ValueError(f"{path} is the unsynced drive, whose pictures are not rectified; fetch its _sync folder")
     above = path.resolve().parent
     cams = _numbers(above / "calib_cam_to_cam.txt")
-    rect_from_lidar = _padded(_named(cams, "R_rect_00", 9, above / "calib_cam_to_cam.txt")) @ _rigid(above / "calib_velo_to_cam.txt")
+    rectified = rigid(_padded(_named(cams, "R_rect_00", 9, above / "calib_cam_to_cam.txt")), f"{above / 'calib_cam_to_cam.txt'}, R_rect_00")
+    rect_from_lidar = rectified @ _rigid(above / "calib_velo_to_cam.txt")
     lidar_from_imu = _rigid(above / "calib_imu_to_velo.txt")
 
     times = _stamps(path / "oxts" / "timestamps.txt")
@@ -69,13 +71,13 @@ def read_kitti_raw(path: Path) -> Log:
     if not recorded:
         raise FileNotFoundError(f"{path} has no pictures in image_00/data to image_03/data; fetch one camera's at least")
     for folder in recorded:  # some fetch no more than image_02, of the others there are time stamps alone
-        projection = _named(cams, f"P_rect_{folder.name[-2:]}", 12, above / "calib_cam_to_cam.txt")
-        body_from_cam = inverse(_beside(projection) @ rect_from_lidar @ lidar_from_imu)
+        lens, beside = _projection(cams, f"P_rect_{folder.name[-2:]}", above / "calib_cam_to_cam.txt")
+        body_from_cam = inverse(beside @ rect_from_lidar @ lidar_from_imu)
         stamps = _stamps(folder / "timestamps.txt")
         stamps = stamps[stamps <= known]
         files = _files(folder / "data", len(stamps), 10)
         world = ego.near_each(torch.from_numpy(stamps)) @ body_from_cam
-        cameras[folder.name] = _camera(folder.name, projection, files, stamps, world)
+        cameras[folder.name] = _camera(folder.name, lens, files, stamps, world)
     sweeps, lidar_times = _spinning(path / "velodyne_points", inverse(lidar_from_imu), ego)
     boxed = lidar_times if len(lidar_times) else times  # synced, a frame of the one is a frame of the other
     meta = {
@@ -91,6 +93,8 @@ def read_kitti_odometry(path: Path) -> Log:
     """The odometry sequence in folder `path`. FileNotFoundError and ValueError name the file that is missing or wrong."""
     number = path.resolve().name
     times = np.round(np.array(_rows(path / "times.txt", 1))[:, 0] * 1e6).astype(np.int64)
+    if not (np.diff(times) > 0).all():
+        raise ValueError(f"{path / 'times.txt'} must have seconds that rise strictly; fetch it again")
     where = next((p for p in (path / "poses.txt", path.resolve().parents[1] / "poses" / f"{number}.txt") if p.is_file()), None)
     if where is None:
         missing = path.resolve().parents[1] / "poses" / f"{number}.txt"
@@ -100,18 +104,20 @@ def read_kitti_odometry(path: Path) -> Log:
         raise ValueError(f"{where} has {len(rows)} poses for the {len(times)} times of {path / 'times.txt'}; they must be as many")
     camera_world = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
     camera_world[:, :3] = torch.from_numpy(rows)
+    camera_world = rigid(camera_world, str(where))
     calib = _numbers(path / "calib.txt")
     blind = "Tr" not in calib and not (path / "velodyne").is_dir()  # the calibration that comes with grey pictures knows no lidar
-    cam_from_body = CAM_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
+    mount = CAM_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
+    cam_from_body = rigid(mount, f"{path / 'calib.txt'}, Tr")
     # the poses' world is the first rectified camera; ours is the first body pose, whose z is up
     poses = inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body
     ego = lengthened(times, poses)
     cameras = {}
     for folder in sorted(path.glob("image_[0-3]")):
-        projection = _named(calib, f"P{folder.name[-1]}", 12, path / "calib.txt")
+        lens, beside = _projection(calib, f"P{folder.name[-1]}", path / "calib.txt")
         files = _files(folder, len(times), 6)
-        world = poses @ inverse(_beside(projection) @ cam_from_body)
-        cameras[folder.name] = _camera(folder.name, projection, files, times, world)
+        world = poses @ inverse(beside @ cam_from_body)
+        cameras[folder.name] = _camera(folder.name, lens, files, times, world)
     sweeps = tuple(
         Sweep(i, int(t), partial(_scan, file, poses[i], int(t), _turn_us(times)))
         for i, t in enumerate(times)
@@ -132,19 +138,18 @@ def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, eg
     return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, (front,), lidars={0: lidar.numpy()})
 
 
-def _camera(name: str, projection: torch.Tensor, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:
+def _camera(name: str, lens: Pinhole, files: tuple[Path, ...], times: np.ndarray, world: torch.Tensor) -> LogCamera:
     """times `[F]`, world: `world_from_cam` `[F, 4, 4]`, of all frames, of which `files` are the first."""
-    p = projection.reshape(3, 4)
-    lens = Pinhole(float(p[0, 0]), float(p[1, 1]), float(p[0, 2]), float(p[1, 2]))
-    # the devkit counts pixel centres from 0, we from 0.5
-    lens = Pinhole(lens.fx, lens.fy, lens.cx + 0.5, lens.cy + 0.5)
     return LogCamera(name, lens, *image_size(files[0]), files, torch.from_numpy(times[: len(files)]), world[: len(files)])
 
 
-def _beside(projection: torch.Tensor) -> torch.Tensor:
-    """`cam_from_rect` `[4, 4]` of a camera's projection K [I | t]: t is its place beside the reference camera."""
-    p = projection.reshape(3, 4)
-    return translation(*torch.linalg.solve(p[:, :3], p[:, 3]).tolist())
+def _projection(found: dict[str, list[float]], name: str, path: Path) -> tuple[Pinhole, torch.Tensor]:
+    """Lens and `cam_from_rect` `[4, 4]` of a camera's projection K [I | t]: t is its place beside the reference camera."""
+    p = _named(found, name, 12, path).reshape(3, 4)
+    with stating(f"{path}, {name}"):
+        # the devkit counts pixel centres from 0, we from 0.5
+        lens = Pinhole(float(p[0, 0]), float(p[1, 1]), float(p[0, 2]) + 0.5, float(p[1, 2]) + 0.5)
+        return lens, translation(*torch.linalg.solve(p[:, :3], p[:, 3]).tolist())
 
 
 def _numbers(path: Path) -> dict[str, list[float]]:
@@ -179,7 +184,7 @@ def _rigid(path: Path) -> torch.Tensor:
     found = _numbers(path)
     out = _padded(_named(found, "R", 9, path))
     out[:3, 3] = _named(found, "T", 3, path)
-    return out
+    return rigid(out, str(path))
 
 
 def _rows(path: Path, count: int) -> list[list[float]]:

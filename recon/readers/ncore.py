@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track, lengthened
+from recon.readers.stated import rigid, stating
 from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Fisheye, FTheta, Lens, OpenCV, Pinhole
 from scenes.poses import inverse, translation
@@ -115,7 +116,7 @@ def _poses(loader, node: str, times_us: np.ndarray, file: Path) -> torch.Tensor:
         found = loader.pose_graph.evaluate_poses(node, "world", np.asarray(times_us, dtype=np.uint64))
     except (KeyError, ValueError, AssertionError) as problem:
         raise ValueError(f"{file} has no poses of {node} in the world at the times of its frames ({problem})") from None
-    return torch.from_numpy(np.array(found, dtype=np.float64))
+    return rigid(torch.from_numpy(np.array(found, dtype=np.float64)), f"{file}, poses of {node}")
 
 
 def _camera(loader, name: str, sensor, home: torch.Tensor, file: Path) -> LogCamera:
@@ -130,7 +131,9 @@ def _camera(loader, name: str, sensor, home: torch.Tensor, file: Path) -> LogCam
     readout = way * round(float(np.median(last - first)))
     mask = sensor.get_mask_images().get("ego")
     ego = None if mask is None else np.asarray(mask.convert("L")) > 0
-    return LogCamera(name, lens_of(model, f"{file}, {name}"), width, height, files, torch.from_numpy(middles), poses, shutter, readout, ego)
+    with stating(f"{file}, {name}"):
+        lens = lens_of(model, f"{file}, {name}")
+    return LogCamera(name, lens, width, height, files, torch.from_numpy(middles), poses, shutter, readout, ego)
 
 
 def _picture(sensor, index: int) -> bytes:

@@ -20,10 +20,11 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
+from recon.readers.stated import posed, stating
 from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.names import unknown
-from scenes.poses import pose_from, translation
+from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
 FRONT = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT")
@@ -53,10 +54,8 @@ def read_nuscenes(path: Path) -> Log:
     taken = sorted((d for d in tables.rows("sample_data") if d["sample_token"] in samples), key=lambda d: d["timestamp"])
     if not taken:
         raise ValueError(f"{tables.folder / 'sample_data.json'} has nothing of {scene['name']}; fetch the tables of the part that has it")
-    mounts = {row["token"]: row for row in tables.rows("calibrated_sensor")}
-    channels = {row["token"]: row["channel"] for row in tables.rows("sensor")}
-    wanted = {d["ego_pose_token"] for d in taken}
-    egos = {row["token"]: row for row in tables.rows("ego_pose") if row["token"] in wanted}
+    mounts, sensors = (Keyed(tables, name) for name in ("calibrated_sensor", "sensor"))
+    egos = Keyed(tables, "ego_pose", {d["ego_pose_token"] for d in taken})
     moments = {int(row["timestamp"]): _pose(row) for row in egos.values()}
     times = np.array(sorted(moments), dtype=np.int64)
     bodies = torch.stack([moments[int(t)] for t in times])
@@ -68,7 +67,7 @@ def read_nuscenes(path: Path) -> Log:
     for d in taken:
         # frames between the annotated ones come as a download of their own, which need not be there
         if d["is_key_frame"] or (root / d["filename"]).is_file():
-            by_channel.setdefault(channels[mounts[d["calibrated_sensor_token"]]["sensor_token"]], []).append(d)
+            by_channel.setdefault(sensors[mounts[d["calibrated_sensor_token"]]["sensor_token"]]["channel"], []).append(d)
     cameras, sweeps, lidars = {}, [], {}
     ends = _ends(by_channel, mounts)
     for channel, frames in sorted(by_channel.items(), key=lambda item: (item[0] != FRONT[0], item[0])):
@@ -80,8 +79,9 @@ def read_nuscenes(path: Path) -> Log:
         poses = torch.stack([home @ _pose(egos[d["ego_pose_token"]]) @ _pose(mount) for d in frames])
         stamps = torch.tensor([int(d["timestamp"]) for d in frames])
         if channel.startswith("CAM"):
-            k = mount["camera_intrinsic"]
-            lens = Pinhole(float(k[0][0]), float(k[1][1]), float(k[0][2]), float(k[1][2]))
+            with stating(f"{tables.folder / 'calibrated_sensor.json'}, camera_intrinsic of {channel}"):
+                k = mount["camera_intrinsic"]
+                lens = Pinhole(float(k[0][0]), float(k[1][1]), float(k[0][2]), float(k[1][2]))
             cameras[channel] = LogCamera(channel, lens, int(frames[0]["width"]), int(frames[0]["height"]), files, stamps, poses)
         elif channel == "LIDAR_TOP":
             when, lidars = stamps.tolist(), {0: _pose(mount)[:3, 3].numpy()}
@@ -116,6 +116,17 @@ class Tables:
                     lost = next(key for key in KEYS[name] if not isinstance(row, dict) or key not in row)
                     raise ValueError(f'{path} has rows without "{lost}"; it is not as nuScenes writes it')
                 yield row
+
+
+class Keyed(dict[str, dict]):
+    """A table's rows by their tokens, of those `wanted` where some are. ValueError naming the table for a token that it lacks."""
+
+    def __init__(self, tables: Tables, name: str, wanted: set[str] | None = None):
+        self.path = tables.folder / f"{name}.json"
+        super().__init__((row["token"], row) for row in tables.rows(name) if wanted is None or row["token"] in wanted)
+
+    def __missing__(self, token: str) -> dict:
+        raise ValueError(f"{self.path} has no row {token}, which other tables name; fetch the tables again")
 
 
 CHUNK = 1 << 20
@@ -178,8 +189,9 @@ def _scene(root: Path, name: str | None) -> tuple[Tables, dict]:
 def _pose(row: dict) -> torch.Tensor:
     """The pose of a row's translation (metres) and rotation (wxyz)."""
     try:
-        return pose_from(torch.tensor(row["rotation"], dtype=torch.float64), torch.tensor(row["translation"], dtype=torch.float64))
-    except (TypeError, ValueError) as problem:
+        quat, place = (torch.tensor(row[key], dtype=torch.float64) for key in ("rotation", "translation"))
+        return posed(quat.reshape(4), place.reshape(3), f"row {row.get('token', '?')} of nuScenes' tables")
+    except (TypeError, RuntimeError) as problem:
         raise ValueError(f"row {row.get('token', '?')} of nuScenes' tables has no pose ({problem})") from None
 
 
@@ -219,8 +231,7 @@ def _tracks(tables: Tables, samples: dict, sweeps: list[dict], home: torch.Tenso
         return ()
     at = {token: int(s["timestamp"]) for token, s in samples.items()}
     at |= {d["sample_token"]: int(d["timestamp"]) for d in sweeps if d["is_key_frame"]}
-    classes = {row["token"]: row["name"] for row in tables.rows("category")}
-    kinds = {row["token"]: classes[row["category_token"]] for row in tables.rows("instance")}
+    classes, instances = (Keyed(tables, name) for name in ("category", "instance"))
     seen: dict[str, list[dict]] = {}
     for row in tables.rows("sample_annotation"):
         if row["sample_token"] in samples:
@@ -230,7 +241,7 @@ def _tracks(tables: Tables, samples: dict, sweeps: list[dict], home: torch.Tenso
         times = np.array([at[row["sample_token"]] for row in rows], dtype=np.int64)
         sizes = np.array([[row["size"][1], row["size"][0], row["size"][2]] for row in rows])
         poses = home @ from_middles(torch.stack([_pose(row) for row in rows]), sizes[:, 2])
-        found.append(Boxes(instance, label_of(kinds[instance]), times, poses, sizes))
+        found.append(Boxes(instance, label_of(classes[instances[instance]["category_token"]]["name"]), times, poses, sizes))
     return tracks_of(found, ego, str(tables.folder / "sample_annotation.json"))
 
 

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
+from recon.readers.stated import posed, stating
 from recon.readers.unpickle import read_frame
 from recon.tracks import named, slug, upright
 from scenes.lenses import Pinhole
-from scenes.poses import pose_from, translation
+from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
 LABELS = {
@@ -38,6 +39,9 @@ LABELS = {
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 READOUT_US, MIDDLE_US = 30_000, -10_000
 """How long an image is read out, and its middle row against its stamp. PandaSet does not say; SplatAD (Hess et al. 2025) takes these."""
+
+LATEST_S = 1e11
+"""A time stamp beyond it is in milliseconds or less."""
 
 ASTRAY_S = 1.0
 """Seconds between a sweep's stamp and its points' times that no lidar explains: clocks of two kinds, or a file of another place."""
@@ -92,18 +96,19 @@ def _stamped(folder: Path) -> tuple[np.ndarray, torch.Tensor]:
     """Times int64 us `[F]` and poses float64 `[F, 4, 4]` of a sensor's folder."""
     times, poses = _json(folder / "timestamps.json"), _json(folder / "poses.json")
     try:
-        times_us = np.round(np.asarray(times, dtype=np.float64) * 1e6).astype(np.int64)
+        seconds = np.asarray(times, dtype=np.float64)
         quats = torch.tensor([[p["heading"][k] for k in "wxyz"] for p in poses], dtype=torch.float64)
         places = torch.tensor([[p["position"][k] for k in "xyz"] for p in poses], dtype=torch.float64)
     except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{folder / 'poses.json'} or timestamps.json is not as PandaSet writes it ({problem!r})") from None
+    if not (np.abs(seconds) < LATEST_S).all():
+        raise ValueError(f"{folder / 'timestamps.json'} must give seconds, finite and since 1970 at most; got {seconds.flat[0]:.16g}")
+    times_us = np.round(seconds * 1e6).astype(np.int64)
     if times_us.ndim != 1 or len(times_us) != len(poses) or not len(poses):
         raise ValueError(f"{folder} has {times_us.size} timestamps and {len(poses)} poses; they must be as many, and not none")
     if not (np.diff(times_us) > 0).all():
         raise ValueError(f"{folder / 'timestamps.json'} does not rise strictly at entry {int(np.argmin(np.diff(times_us) > 0)) + 1}")
-    if not torch.isfinite(quats).all() or not torch.isfinite(places).all() or (quats.norm(dim=1) < 1e-6).any():
-        raise ValueError(f"{folder / 'poses.json'} holds a pose that is not finite or has no rotation")
-    return times_us, pose_from(quats, places)
+    return times_us, posed(quats, places, str(folder / "poses.json"))
 
 
 def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
@@ -111,10 +116,8 @@ def _camera(folder: Path, home: torch.Tensor) -> LogCamera:
     files = leading([folder / f"{i:02d}.jpg" for i in range(len(times_us))])
     width, height = image_size(files[0])
     lens = _json(folder / "intrinsics.json")
-    try:
+    with stating(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy"):
         pinhole = Pinhole(*(float(lens[k]) for k in ("fx", "fy", "cx", "cy")))
-    except (KeyError, TypeError, ValueError) as problem:
-        raise ValueError(f"{folder / 'intrinsics.json'} must give numbers fx, fy, cx, cy ({problem!r})") from None
     middles, world_from_cam = (values[: len(files)] for values in _middles(times_us, home @ poses))
     return LogCamera(folder.name, pinhole, width, height, files, middles, world_from_cam, "rows", READOUT_US)
 
@@ -147,10 +150,11 @@ def _geodetic(path: Path) -> dict:
     if not path.is_file():
         return {}
     try:
-        first = _json(path)[0]
-        return {"geodetic_origin": {k: float(first[k]) for k in ("lat", "long", "height")}}
-    except (KeyError, IndexError, TypeError) as problem:
+        told = [{k: float(fix[k]) for k in ("lat", "long", "height")} for fix in _json(path)]
+    except (KeyError, TypeError, ValueError) as problem:
         raise ValueError(f"{path} is not as PandaSet writes it ({problem!r})") from None
+    # receivers begin with NaN; a later place will do for what it is asked for, where the sun stood
+    return next(({"geodetic_origin": place} for place in told if np.isfinite(list(place.values())).all()), {})
 
 
 def _observations(path: Path, count: int) -> dict[str, list[dict]]:

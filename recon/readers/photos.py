@@ -57,7 +57,8 @@ def read_photos(
     """The log of a folder of photos or of a video; `camera_height` and `metres_per_unit` as in `read_colmap`.
 
     angle_of_view: radians from the pictures' left to their right side, found with the poses where None. ValueError where too few of the
-    pictures can be placed, or were placed with another angle before, PermissionError where the workspace cannot be written.
+    pictures can be placed, or were placed with another angle before, PermissionError where the workspace cannot be written and
+    FileExistsError where something else has its name.
     """
     if angle_of_view is not None and not NARROWEST <= angle_of_view <= WIDEST:
         low, high = (f"{math.degrees(a):.0f}deg" for a in (NARROWEST, WIDEST))
@@ -80,6 +81,8 @@ def read_photos(
 
 def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
     """Find the poses and write the workspace: whole, or not at all."""
+    if workspace.exists() and not (workspace.is_dir() and not any(workspace.iterdir())):
+        raise FileExistsError(f"{workspace} is to hold the poses of {path.name}, and holds something else; move or rename it")
     partial = workspace.with_name(workspace.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -90,12 +93,12 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
         print(f"finding where {path} was taken; it is kept in {workspace}", file=sys.stderr)
         if is_video(path):
             times = _frames(path, partial / "images")
-            placed = solve(partial / "images", list(times), partial, True, angle_of_view)
+            placed = solve(partial / "images", list(times), partial, True, angle_of_view, str(path))
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
             names = _of_one_size(path)
             pictures = _upright(path, names, partial / "images")
-            placed = solve(pictures, names, partial, False, angle_of_view)
+            placed = solve(pictures, names, partial, False, angle_of_view, str(path))
             times = dict.fromkeys(names, 0)
         print(f"placed {placed} of {len(times)} pictures", file=sys.stderr)
         partial.rename(workspace)

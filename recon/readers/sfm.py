@@ -77,14 +77,14 @@ def is_model(folder: Path) -> bool:
 
 def read_model(folder: Path) -> Model:
     """The COLMAP model in `folder`. ValueError where a file is missing, corrupt, or no picture is registered."""
-    for end in (".bin", ".txt"):
-        have = [p for p in PARTS if (folder / f"{p}{end}").is_file()]
-        if have and len(have) < len(PARTS):
-            lost = next(p for p in PARTS if p not in have)
-            raise FileNotFoundError(f"{folder / f'{lost}{end}'} is missing; a COLMAP model has {', '.join(p + end for p in PARTS)}")
+    lost = {end: [p for p in PARTS if not (folder / f"{p}{end}").is_file()] for end in (".bin", ".txt")}
+    if all(lost.values()):  # a whole model of one kind is read whatever lies beside it
+        end = min(lost, key=lambda end: len(lost[end]))
+        raise FileNotFoundError(f"{folder / f'{lost[end][0]}{end}'} is missing; a COLMAP model has {', '.join(p + end for p in PARTS)}")
     try:
         colmap = pycolmap()
-        found = colmap.Reconstruction(str(folder))
+        found = colmap.Reconstruction()
+        (found.read_text if lost[".bin"] else found.read_binary)(str(folder))
     except (RuntimeError, ValueError, IndexError, MemoryError) as problem:
         if FIX in str(problem):
             raise
@@ -110,10 +110,11 @@ def read_model(folder: Path) -> Model:
     return Model(cameras, tuple(images), xyz, any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values()))
 
 
-def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None = None) -> int:
+def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None, source: str) -> int:
     """Find the poses of the named pictures and their common lens; writes `workspace`/sparse/0. Returns how many were placed.
 
-    angle_of_view: radians from the left to the right side, where the focal length need not be found.
+    angle_of_view: radians from the left to the right side, where the focal length need not be found. source: where the pictures come from,
+    for messages.
     SIFT features, matched between all pictures, or where they are `ordered` (a video) or many between near ones, then incremental mapping
     (Schönberger and Frahm 2016), all on the CPU. The largest of the models is kept. ValueError where it holds too few pictures.
     """
@@ -154,7 +155,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     count = 0 if best is None else best.num_reg_images()
     if best is None or count < max(FEWEST_PLACED, len(names) // 4):
         fix = "take them closer together, with more overlap and things that stand still"
-        raise ValueError(f"only {count} of {len(names)} pictures in {pictures} could be placed; {fix}")
+        raise ValueError(f"only {count} of {len(names)} pictures of {source} could be placed; {fix}")
     (workspace / "sparse" / "0").mkdir(parents=True)
     best.write(workspace / "sparse" / "0")
     shutil.rmtree(made)

@@ -17,6 +17,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
 from recon.readers.arrow import Rows, read_cell, read_table
+from recon.readers.stated import rigid, stating
 from recon.tracks import Boxes, from_middles, tracks_of, upright
 from scenes.lenses import OpenCV
 from scenes.names import unknown
@@ -70,11 +71,13 @@ def read_waymo(path: Path) -> Log:
     table = read_table(component("vehicle_pose"), (WHEN, BODY))
     order = np.argsort(table[WHEN])
     times = table[WHEN][order].astype(np.int64)
+    if not len(times):
+        raise ValueError(f"{component('vehicle_pose')} has no row; fetch it again")
     bodies = torch.stack([_matrix(table[BODY][i], component("vehicle_pose")) for i in order])
     origin = bodies[0, :3, 3].clone()
     home = translation(*(-origin).tolist())
     taken = read_table(component("camera_image"), TAKEN, others=False)  # without the pictures themselves
-    moments = _moments(times, bodies, taken)
+    moments = _moments(times, bodies, taken, component("camera_image"))
     ego = lengthened(moments, home @ bodies)
     cameras = _cameras(component, home, ego, taken)
     meta: dict = {
@@ -103,18 +106,18 @@ def _segment(root: Path, name: str | None) -> str:
 
 def _matrix(values, path: Path) -> torch.Tensor:
     flat = np.asarray(values, dtype=np.float64).ravel()
-    if len(flat) != 16 or not np.isfinite(flat).all():
-        raise ValueError(f"{path} holds a pose of {len(flat)} numbers; 16 finite ones make one")
-    return torch.from_numpy(flat.reshape(4, 4).copy())
+    if len(flat) != 16:
+        raise ValueError(f"{path} holds a pose of {len(flat)} numbers; 16 make one")
+    return rigid(torch.from_numpy(flat.reshape(4, 4).copy()), str(path))
 
 
-def _moments(times: np.ndarray, bodies: torch.Tensor, taken: dict[str, np.ndarray]) -> np.ndarray:
+def _moments(times: np.ndarray, bodies: torch.Tensor, taken: dict[str, np.ndarray], images: Path) -> np.ndarray:
     """When the car stood at the frames' poses `[F, 4, 4]`, int64 us `[F]`: when the picture was taken that has the same pose, the front one
     if several do; frames without one are as late after their stamps `[F]` as others are."""
     late = np.full(len(times), np.nan)
     for i in np.argsort(-taken["key.camera_name"], kind="stable"):
         frame = int(np.searchsorted(times, taken[WHEN][i]).clip(max=len(times) - 1))
-        if np.abs(np.asarray(taken[POSE][i], np.float64).ravel() - bodies[frame].numpy().ravel()).max() < SAME:
+        if float((_matrix(taken[POSE][i], images) - bodies[frame]).abs().max()) < SAME:
             late[frame] = taken[STAMP][i] * 1e6 - times[frame]
     known = np.isfinite(late)
     usual = np.median(late[known]) if known.any() else 0.0
@@ -139,7 +142,8 @@ def _cameras(component, home: torch.Tensor, ego: Trajectory, taken: dict[str, np
         # a row is exposed for a while: from the middle of the first's exposure to that of the last's
         readout = way * round(float(np.median((taken[ended] - taken[began] - taken[exposure])[mine])) * 1e6)
         name = CAMERAS.get(int(number), f"camera_{number}")
-        lens = OpenCV(*(float(table[k][row]) for k in LENS))
+        with stating(f"{where}, camera {number}"):
+            lens = OpenCV(*(float(table[k][row]) for k in LENS))
         body_from_cam = _matrix(table[mount][row], where) @ inverse(CAM_FROM_FLU)
         bodies = home @ torch.stack([_matrix(taken[POSE][i], images) for i in mine])
         moved = inverse(ego.near_each(torch.from_numpy(stamps))) @ ego.near_each(torch.from_numpy(middles))
@@ -185,6 +189,8 @@ def _passed(places: np.ndarray, ego: Trajectory, stamp: int, otherwise: int) -> 
 def _points(component, parts: dict[str, Rows], stamp: int, moment: int, home: torch.Tensor, ego: Trajectory) -> LidarPoints:
     """First returns of all lidars at a stamp, in the world; those without a pose a pixel count as taken at the `moment` of the frame's."""
     table, turning, vehicle = (parts[kind].read(stamp) for kind in SWEPT)
+    if not len(vehicle[BODY]):
+        raise ValueError(f"{component('vehicle_pose')} has no pose at {stamp}, of which lidar/ has a sweep; fetch it again")
     body = _matrix(vehicle[BODY][0], component("vehicle_pose"))
     prefix = "[LiDARCalibrationComponent]."
     calibration = read_table(

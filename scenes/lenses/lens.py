@@ -33,10 +33,12 @@ class Lens:
         cy: Number
 
     def __post_init__(self):
-        for name in self.positive:
+        for name in (f.name for f in fields(self)):
             value = float(torch.as_tensor(getattr(self, name)).detach())
-            if not value > 0:
+            if name in self.positive and not value > 0:
                 raise ValueError(f"{name} must be a positive number of pixels, got {value}")
+            if not math.isfinite(value):
+                raise ValueError(f"{name} of a lens must be finite, got {value}")
 
     def params(self) -> torch.Tensor:
         """float64 `[P]`: the fields in order; differentiable where they are tensors."""

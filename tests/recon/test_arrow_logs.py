@@ -296,3 +296,53 @@ def test_pictures_come_from_a_row_of_the_parquet_file(waymo, near):
     truth = [near.image("right", int(t)) for t in camera.times_us]
     off = torch.tensor([[float(np.abs(camera.image(i).astype(int) - t).mean()) for t in truth] for i in range(len(truth))])
     assert off.argmin(1).tolist() == list(range(len(truth)))
+
+
+def changed(path, change):
+    """A table's file with its frame changed."""
+    import pandas as pd
+
+    feather = path.suffix == ".feather"
+    frame = change((pd.read_feather if feather else pd.read_parquet)(path))
+    (frame.to_feather if feather else frame.to_parquet)(path)
+
+
+def test_argoverse_rows_that_are_wrong_or_lost_are_named(own_argoverse):
+    poses, lenses = own_argoverse / "city_SE3_egovehicle.feather", own_argoverse / "calibration/intrinsics.feather"
+    whole = poses.read_bytes()
+    changed(poses, lambda table: table.iloc[:0])
+    with pytest.raises(ValueError, match="city_SE3_egovehicle.feather has no row"):
+        open_log(own_argoverse)
+    poses.write_bytes(whole)
+    changed(poses, lambda table: table.assign(qw=0.0, qx=0.0, qy=0.0, qz=0.0))
+    with pytest.raises(ValueError, match="city_SE3_egovehicle.feather: pose 0 is not finite or has no rotation"):
+        open_log(own_argoverse)
+    poses.write_bytes(whole)
+    changed(lenses, lambda table: table.assign(cx_px=float("nan")))
+    with pytest.raises(ValueError, match="intrinsics.feather, ring_.*: cx of a lens must be finite"):
+        open_log(own_argoverse)
+
+
+def test_waymo_poses_are_rounded_or_refused(own_waymo, waymo):
+    for kind, column in (("vehicle_pose", BODY), ("camera_image", POSE)):
+        changed(own_waymo / kind / f"{SEGMENT}.parquet", lambda table, c=column: table.assign(**{c: [np.round(p, 4) for p in table[c]]}))
+    found, whole = (open_log(root / SEGMENT) for root in (own_waymo, waymo))
+    assert torch.equal(found.ego.times_us, whole.ego.times_us)  # pictures are still known by having their frame's pose
+    for name, camera in found.cameras.items():
+        turns = camera.world_from_cam[:, :3, :3]
+        assert (turns @ turns.mT - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-9
+        assert (camera.world_from_cam - whole.camera(name).world_from_cam).abs().max() < 1e-3
+    file = own_waymo / "vehicle_pose" / f"{SEGMENT}.parquet"
+    changed(file, lambda table: table.assign(**{BODY: [np.diag([2.0, 2, 2, 1]).ravel() for _ in table[BODY]]}))
+    with pytest.raises(ValueError, match=f"vehicle_pose/{SEGMENT}.parquet: pose is no rotation"):
+        open_log(own_waymo / SEGMENT)
+    changed(file, lambda table: table.iloc[:0])
+    with pytest.raises(ValueError, match=f"vehicle_pose/{SEGMENT}.parquet has no row"):
+        open_log(own_waymo / SEGMENT)
+
+
+def test_a_sweep_without_its_frames_pose_is_named_when_read(own_waymo):
+    changed(own_waymo / "vehicle_pose" / f"{SEGMENT}.parquet", lambda table: table.iloc[1:])
+    log = open_log(own_waymo / SEGMENT)
+    with pytest.raises(ValueError, match="vehicle_pose/.* has no pose at .*, of which lidar/ has a sweep"):
+        log.sweeps[0].read()

@@ -304,6 +304,30 @@ def test_poses_without_points_are_a_drive(own, workspace):
     torch.testing.assert_close(log.camera("camera").world_from_cam, known)
 
 
+def test_points_that_no_picture_is_said_to_show_are_none(own, workspace):
+    images = own / "sparse/0/images.txt"
+    lines = images.read_text().splitlines()
+    images.write_text("\n".join(line if ".png" in line or line.startswith("#") else "" for line in lines) + "\n")
+    points = own / "sparse/0/points3D.txt"
+    points.write_text("\n".join(" ".join(line.split()[:8]) for line in points.read_text().splitlines() if line[:1].isdigit()) + "\n")
+    log = open_log(own)
+    assert log.points is None and len(log.camera("camera")) == len(open_log(workspace).camera("camera"))
+
+
+def test_a_model_is_read_whatever_lies_beside_it(own, workspace):
+    import pycolmap
+
+    model = own / "sparse/0"
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for name in ("images.txt", "points3D.txt"):
+        (model / name).unlink()
+    (model / "cameras.txt").write_text("# of another model\n")
+    assert len(open_log(own).camera("camera")) == len(open_log(workspace).camera("camera"))
+    (model / "points3D.bin").unlink()
+    with pytest.raises(FileNotFoundError, match="points3D.bin is missing"):
+        open_log(own)
+
+
 def test_photos_through_several_lenses_are_refused(own):
     lens_each(own, [57.6, 115.2] * 6)
     images = own / "sparse/0/images.txt"
@@ -381,3 +405,43 @@ def test_lund_reads_with_all_its_pictures(shared):
     assert 60 < float(walked.norm(dim=1).sum()) < 180 and float(walked[:, 2].abs().sum()) < 0.05 * float(walked.norm(dim=1).sum())
     bodies = log.ego.world_from_body
     assert (bodies[:, 2, 2] > 0.97).all() and (bodies[:, 0, 0] > 0.8).all()
+
+
+@pytest.mark.parametrize(
+    "layout", ["{camera}_{i:03d}.png", "{i:03d}_{camera}.png", "cam{number}_{i}.png", "{i:03d}/{camera}.png", "run2/{camera}{i}.png"]
+)
+def test_pictures_of_one_moment_are_known_by_what_differs_in_a_cameras_names(street, tmp_path, layout):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    names = [layout.format(camera=c, number=k + 1, i=i) for k, c in enumerate(pair) for i in range(4)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names), metres_per_unit=1 / UNIT)
+    assert [c.times_us.tolist() for c in log.cameras.values()] == [[0, 500_000, 1_000_000, 1_500_000]] * 2
+    front, left = log.cameras
+    rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
+    apart = inverse(rig[front].body_from_cam) @ rig[left].body_from_cam
+    truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
+    torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
+
+
+def test_names_that_are_times_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    names = [f"{c}/{1533151603547590 + 100_000 * i + 20_000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
+    assert log.cameras["front"].times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
+    assert log.cameras["left"].times_us.tolist() == [100_000, 600_000, 1_100_000, 1_600_000]
+    assert not capsys.readouterr().err
+
+
+def test_a_camera_that_took_nothing_in_the_others_time_is_left_out_with_the_fix(street, tmp_path, capsys):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    names = [f"{c}/{i + 1000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
+    assert list(log.cameras) == ["front"]
+    assert "camera left is left out, for it took no picture while front did; name pictures of one moment alike" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("unit", [1, 0.04])
+def test_a_clock_of_another_unit_is_refused(own, unit):
+    names = sorted(p.name for p in (own / "images").iterdir())
+    (own / "sparse/0/times.json").write_text(json.dumps({n: unit * i for i, n in enumerate(names)}))
+    with pytest.raises(ValueError, match="times.json must give whole microseconds by picture name; it has 0"):
+        open_log(own)

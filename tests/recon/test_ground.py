@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.ground import estimate_ground
+from recon.ground import MOST, estimate_ground
 from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
@@ -63,3 +63,13 @@ def test_a_car_that_stands_still_has_a_ground():
     still = Trajectory(torch.arange(5) * 100_000, torch.stack([translation(3.0, 1.0, 0.5)] * 5))
     ground = estimate_ground(points, still)
     assert abs(float(ground.height(torch.tensor([10.0, 4.0]))) - 0.2) < 0.1
+
+
+def test_a_drive_across_kilometres_takes_larger_cells():
+    away = torch.arange(200, dtype=torch.float64) * 15
+    poses = torch.eye(4, dtype=torch.float64).repeat(200, 1, 1)
+    poses[:, 0, 3] = poses[:, 1, 3] = away
+    poses[:, 2, 3] = 0.02 * away
+    ground = estimate_ground(np.zeros((0, 3)), Trajectory(torch.arange(200) * 1_000_000, poses))
+    assert ground.heights.numel() < 1.05 * MOST and ground.cell > 1
+    assert (ground.height(poses[:, :2, 3]) - poses[:, 2, 3]).abs().max() < 0.2

@@ -228,3 +228,47 @@ def test_a_sequence_without_poses_is_refused_with_the_fix(own_sequence):
     poses.unlink()
     with pytest.raises(FileNotFoundError, match="poses/04.txt is missing; KITTI publishes poses of the sequences 00 to 10"):
         open_log(own_sequence)
+
+
+def rewritten(path, change):
+    """The numbers of a text file's rows, changed; names before them stay."""
+    lines = []
+    for line in path.read_text().splitlines():
+        name, colon, rest = line.rpartition(": ")
+        try:
+            lines.append(name + colon + change(name, [float(word) for word in rest.split()]))
+        except ValueError:
+            lines.append(line)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_poses_of_four_decimals_are_rigid(own_sequence, odometry):
+    rewritten(own_sequence.parents[1] / "poses/04.txt", lambda _, row: " ".join(f"{v:.4f}" for v in row))
+    rewritten(own_sequence / "calib.txt", lambda name, row: " ".join((f"{v:.4f}" if name == "Tr" else f"{v:.12e}") for v in row))
+    found, whole = (open_log(path).camera("image_2").world_from_cam for path in (own_sequence, odometry))
+    off = found[:, :3, :3] @ found[:, :3, :3].mT - torch.eye(3, dtype=torch.float64)
+    assert off.abs().max() < 1e-9 and (found - whole).abs().max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "scale"), [("poses/04.txt", "", 2.0), ("poses/04.txt", "", -1.0), ("sequences/04/calib.txt", "Tr", 2.0)]
+)
+def test_poses_that_are_no_rotations_are_named(own_sequence, file, name, scale):
+    rewritten(own_sequence.parents[1] / file, lambda n, row: " ".join(f"{v * scale if n == name else v}" for v in row))
+    with pytest.raises(ValueError, match=f"{file.split('/')[-1]}.*: pose.* is no rotation and place"):
+        open_log(own_sequence)
+
+
+def test_calibrations_that_are_none_are_named(own, own_sequence):
+    rewritten(own.parent / "calib_velo_to_cam.txt", lambda name, row: " ".join(f"{2 * v if name == 'R' else v}" for v in row))
+    with pytest.raises(ValueError, match="calib_velo_to_cam.txt: pose is no rotation"):
+        open_log(own)
+    rewritten(own_sequence / "calib.txt", lambda name, row: " ".join(f"{0 * v if name == 'P2' else v}" for v in row))
+    with pytest.raises(ValueError, match="calib.txt, P2: fx must be a positive number"):
+        open_log(own_sequence)
+
+
+def test_times_that_stand_still_are_named(own_sequence):
+    (own_sequence / "times.txt").write_text("0\n" * 6)
+    with pytest.raises(ValueError, match="times.txt must have seconds that rise strictly"):
+        open_log(own_sequence)

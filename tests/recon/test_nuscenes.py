@@ -132,3 +132,29 @@ def test_the_test_part_has_no_boxes(own):
 def test_categories_become_classes():
     names = ("vehicle.car", "vehicle.bus.rigid", "human.pedestrian.adult", "movable_object.trafficcone", "vehicle.construction", "animal")
     assert [label_of(n) for n in names] == ["car", "bus", "pedestrian", "cone", "construction-vehicle", "animal"]
+
+
+@pytest.mark.parametrize(
+    ("table", "changes", "said"),
+    [
+        ("ego_pose", {"rotation": [0, 0, 0, 0]}, "row .* of nuScenes' tables: pose is not finite or has no rotation"),
+        ("ego_pose", {"translation": [float("nan"), 0, 0]}, "row .* of nuScenes' tables: pose is not finite"),
+        ("ego_pose", {"rotation": [1, 0, 0]}, "row .* of nuScenes' tables has no pose"),
+        ("ego_pose", None, "ego_pose.json has no row .*, which other tables name"),
+        ("calibrated_sensor", None, "calibrated_sensor.json has no row"),
+        ("sensor", None, "sensor.json has no row"),
+        ("instance", None, "instance.json has no row"),
+        ("calibrated_sensor", {"camera_intrinsic": []}, "calibrated_sensor.json, camera_intrinsic of CAM_FRONT"),
+        (
+            "calibrated_sensor",
+            {"camera_intrinsic": [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]},
+            "camera_intrinsic of CAM_FRONT.*: fx must be",
+        ),
+    ],
+)
+def test_rows_that_are_wrong_or_lost_are_named(own, table, changes, said):
+    path = own / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(rows[1:] if changes is None else [{**row, **changes} for row in rows]))
+    with pytest.raises(ValueError, match=said):
+        open_log(own / "scene-0061")

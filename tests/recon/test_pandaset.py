@@ -183,3 +183,25 @@ def test_the_lidar_of_drive_002_falls_into_the_moving_boxes(pandaset):
             local = points @ inverse(pose).numpy()[:3, :3].T + inverse(pose).numpy()[:3, 3]
             counts.append(inside(local, track.size, 0.1).sum())
     assert max(counts) > 3000 and np.median(counts) >= 20
+
+
+def test_stamps_of_another_unit_and_lenses_without_numbers_are_named(own_drive):
+    path = own_drive / "lidar/timestamps.json"
+    times = path.read_text()
+    path.write_text(json.dumps([t * 1e6 for t in json.loads(times)]))
+    with pytest.raises(ValueError, match="lidar/timestamps.json must give seconds"):
+        open_log(own_drive)
+    path.write_text(times)
+    (own_drive / "camera/front_camera/intrinsics.json").write_text('{"fx": NaN, "fy": 9, "cx": 1, "cy": 1}')
+    with pytest.raises(ValueError, match="front_camera/intrinsics.json must give numbers fx, fy, cx, cy: fx must be a positive"):
+        open_log(own_drive)
+
+
+def test_a_place_is_known_from_where_gps_has_one(own_drive):
+    path = own_drive / "meta/gps.json"
+    rows = json.loads(path.read_text())
+    nothing = dict.fromkeys(("lat", "long", "height"), float("nan"))
+    path.write_text(json.dumps([nothing, *rows[1:]]))
+    assert open_log(own_drive).meta["geodetic_origin"]["lat"] == rows[1]["lat"]
+    path.write_text(json.dumps([nothing] * len(rows)))
+    assert "geodetic_origin" not in open_log(own_drive).meta

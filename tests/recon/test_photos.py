@@ -29,7 +29,7 @@ def solved(walk, monkeypatch):
     """Structure from motion that knows its answer; the calls it got."""
     calls = []
 
-    def solve(pictures, names, workspace, ordered, angle_of_view):
+    def solve(pictures, names, workspace, ordered, angle_of_view, source):
         calls.append((names, ordered, angle_of_view))
         shutil.copytree(walk / "sparse", workspace / "sparse")
         images = workspace / "sparse/0/images.txt"
@@ -208,7 +208,7 @@ def test_pictures_without_overlap_are_refused_with_the_fix(tmp_path):
     for i in range(3):
         grey = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(i), dtype=torch.uint8)
         Image.fromarray(grey.numpy()).resize((256, 192)).save(folder / f"{i}.png")
-    with pytest.raises(ValueError, match="of 3 pictures in .* could be placed; take them closer together"):
+    with pytest.raises(ValueError, match=f"of 3 pictures of {folder} could be placed; take them closer together"):
         open_log(folder)
 
 
@@ -230,3 +230,20 @@ def test_real_photos_are_placed(shared, tmp_path, told):
     # how many of so few are placed is luck: matching draws lots
     assert len(camera) >= 3 and len(log.points.xyz) > 50 and camera.lens.kind == "opencv"
     assert torch.isfinite(log.ego.world_from_body).all() and camera.image(0).shape == (480, 640, 3)
+
+
+def test_the_folder_one_is_in_is_read_too(walk, solved, tmp_path, monkeypatch):
+    inside = shutil.copytree(walk / "images", tmp_path / "walk" / "more").parent
+    shutil.copytree(walk / "images", inside, dirs_exist_ok=True)
+    monkeypatch.chdir(inside)
+    assert open_log(".").name == "walk"
+    monkeypatch.chdir(inside / "more")
+    assert open_log("..").name == "walk" and len(solved) == 1 and (tmp_path / "walk.sfm").is_dir()
+
+
+def test_what_else_has_the_workspaces_name_is_left_alone(walk, solved, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    (tmp_path / "walk.sfm").write_text("mine")
+    with pytest.raises(FileExistsError, match="walk.sfm is to hold the poses of walk, and holds something else; move or rename it"):
+        open_log(tmp_path / "walk")
+    assert not solved and (tmp_path / "walk.sfm").read_text() == "mine"

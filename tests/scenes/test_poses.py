@@ -12,6 +12,7 @@ from scenes.poses import (
     interpolate,
     inverse,
     matrix_from_quat,
+    nearest_rotation,
     pose_from,
     quat_from_matrix,
     slerp,
@@ -106,3 +107,12 @@ def test_numpy_and_lists_become_float64_poses():
     assert close(pose_from([2.0, 0, 0, 0], [0, 0, 0]), EYE, 0)
     with pytest.raises(ValueError, match=r"must have shape \(..., 4, 4\), got \(3, 4\)"):
         as_pose(np.zeros((3, 4)))
+
+
+def test_the_nearest_rotation_mirrors_nothing():
+    generator = torch.Generator().manual_seed(3)
+    near = nearest_rotation(torch.randn(40, 3, 3, generator=generator, dtype=torch.float64))
+    assert torch.allclose(torch.linalg.det(near), torch.ones(40, dtype=torch.float64))
+    assert torch.allclose(near @ near.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3), rtol=0, atol=1e-12)
+    turn = yaw(0.7)[:3, :3]
+    assert torch.allclose(nearest_rotation(1.3 * turn), turn, rtol=0, atol=1e-14)

@@ -11,7 +11,7 @@ from randomized import START_US, asset, gaussians, scene, trajectory
 
 import scenes
 from scenes import Actor, Asset, Camera, Gaussians, Ground, Pinhole, Placed, RigCamera, Sky, SplatModel
-from scenes.poses import pose_from
+from scenes.poses import pose_from, translation
 from scenes.sky import linear_from_srgb, srgb_from_linear
 from scenes.trajectory import Trajectory, all_at
 
@@ -215,3 +215,18 @@ def test_a_trajectory_at_many_times_is_the_trajectory_at_each():
     assert still.covers_each(beyond).all() and torch.equal(still.near_each(beyond)[0], still.near(-10_000))
     with pytest.raises(ValueError, match="time 900 us is outside"):
         path.at_each(torch.tensor([0, 900]))
+
+
+def test_a_part_of_a_path_is_as_the_whole_within_its_span():
+    times = torch.tensor([0, 100, 200, 300, 400])
+    poses = translation().repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 1, 4, 9, 16], dtype=torch.float64)
+    path = Trajectory(times, poses)
+    parts = {
+        (150, 250): [100, 200, 300], (100, 200): [100, 200], (-50, 20): [0, 100], (350, 900): [300, 400], (900, 950): [400], (-9, -5): [0],
+    }  # fmt: skip
+    for span, kept in parts.items():
+        part = path.within(span)
+        assert part.times_us.tolist() == kept, span
+        assert all(torch.equal(part.at(t), path.at(t)) for t in kept)
+    assert len(Trajectory(times[:1], poses[:1]).within((500, 600))) == 1
