@@ -350,7 +350,7 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     out, _ = door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.spz")])
     assert "a.spz: " in out and "bytes each; off by at most" in out
     errors = door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "a.spz")], 1)[1]
-    assert "a.spz exists; give -w to replace it, or another name as the second" in errors
+    assert "a.spz exists; give -w to replace it, or another name\n" in errors
     door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.compressed.ply")])
     assert json.loads(door(["info", str(tmp_path / "b.compressed.ply"), "--json"])[0])["format"] == "compressed PLY"
     assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]

@@ -130,7 +130,9 @@ def _tints(colours: np.ndarray, linear: bool, opaque: bool) -> np.ndarray:
     """Display-referred tints rgba `[F, 3, 4]` of colours `[F, 3, 3 or 4]` of corners, in linear light or not, of whole numbers or 0..1."""
     most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1.0
     rgba = np.ones((*colours.shape[:2], 4))
-    rgba[..., : 3 if opaque else colours.shape[2]] = (colours / most)[..., : 3 if opaque else None]
+    rgba[..., : colours.shape[2]] = colours / most
+    if opaque:
+        rgba[..., 3] = 1
     if linear:
         rgba[..., :3] = srgb_from_linear(torch.from_numpy(rgba[..., :3])).numpy()
     return rgba
