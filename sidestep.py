@@ -71,7 +71,8 @@ class Insert:
     path: Way = "straight"
     """Straight on, or in a lane beside the recorded path, to which --yaw then is relative; yaw 180deg is oncoming traffic."""
     trajectory: FileOrNone = None
-    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw and --speed: seconds after --start, metres forward and left."""
+    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw, --speed and --path: seconds after --start, metres forward and
+    left."""
     start: Time = 0
     """When the place holds, after the drive's first moment."""
     databank: Path = Path("databank")
@@ -80,6 +81,8 @@ class Insert:
     def run(self) -> None:
         if (self.at is None) == (self.trajectory is None):
             raise UsageError("say where the asset goes with --at X,Y, as --at 20m,-3.5m, or with --trajectory t.csv; one of the two")
+        if self.trajectory is not None and (self.yaw or self.speed or self.path != "straight"):
+            raise UsageError("--trajectory says it all, also where the asset heads and how fast; leave --yaw, --speed and --path out")
         from scenes import Databank
         from scenes.insert import insert
         from scenes.seen import seeing, unseen_warning
@@ -148,7 +151,8 @@ class Render:
             raise UsageError(f"--weights {self.weights} would do nothing without --enhance; add it, or leave --weights out")
         from render.aside import shift_warning
         from render.clip import clip_cameras, clip_times, cut_warning
-        from render.record import record
+        from render.record import record, stale_warning
+        from render.video import odd_warning
         from scenes import Databank
         from scenes.files import kind_of
         from scenes.insert import insert
@@ -171,6 +175,8 @@ class Render:
             witnesses = seeing(result.actor, cameras)
             warnings += absence_warning(result.actor, cameras, witnesses)
             warnings += unseen_warning(result.actor, witnesses)
+        warnings += odd_warning(self.output, *(self.size or (cameras[0].width, cameras[0].height)))
+        warnings += stale_warning(self.output, self.outputs)
         warn(warnings)
         width, height = self.size or (None, None)
         stages: Stages = {}

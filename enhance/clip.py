@@ -20,7 +20,7 @@ from render.frame_types import Frame
 from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
-from render.video import Video, VideoWriter, read_video
+from render.video import Video, VideoWriter, odd_warning, read_video
 from scenes.opening import warn
 from scenes.scene import Scene
 
@@ -120,6 +120,11 @@ def enhance_video(
             done += 1
             if progress is not None:
                 progress(done, clip.count)
+    if isinstance(clip, Video):
+        warn(odd_warning(out, clip.width, clip.height))
+    if isinstance(clip, Video) and clip.sound:
+        fix = f"ffmpeg -i {out} -i {source} -map 0:v -map 1:a -c copy with_sound{Path(out).suffix} puts it back"
+        warn([f"{out} is without the sound of {source}; {fix}"])
     if not changed:
         why = f"its colours are those of {like}" if like is not None else _why(rendered, instances, told)
         warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])

@@ -117,9 +117,23 @@ def versions() -> dict[str, str]:
     return found
 
 
+def stale_warning(path: Path, keep: Sequence[str]) -> list[str]:
+    """What to tell of frames that an earlier clip of this name kept, where the one at `path` keeps none instead: a sentence, or none."""
+    folder = path.with_suffix("")
+    if keep or not folder.is_dir() or not _holds_frames(folder):
+        return []
+    return [f"{folder} holds frames of an earlier clip, not of this {path.name}; --outputs keeps this one's there"]
+
+
+def _holds_frames(folder: Path) -> bool:
+    """Whether a folder holds kept frames and nothing else."""
+    names = [entry.name for entry in folder.iterdir()]
+    return bool(names) and all(name in OUTPUTS for name in names)
+
+
 def _check_replaceable(folder: Path) -> None:
     """FileExistsError where `folder` holds anything but kept frames: scenes/s1 stands where the frames of scenes/s1.mp4 would go."""
-    if folder.exists() and not (folder.is_dir() and all(entry.name in OUTPUTS for entry in folder.iterdir())):
+    if folder.exists() and not (folder.is_dir() and (_holds_frames(folder) or not any(folder.iterdir()))):
         raise FileExistsError(f"{folder} holds something else than kept frames, so it is left alone; give another name with -o")
 
 
@@ -146,5 +160,5 @@ def _inserted(scene: Scene) -> list[dict]:
             "world_from_asset": [actor.trajectory.world_from_body[0].tolist(), actor.trajectory.world_from_body[-1].tolist()],
         }
         for i, actor in enumerate(scene.actors)
-        if actor.asset.meta.get("inserted")
+        if not actor.recorded
     ]

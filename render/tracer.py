@@ -26,13 +26,15 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Mesh:
-    """F textured triangles: vertices float32 `[V, 3]` metres, faces int32 `[F, 3]`; of each face's corners unit normals `[F, 3, 3]` and
-    texture coordinates `[F, 3, 2]` (u right, v down, in textures); texture `[F]` index into textures uint8 `[H, W, 4]`, sRGB and alpha."""
+    """F textured triangles: vertices float32 `[V, 3]` metres, faces int32 `[F, 3]`; of each face's corners unit normals `[F, 3, 3]`,
+    texture coordinates `[F, 3, 2]` (u right, v down, in textures) and tints `[F, 3, 4]`, which multiply the texture; texture `[F]` index
+    into textures uint8 `[H, W, 4]`. Both are sRGB and alpha: of what is nearly a power the products are nearly those of linear light."""
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     uvs: np.ndarray
+    tints: np.ndarray
     texture: np.ndarray
     textures: tuple[np.ndarray, ...]
     opaque_from: float = 0.5
@@ -69,13 +71,14 @@ class TracedMesh:
         tensors = {
             "normals": torch.from_numpy(m.normals.astype(np.float32).reshape(-1, 3)),
             "uvs": torch.from_numpy(m.uvs.astype(np.float32).reshape(-1, 2)),
+            "tints": torch.from_numpy(m.tints.astype(np.float32).reshape(-1, 4)),
             "texture": torch.from_numpy(m.texture.astype(np.int32)),
             "first": torch.from_numpy(first.astype(np.int32)),
             "width": torch.tensor([w for _, w in sizes], dtype=torch.int32),
             "height": torch.tensor([h for h, _ in sizes], dtype=torch.int32),
             "texels": torch.from_numpy(np.concatenate([t.reshape(-1, 4) for t in m.textures]).astype(np.float32) / 255),
         }
-        types = {"normals": wp.vec3, "uvs": wp.vec2, "texels": wp.vec4}
+        types = {"normals": wp.vec3, "uvs": wp.vec2, "tints": wp.vec4, "texels": wp.vec4}
         surface = Surface()
         for name, tensor in tensors.items():
             setattr(surface, name, wp.from_torch(tensor.contiguous(), dtype=types.get(name, wp.int32)))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from render.matroska import lacking
 from scenes.atomic import atomic_file
 from scenes.checks import check_tensor
 
@@ -55,8 +56,8 @@ class Video:
     """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1, turned as the file says (phones').
 
     fps: frames a second in the mean; width, height: pixels of the turned frames; pixel_aspect: how much wider than high a pixel is to be
-    shown; count, seconds: frames and length as the file claims, None where it does not say. Raises ValueError where the file is no video,
-    has no frames, breaks off in the middle, or goes on in another size.
+    shown; count, seconds: frames and length as the file claims, None where it does not say; sound: whether it has any. Raises ValueError
+    where the file is no video, has no frames, breaks off in the middle, or goes on in another size.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -72,7 +73,10 @@ class Video:
             self.fps = float(stream.average_rate or stream.guessed_rate or 25)
             self.count = stream.frames or None
             self.seconds = float(stream.duration * stream.time_base) if stream.duration else None
+            self.sound = bool(container.streams.audio)
             aspect = stream.sample_aspect_ratio or Fraction(1)
+        if cut := lacking(self.path):
+            raise ValueError(f"{path} breaks off {cut} bytes before its end; fetch the file again")
         frames = self._decoded()
         first = next(frames)  # what turns them is said with the frames
         frames.close()
@@ -134,6 +138,14 @@ def _quarters(frame) -> int:
 def read_video(path: str | os.PathLike) -> Video:
     """Open a video; see Video."""
     return Video(path)
+
+
+def odd_warning(path: str | os.PathLike, width: int, height: int) -> list[str]:
+    """What to tell of a video whose sides in pixels are not even: a sentence, or none."""
+    if width % 2 == height % 2 == 0:
+        return []
+    size = f"{width + width % 2}x{height + height % 2}"
+    return [f"{path} has {size} pixels for {width}x{height}: H.264 needs even sides, so a last row or column is there twice"]
 
 
 class VideoWriter:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from scenes.opening import UsageError, dropped, fresh, open_scene, open_splats, warn
 from scenes.options import AnyPath, Flag, Name, Overwrite, Replacement, Retiming, ScenePath, Shift, Track
+
+if TYPE_CHECKING:
+    from scenes.usd_edit import Undone
 
 Value = TypeVar("Value")
 
@@ -74,6 +78,8 @@ class Convert:
     """Replace an existing file."""
 
     def run(self) -> None:
+        if self.target.exists() and not self.overwrite:
+            raise FileExistsError(f"{self.target} exists; give -w to replace it, or another name")  # there is no -o here
         fresh(self.target, self.overwrite)
         from scenes.convert import convert
         from scenes.formats.trained import model_of
@@ -108,18 +114,23 @@ class Edit:
         asked = bool(self.remove or self.shift or self.replace or self.retime)
         if not asked and not self.undo:
             raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
+        from scenes.usd_edit import undone
+
+        with ExitStack() as stack:
+            gone = stack.enter_context(undone(self.scene, self.undo)) if self.undo else []
+            warnings, said = self._changed() if asked else ([], [])
+        for line in (*(_without(self.scene, edit) for edit in gone), *said):
+            print(line)
+        warn(warnings)
+
+    def _changed(self) -> tuple[list[str], list[str]]:
+        """Write the edit's layer; what to warn of, and what was done."""
         from scenes import Databank
         from scenes import edit as edits
-        from scenes.usd_edit import add_change, free_name, undo
+        from scenes.astray import astray
+        from scenes.match import other_model
+        from scenes.usd_edit import add_change, free_name
 
-        went: list[str] = []
-        for name in (n for n in self.undo if n not in went):
-            idle = undo(self.scene, name)
-            also = f", and without {', '.join(idle)}, which changed only what {name} had brought" if idle else ""
-            print(f"{self.scene} is again as it was without {name}{also}")
-            went += idle
-        if not asked:
-            return
         scene, _ = open_scene(self.scene)
         wanted = _once(self.replace, "--replace")
         bank = Databank(self.databank)
@@ -128,9 +139,18 @@ class Edit:
         told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
         name = self.name or free_name(self.scene, "edit")
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
-        warn(edits.absences(edit, scene))
+        others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
         layer = self.scene / "edits" / f"{name}.usda"
-        print(f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it")
+        done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
+        return [*others, *astray(edit, scene), *edits.absences(edit, scene)], [done]
+
+
+def _without(scene: Path, edit: Undone) -> str:
+    """What `edit --undo` says of an edit that it took out of a scene."""
+    also = f", and without {', '.join(edit.idle)}, which changed only what {edit.name} had brought" if edit.idle else ""
+    still = [f"{by} still moves {', '.join(tracks)} from where {edit.name} had put it" for by, tracks in edit.held.items()]
+    but = f"; but {', and '.join(still)}: undo that too, and give it anew" if still else ""
+    return f"{scene} is again as it was without {edit.name}{also}{but}"
 
 
 def _once(pairs: Iterable[tuple[str, Value]], option: str) -> dict[str, Value]:

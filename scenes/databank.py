@@ -2,7 +2,8 @@
 
 databank/index.json  assets/<class>/<number>/{asset.usdc,asset.json,thumb.png,asset.photos/}
 
-An asset's id is "<class>/<number>", as car/0003. index.json lists every entry; asset.json holds the same entry beside the asset.
+An asset's id is "<class>/<number>", as car/0003. index.json lists every entry; asset.json holds the same entry beside the
+asset, and from there an index that was lost is made anew by the next asset that is added.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
@@ -81,17 +83,16 @@ class Databank:
     def add(self, asset: Asset, thumb_png: bytes | None = None, half: bool = False) -> str:
         """Store an asset under the next free number of its class and return the id. It appears whole or not at all.
 
-        Of `asset.meta`, licence, attribution, source and views go into the index.
+        Of `asset.meta`, licence, attribution, source and views go into the index. ValueError where the index is corrupt, or is lost and an
+        asset's own entry, too.
         """
         from scenes.usd_splats import save_asset, to_json
 
         asset.gaussians.validate(f"asset {asset.label!r}")
-        self.path.mkdir(parents=True, exist_ok=True)
-        entries = self.entries() if (self.path / "index.json").exists() else []
+        entries = self.entries() if (self.path / "index.json").exists() else self._beside()
         kind = slug(asset.label)
         folder = self.path / "assets" / kind
-        folder.mkdir(parents=True, exist_ok=True)
-        names = [e.id for e in entries] + [f"{kind}/{p.name}" for p in folder.iterdir()]  # a killed add leaves a folder without an entry
+        names = [e.id for e in entries] + [f"{kind}/{p.name}" for p in folder.glob("*")]  # a killed add leaves a folder without an entry
         numbers = [int(m[1]) for name in names if (m := re.fullmatch(rf"{kind}/(\d+)", name))]
         id = f"{kind}/{max(numbers, default=0) + 1:04d}"
         home, meta = PurePosixPath("assets", id), asset.meta
@@ -108,15 +109,36 @@ class Databank:
             asset=str(home / "asset.usdc"),
             thumb=None if thumb_png is None else str(home / "thumb.png"),
         )
-        with atomic_folder(self.path / home) as partial:
-            save_asset(partial / "asset.usdc", asset, half)
-            (partial / "asset.json").write_text(to_json({**asdict(entry), "meta": meta}, "the asset's meta"), encoding="utf-8")
-            if thumb_png is not None:
-                (partial / "thumb.png").write_bytes(thumb_png)
+        told = to_json({**asdict(entry), "meta": meta}, "the asset's meta")
+        new = [f for f in (folder, folder.parent, self.path) if not f.exists()]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with atomic_folder(self.path / home) as partial:
+                save_asset(partial / "asset.usdc", asset, half)
+                (partial / "asset.json").write_text(told, encoding="utf-8")
+                if thumb_png is not None:
+                    (partial / "thumb.png").write_bytes(thumb_png)
+        except BaseException:
+            for empty in new:
+                with suppress(OSError):
+                    empty.rmdir()
+            raise
         index = {"format": FORMAT, "version": VERSION, "entries": [asdict(e) for e in [*entries, entry]]}
         with atomic_file(self.path / "index.json") as partial:
             partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
+
+    def _beside(self) -> list[Entry]:
+        """The entries that assets hold themselves, of a databank whose index was lost."""
+        return [read_entry(file) for file in sorted(self.path.glob("assets/*/*/asset.json"))]
+
+
+def read_entry(file: Path) -> Entry:
+    """The entry in an asset.json. FileNotFoundError, or ValueError where it is corrupt."""
+    try:
+        return _entry(json.loads(file.read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is corrupt: {type(error).__name__} {error}; restore it, or take its folder away") from error
 
 
 def _metres(size: Sequence[float]) -> tuple[float, float, float]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
 
 from scenes.asset import Actor, Asset
 from scenes.gaussians import Gaussians
+from scenes.match import matched
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -52,7 +53,8 @@ class Edit:
         return list(dict.fromkeys([*self.remove, *self.shift, *self.replace, *self.retime]))
 
     def apply(self, actor: Actor, scene: Scene) -> Actor:
-        """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were."""
+        """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were; another asset
+        in the light of where it is at the drive's first moment, or nearest to that."""
         asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
         if actor.track in self.shift:
             path = shifted(path, self.shift[actor.track], scene)
@@ -61,6 +63,8 @@ class Edit:
             deformation = deformation and deformation.later(self.retime[actor.track])
         if actor.track in self.replace:
             deformation = None  # another body bends elsewhere
+            first = int((path.times_us - scene.ego.times_us[0]).abs().argmin())
+            asset = matched(asset, scene, path.world_from_body[first, :2, 3])
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 
 
@@ -115,8 +119,17 @@ def edited(scene: Scene, edit: Edit) -> Scene:
     painted, colours = bared(scene, edit.remove)
     sh[painted] = colours
     hidden = replace(scene.background, gaussians=replace(splats, logit_opacities=logits, sh=sh))
-    left = [p for p in scene.meta.get("parked", []) if p["track"] not in edit.remove]
-    return replace(scene, actors=actors, background=hidden, meta={**scene.meta, **({"parked": left} if "parked" in scene.meta else {})})
+    return replace(scene, actors=actors, background=hidden, meta=unparked(scene.meta, edit.remove))
+
+
+def unparked(meta: Mapping, tracks: Collection[str]) -> dict:
+    """A scene's meta with the entries of these `parked` vehicles among `parked_once`: they are gone, but what shadows the street has beside
+    them still tells of the sun (scenes/light.py)."""
+    gone = [p for p in meta.get("parked", []) if p["track"] in tracks]
+    if not gone:
+        return dict(meta)
+    left = [p for p in meta["parked"] if p["track"] not in tracks]
+    return {**meta, "parked": left, "parked_once": [*meta.get("parked_once", []), *gone]}
 
 
 def parked(scene: Scene) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:

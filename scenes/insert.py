@@ -14,7 +14,7 @@ from scenes.collide import collisions
 from scenes.detail import coarser
 from scenes.edit import named
 from scenes.lane import Lane
-from scenes.match import matched
+from scenes.match import matched, other_model
 from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
@@ -24,6 +24,7 @@ from scenes.trajectory import Trajectory
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
 LONGEST_US = 3_600_000_000  # from the clip's first frame: no drive lasts longer, and each pose takes a look at the ground
 ASIDE = 5.0  # metres off the recorded path from which an asset is still drawn in full: half of itself, and a shift to the next lane
+SIDEWAYS = 30  # degrees from its way by which what goes may be turned: beyond, no wheel drives so
 NEAREST = 1.0  # metres from which it is, wherever it stands
 
 
@@ -64,6 +65,11 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     if len(times) > 1 and (times[-1] < scene.ego.times_us[0] or times[0] > scene.ego.times_us[-1]):
         first, last = ((int(t) - start_us) / 1e6 for t in (times[0], times[-1]))
         warnings.append(f"{placement.asset} is there from {first:g}s to {last:g}s only, and never during the drive")
+    if placement.path == "lane" and placement.speed and abs(math.cos(placement.yaw)) < math.cos(math.radians(SIDEWAYS)):
+        turned = (
+            f"{placement.asset} is turned by {math.degrees(placement.yaw):g}deg from the lane that it goes along, so it slides sideways"
+        )
+        warnings.append(f"{turned}; give yaw=0deg or yaw=180deg, or path=straight to go where it faces")
     for point, heading in zip(xy, headings, strict=True):
         poses.append(standing_pose(scene, point, float(heading), asset.size))
     beyond = max(outside_ground(scene, point) for point in xy)
@@ -71,8 +77,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         warnings.append(f"{placement.asset}: the scene has no ground, so its height is that of the lowest splats around it")
     elif beyond > 0:
         warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
-    if asset.model != scene.model:
-        warnings.append(f"{placement.asset} was trained with {asset.model}, but the scene is rendered with {scene.model}")
+    warnings += other_model(placement.asset, asset, scene)
     lit = matched(asset, scene, xy[int((times - start_us).abs().argmin())])
     path = Trajectory(times, torch.stack(poses))
     splats = coarser(lit.gaussians, finest_pixel(scene, path) / 2)  # what half a pixel holds cannot be told apart

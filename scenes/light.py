@@ -95,14 +95,15 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
 
 
 def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
-    """The part of the light that the ground lacks on the far side from the sun of parked vehicles, against the near side: whether the sun
-    reaches the street at all, where the houses that keep it off were never seen.
+    """The part of the light that the ground lacks on the far side from the sun of parked vehicles, of removed ones too, against the near
+    side: whether the sun reaches the street at all, where the houses that keep it off were never seen.
 
     What three in four vehicles show at least: a kerb has pale pavement on one side and dark road on the other, which looks like a shadow
     on one side of the street, and on the other like its opposite; a sun that is there shows on both. None where fewer than 3 tell.
     """
     background, ground = scene.background, scene.ground
-    if ground is None or not scene.meta.get("parked"):
+    vehicles = [*scene.meta.get("parked", []), *scene.meta.get("parked_once", [])]
+    if ground is None or not vehicles:
         return None
     pose, splats = background.world_from_local.float(), background.gaussians.detach().to("cpu")
     means = splats.means @ pose[:3, :3].T + pose[:3, 3]
@@ -112,7 +113,7 @@ def shadows_beside_parked(scene: Scene, sun: torch.Tensor) -> float | None:
     luminance = linear_from_srgb(rgb_from_sh(splats.sh[low, 0]).clamp(0, 1)).mean(1)
     away = -torch.nn.functional.normalize(sun[:2].float(), dim=0)
     lacking = []
-    for vehicle in scene.meta["parked"]:
+    for vehicle in vehicles:
         box, size = torch.tensor(vehicle["world_from_box"]), torch.tensor(vehicle["size"])
         reach = (box[:2, :2].T @ away).abs() @ size[:2] / 2 + BEYOND
         sides = [luminance[(places - box[:2, 3] - way * reach * away).norm(dim=1) < BEYOND] for way in (1, -1)]

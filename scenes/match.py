@@ -60,6 +60,13 @@ def matched(asset: Asset, scene: Scene, xy: torch.Tensor) -> Asset:
     return replace(asset, gaussians=relit(asset.gaussians, gain), meta=meta)
 
 
+def other_model(name: str, asset: Asset, scene: Scene) -> list[str]:
+    """What to tell of an asset that goes by `name` where its splats were trained otherwise than the scene's: a sentence, or none."""
+    if asset.model == scene.model:
+        return []
+    return [f"{name} was trained with {asset.model}, but the scene is rendered with {scene.model}"]
+
+
 def relit(splats: Gaussians, gain: torch.Tensor) -> Gaussians:
     """Splats whose linear light is multiplied by `gain` `[3]`. What changes with the view changes as the curve to sRGB does there."""
 

@@ -61,6 +61,8 @@ def parse_placement(text: str) -> Placement:
     for key, _, value in (p.partition("=") for p in parts if "=" in p):
         if key not in KEYS:
             raise ValueError(f'"{text}" has the unknown key "{key}"; there are {", ".join(KEYS)}.{nearest(key, KEYS)}')
+        if key in given:
+            raise ValueError(f'"{text}" says {key} twice; say it once')
         given[key] = value
     if "trajectory" in given:
         if place or len(given) > 1:

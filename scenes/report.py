@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import torch
 
 from scenes.asset import Asset
-from scenes.databank import Databank, Entry
+from scenes.databank import Databank, Entry, read_entry
 from scenes.files import as_is, kind_of, read, splats_of
 from scenes.formats import USD, found
 from scenes.formats.trained import model_of
@@ -212,6 +212,9 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
     if not scene.rig:
         yield f"{where}: there is no camera"
     for name, camera in scene.rig.items():
+        if (camera.times_us.diff() <= 0).any():
+            at = int((camera.times_us.diff() <= 0).nonzero()[0]) + 1
+            yield f"{where}: the times of camera {name} must rise, but frame {at} is taken no later than the one before"
         early = [int(t) for t in camera.times_us if not scene.ego.covers(int(t))]
         if early:
             yield f"{where}: camera {name} took {len(early)} frames when the body's pose is unknown, the first at {early[0]} us"
@@ -239,9 +242,10 @@ def _databank_problems(path: Path, clean: Callable[[Gaussians, str], Gaussians])
         lost = _missing(path, entry)
         yield from (f"{entry.id} lacks its file {file}" for file in lost)
         file = path / entry.asset
-        if file in lost:
+        if {file, file.with_name("asset.json")} & set(lost):
             continue
         try:
+            read_entry(file.with_name("asset.json"))
             asset = bank.load(entry.id, clean)
         except (ValueError, OSError) as error:
             yield str(error)
@@ -265,7 +269,8 @@ def _photo_problems(asset: Asset, where: str) -> Iterator[str]:
 
 
 def _missing(bank: Path, entry: Entry) -> list[Path]:
-    return [bank / file for file in (entry.asset, entry.thumb) if file and not (bank / file).is_file()]
+    told = str(PurePosixPath(entry.asset).with_name("asset.json"))
+    return [bank / file for file in (entry.asset, told, entry.thumb) if file and not (bank / file).is_file()]
 
 
 def _usd_files(path: Path) -> list[Path]:

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
-from scenes.atomic import atomic_folder
+from scenes.atomic import atomic_file, atomic_folder
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
@@ -67,7 +70,8 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
 
     A removed actor becomes inactive, and the splats of a removed parked vehicle transparent, the street below it
     as beside it; another one's path and asset are outweighed;
-    `edited` in their asset's meta names the edit. An edit stands on what it found: of two that change the same actor, the later one counts.
+    `edited` in their asset's meta names the edit, and `remove` in its own meta who is gone.
+    An edit stands on what it found: of two that change the same actor, the later one counts.
     Raises as `add_edit` and `check_edit`.
     """
     path = Path(path)
@@ -80,8 +84,8 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     painted, colours = bared(recorded, edit.remove)
 
     def files(folder: Path) -> None:
-        for track, asset in edit.replace.items():
-            save_asset(folder / f"{Path(prims[track]).name}.usdc", asset, half)
+        for actor in (a for a in changed if a.track in edit.replace):
+            save_asset(folder / f"{Path(prims[actor.track]).name}.usdc", actor.asset, half)
         if hidden or len(painted):
             _save_background(path, folder / "hidden.usda", hidden, painted.tolist(), colours.tolist())
 
@@ -102,28 +106,66 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
         if hidden or len(painted):
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
-    _write(path, name, meta, files, author)
+    _write(path, name, {**meta, "remove": list(edit.remove)} if edit.remove else meta, files, author)
+
+
+@dataclass(frozen=True)
+class Undone:
+    """An edit that was taken out of a scene folder."""
+
+    name: str
+    idle: tuple[str, ...]
+    """Edits that changed only actors which it brought, and went with it."""
+    held: dict[str, list[str]]
+    """Later edits that moved an actor from where this one had put it, and still do; and which actors."""
 
 
 def undo(scene: str | Path, name: str) -> list[str]:
-    """Take an edit out of a scene folder, with all its files; also one whose layer was deleted by hand.
+    """Take one edit out of a scene folder, as `undone` does; returns the names of those that went with it."""
+    with undone(scene, [name]) as (gone,):
+        return list(gone.idle)
 
-    With it go the edits that changed only actors which it brought; returns their names. ValueError for no such edit, and where an edit
-    changes such an actor and something else.
+
+@contextmanager
+def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
+    """Take edits out of a scene folder, with all their files, for a block that changes it further; where that fails they are back.
+
+    Also one whose layer was deleted by hand. With each go the edits that changed only actors which it brought. ValueError for no such
+    edit, and where an edit changes such an actor and something else.
     """
     scene = Path(scene)
     read_metadata(scene)
-    layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
+    root, out = scene / "scene.usda", list[Undone]()
+    before = root.read_bytes()
+    with TemporaryDirectory(prefix=".undone.", dir=scene) as aside:
+        try:
+            gone: set[str] = set()
+            for name in names:
+                if name not in gone:
+                    out.append(_taken_out(scene, name, Path(aside)))
+                    gone |= {name, *out[-1].idle}
+            yield [replace(u, held={edit: tracks for edit, tracks in u.held.items() if edit not in gone}) for u in out]
+        except BaseException:
+            for path in Path(aside).iterdir():
+                path.rename(scene / "edits" / path.name)
+            with atomic_file(root) as partial:
+                partial.write_bytes(before)
+            raise
+
+
+def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
+    """Move an edit's files, and those of the edits that go with it, from a scene to the folder `aside`."""
+    edits = scene / "edits"
     with open_stage(scene / "scene.usda") as stage:
         have = [e["name"] for e in read_edits(stage)]
-        if name not in have and not (_is_name(name) and (layer.exists() or folder.exists())):
+        if name not in have and not (_is_name(name) and ((edits / f"{name}.usda").exists() or (edits / name).exists())):
             raise ValueError(unknown("edit", name, str(scene), have))
-        idle = _idle_without(stage, name)
-    for each in (*idle, name):
+        gone = Undone(name, tuple(_idle_without(stage, name)), _held(stage, name))
+    for each in (*gone.idle, name):
         drop_sublayer(scene, f"./edits/{each}.usda")
-        (scene / "edits" / f"{each}.usda").unlink(missing_ok=True)
-        shutil.rmtree(scene / "edits" / each, ignore_errors=True)
-    return idle
+        for path in (p for p in (edits / f"{each}.usda", edits / each) if p.exists()):
+            path.rename(aside / path.name)
+    return gone
 
 
 def free_name(scene: Path, wish: str) -> str:
@@ -154,6 +196,21 @@ def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
             raise ValueError(f"the edit {edit} changes more than {lost}, which {name} brought; undo both: --undo {edit} --undo {name}")
         if changed & gone:
             out.append(edit)
+    return out
+
+
+def _held(stage: Usd.Stage, name: str) -> dict[str, list[str]]:
+    """Tracks of the actors whose path the edit `name` tells and a later one tells anew, from there on; by the later edit's name."""
+    root = stage.GetRootLayer()
+    paths = {}  # the newest first, as the layers are
+    for sub in (s for s in root.subLayerPaths if s != RECORDED):
+        layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
+        actors = layer and layer.GetPrimAtPath("/World/Actors")
+        paths[Path(sub).stem] = {p.name for p in actors.nameChildren if "xformOp:translate" in p.attributes} if actors else set()
+    own, out = paths.get(name, set()), {}
+    for edit in list(paths)[: list(paths).index(name)] if name in paths else []:
+        if both := sorted(own & paths[edit]):
+            out[edit] = [own_data(stage.GetPrimAtPath(f"/World/Actors/{prim}")).get("track", prim) for prim in both]
     return out
 
 

@@ -28,6 +28,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, Vt
 from scenes.asset import Actor
 from scenes.atomic import atomic_folder
 from scenes.camera import RigCamera
+from scenes.edit import unparked
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.hdr import load_hdr, save_hdr
@@ -72,11 +73,15 @@ def save_scene(path: Path, scene: Scene, replace: bool = False, half: bool = Fal
 
 
 def load_scene(path: Path, clean: Clean = Gaussians.checked) -> Scene:
-    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta, changed ones `edited`."""
+    """The scene of a folder, with its edits: inserted actors have `inserted` and `edit` in their asset's meta, changed ones `edited`.
+
+    An edit whose layer was deleted is undone; ValueError where one is damaged, or its layer lacks a file.
+    """
     meta = read_metadata(path)
     with open_stage(path / "scene.usda") as stage:
         if RECORDED in list(stage.GetRootLayer().subLayerPaths) and not (path / RECORDED).is_file():
             raise FileNotFoundError(f"{path} lacks what was recorded: {path / RECORDED} is missing")
+        _check_edits(stage, path)
         return _read_scene(stage, path, meta, clean)
 
 
@@ -93,6 +98,7 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
         origin, model = int(meta["origin_us"]), SplatModel(**meta["model"])
         rig = {name: _load_camera(stage, entry, name) for name, entry in meta["cameras"].items()}
         own_meta = dict(meta["meta"])
+        _check_parked(own_meta.get("parked", []), path / "metadata.json")
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path / 'metadata.json'} is corrupt: {type(error).__name__} {error}") from error
     background = _prim(stage, "/World/Background", path)
@@ -100,6 +106,7 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
     edits = read_edits(stage)
     if edits:
         own_meta["edits"] = edits
+        own_meta = unparked(own_meta, [track for edit in edits for track in edit.get("remove", ())])
     return Scene(
         Placed(splats, local_pose(background)),
         tuple(_load_actor(p, path, origin, clean) for p in _actor_prims(stage, [e["name"] for e in edits])),
@@ -110,6 +117,19 @@ def _read_scene(stage: Usd.Stage, path: Path, meta: dict, clean: Clean) -> Scene
         _load_ground(stage, path),
         own_meta,
     )
+
+
+def _check_parked(entries: list[dict], file: Path) -> None:
+    """ValueError where an entry of a scene's `parked` vehicles is no box of finite numbers with a track and a label."""
+    for i, entry in enumerate(entries):
+        try:
+            named = isinstance(entry["track"], str) and isinstance(entry["label"], str)
+            box = *np.asarray(entry["size"], float).reshape(3), *np.asarray(entry["world_from_box"], float).reshape(16)
+        except (KeyError, TypeError, ValueError):
+            named, box = False, ()
+        if not named or not np.isfinite(box).all():
+            needs = "a track, a label, a size of 3 and a world_from_box of 4x4 finite numbers"
+            raise ValueError(f"{file} is corrupt: entry {i} of parked needs {needs}; restore the file, or take the entry out")
 
 
 def is_scene(path: Path) -> bool:
@@ -145,6 +165,18 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
         told = json.loads(data.get("sidestep_edit", "{}")) if layer else {"missing": True}
         out.append({**told, "name": Path(sub).stem})
     return out
+
+
+def _check_edits(stage: Usd.Stage, path: Path) -> None:
+    """ValueError where an edit's layer is there, and USD left it or one below it out."""
+    root = stage.GetRootLayer()
+    for sub in (s for s in root.subLayerPaths if s != RECORDED and (path / s).exists()):
+        layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
+        below = {path / "edits" / s: Sdf.Layer.Find(layer.ComputeAbsolutePath(s)) for s in layer.subLayerPaths} if layer else {}
+        for file in (file for file, found in {path / sub: layer, **below}.items() if not found):
+            how, name = "damaged" if file.exists() else "missing", Path(sub).stem
+            fix = f"restore it, or undo the edit: sidestep edit {path} --undo {name}"
+            raise ValueError(f"{file} is {how}, so the edit {name} cannot be applied; {fix}")
 
 
 def defines(layers: Iterable[Sdf.Layer], prim: Usd.Prim) -> bool:

@@ -18,14 +18,14 @@ from pxr import Usd, UsdGeom, UsdVol, Vt
 
 from scenes.asset import Asset
 from scenes.asset_photos import load_photos, photos_beside
-from scenes.formats.packing import log_scales_from, logits_from, opacities_from, unit
+from scenes.formats.packing import log_scales_from, logits_from, opacities_from, scales_from, unit
 from scenes.formats.transform import moved
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
 
 EXTENT_SIGMAS = 3.0
 _SPLATS = "ParticleField3DGaussianSplat"
-_HALF_TINY, _HALF_MAX = 2.0**-14, 65504.0
+_HALF_MAX = 65504.0
 Clean = Callable[[Gaussians, str], Gaussians]
 
 
@@ -97,7 +97,7 @@ def author_splats(stage: Usd.Stage, where: str, gaussians: Gaussians, model: Spl
     """Define a splat prim at a path of the stage."""
     g = {name: t.detach().cpu().numpy().astype(np.float64) for name, t in gaussians.tensors().items()}
     n, k = len(gaussians), gaussians.sh.shape[1]
-    scales = np.exp(g["log_scales"]).clip(*((_HALF_TINY, _HALF_MAX) if half else (np.finfo("f4").tiny, np.finfo("f4").max)))
+    scales = scales_from(g["log_scales"], "f2" if half else "f4")
     opacities, quats = opacities_from(g["logit_opacities"]), unit(g["quats"])
     sh = g["sh"].reshape(n * k, 3)
     splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, where)
@@ -203,4 +203,5 @@ def _extent(means: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.ndar
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     half = EXTENT_SIGMAS * np.sqrt(np.square(np.array(rows) * scales.T).sum(1)).T
-    return np.stack([(means - half).min(0), (means + half).max(0)]).astype(np.float32)
+    most = np.finfo("f4").max
+    return np.stack([(means - half).min(0), (means + half).max(0)]).clip(-most, most).astype(np.float32)

@@ -18,7 +18,7 @@ import street as made
 import torch
 
 from render.video import VideoWriter, read_video
-from scenes import Databank, Gaussians, Placed, load, save
+from scenes import Databank, Gaussians, Placed, SplatModel, load, save
 from scenes.usd_splats import save_gaussians
 
 REPOSITORY = Path(__file__).parents[1]
@@ -123,6 +123,14 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
     assert load(street).actors[0].asset.label == "car"
 
 
+def test_another_asset_of_another_splat_model_is_said(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    bank = Databank(tmp_path / "bank")
+    bank.add(replace(made.car(), model=SplatModel("ewa")))
+    _, errors = door(["edit", str(tmp_path / "street"), "--replace", "veh_1=car/0001", "--databank", str(bank.path)])
+    assert "warning: car/0001 was trained with SplatModel(projection='ewa'" in errors
+
+
 def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     street, bank = str(tmp_path / "street"), ["--databank", "bank"]
@@ -137,6 +145,18 @@ def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
     assert [a.track for a in load(street).actors] == ["veh_1", "inserted_car_0001_2"]
     _, errors = door(["edit", street, "--shift", "inserted_car_0001=1m,0m"], 1)
     assert "the edit edit removed it; --undo edit brings it back" in errors
+
+
+def test_undoing_and_changing_at_once_is_all_or_nothing(door, tmp_path):
+    shutil.copytree("street", tmp_path / "street")
+    street = str(tmp_path / "street")
+    door(["edit", street, "--shift", "veh_1=0m,1m", "--name", "aside"])
+    _, errors = door(["edit", street, "--undo", "aside", "--remove", "veh_2"], 1)
+    assert 'actor "veh_2" is not in' in errors and [e["name"] for e in load(street).meta["edits"]] == ["aside"]
+    door(["edit", street, "--undo", "aside", "--shift", "veh_1=0m,2m", "--name", "aside"])
+    door(["edit", street, "--retime", "veh_1=+0.1s", "--name", "late"])
+    out, _ = door(["edit", street, "--undo", "aside"])
+    assert "as it was without aside; but late still moves veh_1 from where aside had put it: undo that too, and give it anew" in out
 
 
 def test_an_asset_can_follow_a_csv(door, tmp_path):
@@ -196,6 +216,8 @@ USAGE = [
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
     ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
     ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
+    ([*INSERT, "--trajectory", "t.csv", "--speed", "5m/s"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
+    ([*INSERT, "--trajectory", "t.csv", "--path", "lane"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
     (["assets", "lst"], "lst", "list"),
     (["edit", "street"], "say what to change", "--remove veh_12"),
     (["edit", "street", "--shift", "veh_1"], "--shift", "as veh_3=0m,1.5m"),
@@ -231,6 +253,7 @@ DATA = [
     ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
     (["edit", "street", "--remove", "veh_2"], 'actor "veh_2" is not in street; it has veh_1. Did you mean veh_1?'),
     (["edit", "street", "--undo", "edit"], 'edit "edit" is not in street'),
+    (["edit", "stret", "--remove", "veh_1"], "stret does not exist. Did you mean street?"),
     (["assets", "show", "cra/0001", "--databank", "bank"], "Did you mean car/0001?"),
     (["enhance", "street/metadata.json", "-o", "x.mp4"], "street/metadata.json cannot be decoded as video"),
     (["enhance", "gone.mp4", "-o", "x.mp4"], "gone.mp4"),
@@ -326,7 +349,8 @@ def test_nan_is_dropped_and_counted_when_asked(door, spoiled):
 def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     out, _ = door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.spz")])
     assert "a.spz: " in out and "bytes each; off by at most" in out
-    assert "a.spz exists; give -w" in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "a.spz")], 1)[1]
+    errors = door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "a.spz")], 1)[1]
+    assert "a.spz exists; give -w to replace it, or another name\n" in errors
     door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.compressed.ply")])
     assert json.loads(door(["info", str(tmp_path / "b.compressed.ply"), "--json"])[0])["format"] == "compressed PLY"
     assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]
@@ -386,6 +410,16 @@ def test_existing_outputs_are_replaced_with_w(door, tmp_path):
     assert not (tmp_path / "out.mp4").exists()
     door([*words, "-w"])
     assert json.loads((tmp_path / "out.json").read_text())["size"] == [32, 18]
+
+
+def test_what_a_new_clip_does_not_replace_or_widens_is_said(door, tmp_path):
+    words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--duration", "100ms", "-w"]
+    assert "warning" not in door([*words, "--size", "32x18", "--outputs", "rgb"])[1]
+    _, errors = door([*words, "--size", "33x17"])
+    assert "out.mp4 has 34x18 pixels for 33x17: H.264 needs even sides" in errors
+    assert f"{tmp_path / 'out'} holds frames of an earlier clip, not of this out.mp4; --outputs" in errors
+    assert len(json.loads((tmp_path / "out.json").read_text())["warnings"]) == 2
+    assert "warning" not in door([*words, "--size", "32x18", "--outputs", "rgb"])[1]
 
 
 def begin(folder: Path, desk: Path) -> subprocess.Popen:

@@ -24,7 +24,8 @@ from scenes.match import ASPHALT
 from scenes.poses import matrix_from_quat, quat_from_matrix
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+GLTF = (".glb", ".gltf")
+SUFFIXES = (*GLTF, ".obj", ".ply", ".stl", ".off")
 MODEL = SplatModel(projection="ewa")
 
 
@@ -47,10 +48,13 @@ class MeshFit:
 def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0) -> Mesh:
     """A mesh file in the frame of an asset: x forward, z up, metres, origin at the base centre of its box.
 
-    up, forward: the file's own axes, as "y", "-z"; glTF's are y and z. ValueError for a file without triangles or axes that are not two.
+    up, forward: the file's own axes, as "y", "-z"; glTF's are y and z. ValueError for a file without triangles that can be seen, for
+    values that are not finite, and for axes that are not two.
     """
     import trimesh
 
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give one mesh file of it, as {path / 'car.glb'}")
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
@@ -62,22 +66,38 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     parts: list[trimesh.Trimesh] = [p for p in found if isinstance(p, trimesh.Trimesh) and len(p.faces)]
     if not parts:
         raise ValueError(f"{path} holds no triangles")
+    if not all(np.isfinite(p.vertices).all() for p in parts):
+        raise ValueError(f"{path} has vertices that are not finite")
     turn = turn_to_asset(up, forward)
     vertices = [p.vertices @ turn.T * scale for p in parts]
-    if not all(np.isfinite(v).all() for v in vertices):
-        raise ValueError(f"{path} has vertices that are not finite")
     low, high = np.concatenate(vertices).min(0), np.concatenate(vertices).max(0)
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     starts = np.cumsum([0, *(len(v) for v in vertices)])
-    looks = [_look(p) for p in parts]
-    return Mesh(
+    # copies, as dump makes them, have lost the vertex colours that come on top of a material
+    visuals = [loaded.geometry[p.metadata["name"]].visual if isinstance(loaded, trimesh.Scene) else p.visual for p in parts]
+    looks = [_look(v, p.faces, path.suffix.lower() in GLTF) for v, p in zip(visuals, parts, strict=True)]
+    mesh = Mesh(
         vertices=(np.concatenate(vertices) - base).astype(np.float32),
         faces=np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=False)]).astype(np.int32),
         normals=np.concatenate([(p.vertex_normals @ turn.T)[p.faces] for p in parts]),
-        uvs=np.concatenate([uv for uv, _ in looks]),
+        uvs=np.concatenate([uv for uv, _, _ in looks]),
+        tints=np.concatenate([tints for _, tints, _ in looks]),
         texture=np.concatenate([np.full(len(p.faces), i) for i, p in enumerate(parts)]),
-        textures=tuple(t for _, t in looks),
+        textures=tuple(t for _, _, t in looks),
     )
+    _check_seen(mesh, path)
+    return mesh
+
+
+def _check_seen(mesh: Mesh, path: Path) -> None:
+    """ValueError where nothing of a mesh can be seen, or cannot be told."""
+    for what, values in {"normals": mesh.normals, "texture coordinates": mesh.uvs, "vertex colours": mesh.tints}.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{path} has {what} that are not finite; export it again, without them or with whole ones")
+    if not _areas(mesh).any():
+        raise ValueError(f"{path} has no triangle of any area; export it again, with its surface")
+    if not len(_sampled(mesh, 4000)):
+        raise ValueError(f"{path} is see-through all over: its materials have no alpha of {mesh.opaque_from} or more; make them opaque")
 
 
 def turn_to_asset(up: str, forward: str) -> np.ndarray:
@@ -88,32 +108,46 @@ def turn_to_asset(up: str, forward: str) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _look(part) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates `[F, 3, 2]` of a part's corners, v down, and its texture uint8 `[H, W, 4]`; one texel where it has one colour."""
-    visual = part.visual
+def _look(visual, faces: np.ndarray, gltf: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of what trimesh says how faces `[F, 3]` look: texture coordinates `[F, 3, 2]` of their corners, v down, tints `[F, 3, 4]` there, and
+    the texture uint8 `[H, W, 4]`; one texel where they have one colour."""
+    middle, plain = np.full((len(faces), 3, 2), 0.5), np.ones((len(faces), 3, 4))
+    white = np.full((1, 1, 4), 255, np.uint8)
     if visual.kind == "texture":
-        uv = np.full((len(part.faces), 3, 2), 0.5) if visual.uv is None else np.asarray(visual.uv)[part.faces]
-        return np.stack([uv[..., 0], 1 - uv[..., 1]], -1), _texture(visual.material)
+        uv = middle if visual.uv is None else np.asarray(visual.uv)[faces]
+        colours = visual.vertex_attributes.get("color")  # glTF's alone
+        tints = plain if colours is None else _tints(np.asarray(colours)[faces], linear=True, opaque=_is_opaque(visual.material))
+        return np.stack([uv[..., 0], 1 - uv[..., 1]], -1), tints, _texture(visual.material)
     if visual.kind == "vertex":
-        return _by_corners(np.asarray(visual.vertex_colors)[part.faces])
+        # what has no material has glTF's default one, which is opaque
+        return middle, _tints(np.asarray(visual.vertex_colors)[faces], linear=gltf, opaque=gltf), white
     if visual.kind == "face":
-        return _by_corners(np.repeat(np.asarray(visual.face_colors)[:, None], 3, 1))
-    return np.full((len(part.faces), 3, 2), 0.5), np.array([[[180, 180, 180, 255]]], np.uint8)
+        return middle, _tints(np.repeat(np.asarray(visual.face_colors)[:, None], 3, 1), linear=False, opaque=False), white
+    return middle, plain, white if gltf else np.array([[[180, 180, 180, 255]]], np.uint8)
 
 
-def _by_corners(colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates and texture of colours `[F, 3, 4]` of face corners: a texel each."""
-    texture = colours.reshape(1, -1, 4).astype(np.uint8)
-    u = (np.arange(texture.shape[1]) + 0.5) / texture.shape[1]
-    return np.stack([u, np.full_like(u, 0.5)], -1).reshape(-1, 3, 2), texture
+def _tints(colours: np.ndarray, linear: bool, opaque: bool) -> np.ndarray:
+    """Display-referred tints rgba `[F, 3, 4]` of colours `[F, 3, 3 or 4]` of corners, in linear light or not, of whole numbers or 0..1."""
+    most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1.0
+    rgba = np.ones((*colours.shape[:2], 4))
+    rgba[..., : colours.shape[2]] = colours / most
+    if opaque:
+        rgba[..., 3] = 1
+    if linear:
+        rgba[..., :3] = srgb_from_linear(torch.from_numpy(rgba[..., :3])).numpy()
+    return rgba
+
+
+def _is_opaque(material) -> bool:
+    return getattr(material, "alphaMode", None) in (None, "OPAQUE")
 
 
 def _texture(material) -> np.ndarray:
-    """The texture uint8 `[H, W, 4]` of a trimesh material: its picture times its factor, which glTF has in linear light; of the simple
-    materials of other formats the picture, or else their colour."""
+    """The texture uint8 `[H, W, 4]` of a trimesh material: its picture, white without one, times its factor, which glTF has in linear
+    light; of the simple materials of other formats the picture, or else their colour."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor = getattr(material, "baseColorFactor", None)
-    if image is None and factor is None:
+    if image is None and not hasattr(material, "baseColorFactor"):
         return np.asarray(material.main_color, np.uint8).reshape(1, 1, 4)
     texture = np.full((1, 1, 4), 255, np.uint8) if image is None else np.asarray(image.convert("RGBA")).copy()
     if factor is not None and (np.asarray(factor) != 255).any():
@@ -121,7 +155,7 @@ def _texture(material) -> np.ndarray:
         rgba = torch.from_numpy(texture).float() / 255
         lit = srgb_from_linear(linear_from_srgb(rgba[..., :3]) * share[:3])
         texture = (torch.cat([lit, rgba[..., 3:] * share[3]], -1) * 255).round().to(torch.uint8).numpy()
-    if getattr(material, "alphaMode", None) in (None, "OPAQUE"):
+    if _is_opaque(material):
         texture[..., 3] = 255
     return texture
 
@@ -142,15 +176,20 @@ def _in_the_open(splats: Gaussians, blockers: Blockers) -> torch.Tensor:
     return (sides[0] > 0.01) | (sides[1] > 0.01)
 
 
+def _areas(mesh: Mesh) -> np.ndarray:
+    """Square metres `[F]` of a mesh's faces."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+
+
 def _sampled(mesh: Mesh, count: int) -> Gaussians:
     """Splats evenly over all of a mesh's surface that is not see-through."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(a, b)
-    area = np.linalg.norm(cross, axis=1) / 2
-    ends = np.cumsum(area)
+    ends = np.cumsum(_areas(mesh))
     # even steps along the area, and within a triangle the R2 sequence (Roberts 2018): as even as random, without its clumps
-    face = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1]).clip(0, len(area) - 1)
+    face = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1]).clip(0, len(ends) - 1)
     u, v = np.modf(np.arange(count) * 0.7548776662466927)[0], np.modf(np.arange(count) * 0.5698402909980532)[0]
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
@@ -158,7 +197,7 @@ def _sampled(mesh: Mesh, count: int) -> Gaussians:
     means = (corners[face] * weights).sum(1)
     normals = (mesh.normals[face] * weights).sum(1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-9)
-    colours = _texels(mesh, face, (mesh.uvs[face] * weights).sum(1))
+    colours = _texels(mesh, face, (mesh.uvs[face] * weights).sum(1)) * (mesh.tints[face] * weights).sum(1)
     solid = colours[:, 3] >= mesh.opaque_from
     flat = cross[face] / np.linalg.norm(cross[face], axis=1, keepdims=True).clip(1e-12)
     axis = a[face] / np.linalg.norm(a[face], axis=1, keepdims=True).clip(1e-12)

@@ -8,11 +8,12 @@ LAYERS = wp.constant(32)  # see-through surfaces that one ray may pass
 
 @wp.struct
 class Surface:
-    """Corners of F triangles: normals `[3 F]`, texture coordinates `[3 F]` (v downwards, in textures); their textures `[F]`, and of each of
-    those `[M]` the first texel, width and height in one list of texels rgba, display-referred."""
+    """Corners of F triangles: normals `[3 F]`, texture coordinates `[3 F]` (v downwards, in textures), tints rgba `[3 F]`; their textures
+    `[F]`, and of each of those `[M]` the first texel, width and height in one list of texels rgba, display-referred as the tints."""
 
     normals: wp.array[wp.vec3]
     uvs: wp.array[wp.vec2]
+    tints: wp.array[wp.vec4]
     texture: wp.array[wp.int32]
     first: wp.array[wp.int32]
     width: wp.array[wp.int32]
@@ -72,7 +73,8 @@ def trace_surface(
         f = hit.face
         w = 1.0 - hit.u - hit.v
         uv = hit.u * surface.uvs[3 * f] + hit.v * surface.uvs[3 * f + 1] + w * surface.uvs[3 * f + 2]
-        c = sample(surface, surface.texture[f], uv)
+        tint = hit.u * surface.tints[3 * f] + hit.v * surface.tints[3 * f + 1] + w * surface.tints[3 * f + 2]
+        c = wp.cw_mul(sample(surface, surface.texture[f], uv), tint)
         if c[3] >= opaque_from:
             n = hit.u * surface.normals[3 * f] + hit.v * surface.normals[3 * f + 1] + w * surface.normals[3 * f + 2]
             if wp.dot(n, direction) > 0.0:

@@ -17,7 +17,7 @@ import numpy as np
 
 from scenes.atomic import atomic_file
 from scenes.formats.gltf import CHUNK, HEADER, WIDTHS, accessor, primitives, read_glb, view_bytes
-from scenes.formats.packing import assembled, follows, log_scales_from, logits_from, opacities_from, stored, unit
+from scenes.formats.packing import assembled, follows, log_scales_from, logits_from, opacities_from, scales_from, stored, unit
 from scenes.formats.spz import unpacked
 from scenes.formats.transform import moved
 from scenes.gaussians import SH_COUNTS, Gaussians
@@ -27,7 +27,6 @@ _NAME = "KHR_gaussian_splatting"
 _SPZ = (f"{_NAME}_compression_spz_2", f"{_NAME}_compression_spz")
 _DRAFT = "KHR_spz_gaussian_splats_compression"
 _NAMES = {width: name for name, width in WIDTHS.items()}
-_FLOAT = np.finfo("f4")
 _SPACE = "srgb_rec709_display"
 _Y_FROM_Z_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # a quarter turn about x, xyzw
 
@@ -57,7 +56,7 @@ def save_glb(path: str | os.PathLike, gaussians: Gaussians) -> None:
     if not len(gaussians):
         raise ValueError(f"{path} cannot be written: a GLB file holds at least one splat")
     g = stored(gaussians)
-    scales = np.exp(g["log_scales"].astype(np.float64)).clip(_FLOAT.tiny, _FLOAT.max)
+    scales = scales_from(g["log_scales"])
     columns = {
         "POSITION": g["means"], f"{_NAME}:ROTATION": unit(g["quats"])[:, [1, 2, 3, 0]], f"{_NAME}:SCALE": scales,
         f"{_NAME}:OPACITY": opacities_from(g["logit_opacities"])[:, None],

@@ -35,6 +35,12 @@ def log_scales_from(scales: np.ndarray) -> np.ndarray:
         return np.where(scales == 0, FLAT, np.log(scales)).astype(np.float32)
 
 
+def scales_from(log_scales: np.ndarray, kind: str = "f4") -> np.ndarray:
+    """float64 linear scales, held within what a kind of float has, full or half."""
+    with np.errstate(over="ignore"):
+        return np.exp(log_scales.astype(np.float64)).clip(np.finfo(kind).tiny, np.finfo(kind).max)
+
+
 BYTE_LOGITS = logits_from(np.arange(256) / 255)
 
 

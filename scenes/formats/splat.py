@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from scenes.atomic import atomic_file
-from scenes.formats.packing import BYTE_LOGITS, assembled, levels, log_scales_from, opacities_from, stored, unit
+from scenes.formats.packing import BYTE_LOGITS, assembled, levels, log_scales_from, opacities_from, scales_from, stored, unit
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 
 _RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_FLOAT = np.finfo("f4")
 
 
 def load_splat(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
@@ -39,7 +38,7 @@ def save_splat(path: str | os.PathLike, gaussians: Gaussians) -> None:
     g = stored(gaussians)
     records = np.zeros(len(gaussians), _RECORD)
     records["means"] = g["means"]
-    records["scales"] = np.exp(g["log_scales"].astype(np.float64)).clip(_FLOAT.tiny, _FLOAT.max)
+    records["scales"] = scales_from(g["log_scales"])
     records["rgba"][:, :3] = levels(rgb_from_sh(g["sh"][:, 0]), 255)
     records["rgba"][:, 3] = levels(opacities_from(g["logit_opacities"]), 255)
     records["quats"] = np.rint(unit(g["quats"]) * 128 + 128).clip(0, 255)

@@ -56,10 +56,30 @@ def test_frames_keep_their_times_and_the_shape_of_their_pixels(tmp_path, enhance
     assert [t for t, _ in out.timed()] == pytest.approx(times_us, abs=12) and out.pixel_aspect == Fraction(4, 3)
 
 
-def test_odd_sizes_gain_the_row_and_column_that_h264_needs(tmp_path, enhancer):
-    write(tmp_path / "in.mkv", 2, 33, 19)
+def test_odd_sizes_gain_the_row_and_column_that_h264_needs(tmp_path, enhancer, capsys):
+    with av.open(str(tmp_path / "in.mkv"), "w") as container:
+        picture = container.add_stream("ffv1", rate=10)
+        picture.width, picture.height, picture.pix_fmt = 33, 19, "bgr0"
+        frame = av.VideoFrame.from_ndarray(np.full((19, 33, 3), 90, np.uint8), format="rgb24")
+        container.mux([*picture.encode(frame), *picture.encode(None)])
     enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", enhancer)
     assert next(iter(read_video(tmp_path / "out.mp4"))).shape == (20, 34, 3)
+    assert "out.mp4 has 34x20 pixels for 33x19" in capsys.readouterr().err
+
+
+def test_that_the_sound_is_left_out_is_said_with_how_to_put_it_back(tmp_path, enhancer, capsys):
+    with av.open(str(tmp_path / "in.mp4"), "w") as container:
+        sound, picture = container.add_stream("aac", rate=48_000), container.add_stream("libx264", rate=10)
+        picture.width, picture.height, picture.pix_fmt = 48, 32, "yuv420p"
+        silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        silence.sample_rate = 48_000
+        for stream, frame in ((sound, silence), (picture, av.VideoFrame.from_ndarray(np.full((32, 48, 3), 90, np.uint8), format="rgb24"))):
+            container.mux([*stream.encode(frame), *stream.encode(None)])
+    enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", enhancer)
+    told = capsys.readouterr().err
+    assert told.count("is without the sound of") == 1 and f"-i {tmp_path / 'in.mp4'} -map 0:v -map 1:a" in told
+    enhance_video(tmp_path / "out.mp4", tmp_path / "again.mp4", enhancer)
+    assert "without the sound" not in capsys.readouterr().err
 
 
 def test_an_undecodable_clip_is_refused_and_leaves_nothing(tmp_path, enhancer):

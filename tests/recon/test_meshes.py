@@ -11,9 +11,11 @@ from recon.assets.looking import looking_at
 from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, read_mesh, splats_of_mesh, turn_to_asset, views_around
 from render.rays import camera_rays
 from render.tracer import Blockers, TracedMesh, fibonacci, lit
+from scenes.harmonics import rgb_from_sh
 from scenes.poses import matrix_from_quat
 
 SIZE = (4.0, 1.8, 1.5)  # length, width, height
+PBR = trimesh.visual.material.PBRMaterial
 
 
 def write_box(path: Path, inner: bool = False) -> Path:
@@ -136,16 +138,49 @@ def test_a_file_that_is_no_mesh_says_so(tmp_path):
         read_mesh(tmp_path / "a.glb")
     with pytest.raises(FileNotFoundError):
         read_mesh(tmp_path / "b.glb")
+    with pytest.raises(ValueError, match="is a folder; give one mesh file of it"):
+        read_mesh(tmp_path)
+
+
+def wide_box(path: Path, uv: float, **material) -> Path:
+    box = trimesh.creation.box((1.8, 1.5, 4.2))
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), uv), material=PBR(**material))
+    trimesh.Scene([box]).export(path)
+    return path
+
+
+def test_what_cannot_be_seen_is_refused_before_it_is_fitted(tmp_path):
+    from PIL import Image
+
+    file, picture = tmp_path / "car.glb", Image.new("RGB", (4, 4), (188, 30, 30))
+    with pytest.raises(ValueError, match="car.glb has texture coordinates that are not finite"):
+        read_mesh(wide_box(file, float("nan"), baseColorTexture=picture))
+    with pytest.raises(ValueError, match="car.glb is see-through all over"):
+        read_mesh(wide_box(file, 0.5, baseColorFactor=[255, 255, 255, 0], alphaMode="BLEND"))
+    line = np.array([[-0.9, 0, -2], [0.9, 1.5, 2], [0, 0.75, 0]])
+    trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "line.glb")
+    with pytest.raises(ValueError, match="line.glb has no triangle of any area"):
+        read_mesh(tmp_path / "line.glb")
+
+
+@pytest.mark.filterwarnings("error")
+def test_vertices_that_are_not_finite_are_refused_without_further_words(tmp_path):
+    box = trimesh.creation.box((1.8, 1.5, 4.2))
+    vertices = box.vertices.copy()
+    vertices[0] = np.inf
+    trimesh.Trimesh(vertices, box.faces, process=False).export(tmp_path / "car.ply")
+    with pytest.raises(ValueError, match="car.ply has vertices that are not finite"):
+        read_mesh(tmp_path / "car.ply")
 
 
 def _textures(path: Path) -> np.ndarray:
     """Every colour that the mesh of a file has at a corner of a face, uint8 `[F, 4]` a face: at its first one."""
     mesh = read_mesh(path, up="z", forward="x")
     colours = []
-    for uv, which in zip(np.asarray(mesh.uvs), mesh.texture, strict=True):
+    for uv, tint, which in zip(np.asarray(mesh.uvs), mesh.tints, mesh.texture, strict=True):
         texture = mesh.textures[int(which)]
         u, v = (uv[0] * (texture.shape[1], texture.shape[0])).astype(int)
-        colours.append(texture[min(v, texture.shape[0] - 1), min(u, texture.shape[1] - 1)])
+        colours.append((texture[min(v, texture.shape[0] - 1), min(u, texture.shape[1] - 1)] * tint[0]).round())
     return np.array(colours)
 
 
@@ -177,3 +212,42 @@ def test_every_face_has_its_own_colour(tmp_path):
     box.export(tmp_path / "faces.ply")
     found = {tuple(c) for c in _textures(tmp_path / "faces.ply")[:, :3].tolist()}
     assert found == {(200, 30, 30), (30, 30, 200)}
+
+
+def gltf_box(path: Path, material=None, colours=None) -> Path:
+    """A box of glTF with a material, or none, and vertex colours `[4]` of bytes, or none."""
+    box = trimesh.creation.box((4, 1.8, 1.5))
+    colours = None if colours is None else np.tile(np.array(colours, np.uint8), (len(box.vertices), 1))
+    if material is not None:
+        box.visual = trimesh.visual.TextureVisuals(uv=np.full((len(box.vertices), 2), 0.5), material=material)
+        if colours is not None:
+            box.visual.vertex_attributes["color"] = colours
+    elif colours is not None:
+        box.visual.vertex_colors = colours
+    trimesh.Scene([box]).export(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("material", "colours", "seen"),
+    [
+        ({}, None, [255, 255, 255, 255]),
+        (None, None, [255, 255, 255, 255]),
+        ({}, [128, 26, 255, 255], [188, 90, 255, 255]),
+        (None, [128, 26, 255, 0], [188, 90, 255, 255]),
+        ({"baseColorFactor": [128, 128, 128, 255]}, [128, 128, 128, 0], [137, 137, 137, 255]),
+        ({"baseColorFactor": [255, 255, 255, 204], "alphaMode": "BLEND"}, [255, 255, 255, 204], [255, 255, 255, 163]),
+    ],
+    ids=["no factor", "no material", "colours", "colours without a material", "opaque", "blended"],
+)
+def test_what_gltf_leaves_out_is_white_and_vertex_colours_are_factors_in_linear_light(tmp_path, material, colours, seen):
+    material = None if material is None else PBR(**{"name": "paint", **material})
+    assert np.abs(_textures(gltf_box(tmp_path / "box.glb", material, colours)) - seen).max() <= 2
+
+
+def test_a_tinted_mesh_is_traced_and_sampled_in_its_tint(tmp_path):
+    mesh = read_mesh(gltf_box(tmp_path / "box.glb", PBR(baseColorFactor=[255, 255, 255, 255]), [255, 26, 26, 255]), up="z", forward="x")
+    rgb = TracedMesh(mesh).render(view(9.0, 0.0, 0.75)).rgb[36, 48]
+    splats = splats_of_mesh(mesh, 500)
+    for red, green, blue in (rgb.tolist(), rgb_from_sh(splats.sh[:, 0]).mean(0).tolist()):
+        assert green == pytest.approx(blue) and green == pytest.approx(red * 90 / 255, rel=0.1)

@@ -9,6 +9,7 @@ from street import car
 
 from render.record import record
 from render.video import read_image, read_video
+from scenes.edit import Edit, edited
 from scenes.insert import insert
 from scenes.placement import Placement
 
@@ -28,6 +29,16 @@ def test_a_video_and_its_report_appear_together(street, tmp_path):
     assert {"render", "write"} == set(told["ms_per_frame"])
     assert {"sidestep", "torch", "warp-lang"} <= set(told["versions"])
     assert told["seed"] == 0
+
+
+def test_what_took_the_place_of_another_is_told_as_inserted(street, tmp_path):
+    """It was never there either, and is another instance to harmonize."""
+    scene = edited(street, Edit(replace={"veh_1": replace(car("van"), meta={"id": "van/0001"})}))
+    record(scene, "front_camera", tmp_path / "out.mp4", times_us=street.frame_times("front_camera")[:1])
+    (told,) = json.loads((tmp_path / "out.json").read_text())["inserted"]
+    assert (told["track"], told["label"], told["instance"]) == ("veh_1", "van", 1)
+    shifted = edited(street, Edit(shift={"veh_1": (0.0, 1.0)}))
+    assert record(shifted, "front_camera", tmp_path / "b.mp4", times_us=street.frame_times("front_camera")[:1])["inserted"] == []
 
 
 def test_frames_that_are_missing_leave_their_gap(street, tmp_path):

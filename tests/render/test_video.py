@@ -126,6 +126,24 @@ def test_a_truncated_video_is_named(tmp_path):
         list(read_video(tmp_path / "cut.mp4"))
 
 
+@pytest.mark.parametrize("left", [0.5, 0.999])
+def test_a_truncated_matroska_file_is_named(tmp_path, left):
+    """FFmpeg says nothing of it, and gives the frames that are there."""
+    with VideoWriter(tmp_path / "a.mkv", 10, 64, 48) as video:
+        for seed in range(8):
+            video.write(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(seed)))
+    whole = (tmp_path / "a.mkv").read_bytes()
+    assert len(list(read_video(tmp_path / "a.mkv"))) == 8
+    (tmp_path / "cut.mkv").write_bytes(whole[: int(left * len(whole))])
+    with pytest.raises(ValueError, match=r"cut\.mkv breaks off \d+ bytes before its end; fetch the file again"):
+        read_video(tmp_path / "cut.mkv")
+    unknown = bytearray(whole)  # as a stream is written, whose length nobody knows yet
+    size = whole.index(bytes.fromhex("18538067")) + 4
+    unknown[size : size + 8] = b"\x01" + b"\xff" * 7
+    (tmp_path / "live.mkv").write_bytes(unknown)
+    assert len(list(read_video(tmp_path / "live.mkv"))) == 8
+
+
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="gone"):
         read_video(tmp_path / "gone.mp4")

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -105,6 +106,31 @@ def test_an_add_that_breaks_off_leaves_the_databank_as_it_was(bank, monkeypatch)
     assert {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()} == before
     monkeypatch.undo()
     assert bank.add(asset()) == "car/0003"
+
+
+def test_an_add_that_fails_leaves_no_folder(tmp_path):
+    bad = replace(asset(), meta={"psnr_unseen": float("nan")})
+    with pytest.raises(ValueError, match="meta cannot be stored as JSON"):
+        Databank(tmp_path / "new").add(bad)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_could_not_be_written_is_taken_away(bank, monkeypatch):
+    monkeypatch.setattr("scenes.usd_splats.author_splats", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        bank.add(asset(4, "Truck"))
+    assert not (bank.path / "assets/truck").exists()
+
+
+def test_an_index_that_was_lost_is_made_anew_of_what_the_assets_say(bank):
+    before = bank.entries()
+    (bank.path / "index.json").unlink()
+    assert bank.add(asset(4, "car")) == "car/0003"
+    assert [e for e in bank.entries() if e.id != "car/0003"] == before
+    (bank.path / "index.json").unlink()
+    (bank.path / "assets/car/0001/asset.json").write_text("{}")
+    with pytest.raises(ValueError, match="car/0001/asset.json is corrupt: KeyError 'id'; restore it"):
+        bank.add(asset())
 
 
 def test_a_folder_that_a_killed_add_left_is_not_reused(bank):

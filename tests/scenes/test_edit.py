@@ -1,5 +1,6 @@
 """Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
 
+import os
 import shutil
 from dataclasses import replace
 
@@ -9,13 +10,14 @@ from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
+from scenes.astray import astray
 from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
 from scenes.usd import new_stage, usd_problems
-from scenes.usd_edit import add_change, add_edit, undo
+from scenes.usd_edit import add_change, add_edit, undo, undone
 from scenes.usd_root import RECORDED, add_sublayer
 
 
@@ -57,7 +59,7 @@ def test_an_edit_on_disk_does_what_it_does_in_memory(saved):
     after = load(saved)
     same(after, edited(busy(), ALL))
     assert [a.asset.meta.get("edited") for a in after.actors] == ["mine", "mine"]
-    assert after.meta["edits"] == [{"kind": "edit", "name": "mine"}]
+    assert after.meta["edits"] == [{"kind": "edit", "remove": ["veh_1"], "name": "mine"}]
 
 
 def test_an_edit_is_undone_by_deleting_its_layer_and_tidied_up_by_undo(saved):
@@ -127,11 +129,21 @@ def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path
     add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(remove=("veh_7",)), {})
     after = load(tmp_path / "s1")
     same(after, edited(scene, Edit(remove=("veh_7",))))
+    assert after.meta["parked"] == [] == edited(scene, Edit(remove=("veh_7",))).meta["parked"]
+    with pytest.raises(ValueError, match="veh_7 is not in street any more: the edit mine removed it"):
+        add_change(tmp_path / "s1", "again", after, Edit(remove=("veh_7",)), {})
     hidden = edited(scene, Edit(remove=("veh_7",))).background.gaussians.logit_opacities == HIDDEN
     own = torch.arange(len(hidden)) >= len(busy().background.gaussians)
     assert (hidden[own] | (scene.background.gaussians.means[own][:, 2] <= 0.08)).all() and not hidden[~own].any()
     undo(tmp_path / "s1", "mine")
     same(load(tmp_path / "s1"), scene)
+    assert load(tmp_path / "s1").meta["parked"] == scene.meta["parked"]
+
+
+@pytest.mark.parametrize(("by", "said"), [(5.0, []), (30.0, ["13.5 m"]), (1e30, ["1e+30 m"])])
+def test_it_is_said_when_an_actor_is_shifted_off_the_known_ground(by, said):
+    told = astray(Edit(shift={"veh_1": (0.0, -by), "veh_2": (1.0, 0.0)}), busy())
+    assert [f"veh_1 is shifted {far} beyond the known ground and keeps the height of its edge there" for far in said] == told
 
 
 @pytest.mark.parametrize(("by", "said"), [(0, None), (300_000, "0.2s to 1.1s only"), (20_000_000, "of a drive of 0.8s: never")])
@@ -177,6 +189,50 @@ def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
     assert place() == pytest.approx(-2.0)
     undo(saved, "first")
     assert place() == pytest.approx(-3.0)
+
+
+def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(saved):
+    dark = replace(VAN, meta={**VAN.meta, "id": "van/0001", "ground_linear": [0.03, 0.04, 0.05]})
+    add_change(saved, "mine", load(saved), Edit(replace={"veh_3": dark}), {})
+    put_in = insert(load(saved), dark, Placement("van/0001", 15.0, 5.0)).actor.asset
+    for asset in (load(saved).actors[2].asset, edited(busy(), Edit(replace={"veh_3": dark})).actors[2].asset):
+        assert asset.meta["light_gain"] == put_in.meta["light_gain"] and asset.meta["id"] == "van/0001"
+        assert len(asset.gaussians) == len(VAN.gaussians) and rgb_from_sh(asset.gaussians.sh[:, 0]).mean() > 0.7
+    undo(saved, "mine")
+    same(load(saved), busy())
+
+
+def test_undoing_says_which_later_edits_go_on_from_where_it_put_an_actor(saved):
+    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0), "veh_3": (1.0, 0.0)}), {})
+    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
+    add_change(saved, "gone", load(saved), Edit(remove=("veh_3",)), {})
+    with undone(saved, ["shift"]) as (edit,):
+        assert edit.held == {"retime": ["veh_2"]}
+    assert float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3]) == pytest.approx(-2.0)
+    with undone(saved, ["gone", "retime"]) as edits:
+        assert [e.held for e in edits] == [{}, {}]
+    same(load(saved), busy())
+
+
+def test_an_edit_that_goes_with_a_later_one_leaves_nothing_of_it(saved):
+    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
+    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
+    with undone(saved, ["shift", "retime"]) as edits:
+        assert [e.held for e in edits] == [{}, {}]
+    same(load(saved), busy())
+
+
+def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
+    put_in(saved)
+    add_change(saved, "aside", load(saved), Edit(shift={"new": (1.0, 0.0)}), {})
+    add_change(saved, "mine", load(saved), ALL, {})
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+    with pytest.raises(ValueError, match='"veh_9" is not in'), undone(saved, ["new", "mine"]):
+        add_change(saved, "mine", load(saved), Edit(remove=("veh_9",)), {})
+    with pytest.raises(ValueError, match='edit "typo" is not in'), undone(saved, ["mine", "typo"]):
+        pass
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+    assert {p.name for p in saved.iterdir()} == {p.relative_to(saved).parts[0] for p in before}
 
 
 def shown(scene: Scene) -> torch.Tensor:
@@ -240,6 +296,28 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     after = load(saved)
     assert [a.track for a in after.actors][-2:] == ["a", "b"]
     assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
+
+
+@pytest.mark.parametrize(
+    ("file", "left", "said"),
+    [
+        ("mine.usda", 300, "mine.usda is damaged"),
+        ("mine.usda", 0, "mine.usda is damaged"),
+        ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
+        ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
+    ],
+)
+def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, left, said):
+    add_change(saved, "mine", load(saved), ALL, {})
+    if left is None:
+        (saved / "edits" / file).unlink()
+    else:
+        os.truncate(saved / "edits" / file, left)
+    with pytest.raises(ValueError, match=f"{said}.*restore it, or undo the edit: sidestep edit {saved} --undo mine"):
+        load(saved)
+    assert any(said in problem for problem in validate(saved)) and not any("deleted" in problem for problem in validate(saved))
+    undo(saved, "mine")
+    same(load(saved), busy())
 
 
 def put_in(scene, name="new"):

@@ -135,6 +135,14 @@ def test_an_asset_whose_light_is_unknown_is_left_as_it_is(street):
     assert matched(known, lost, torch.tensor([12.0, 0.0])) is known
 
 
+@pytest.mark.parametrize(
+    ("yaw_deg", "speed", "said"), [(90, 4.0, True), (-140, 4.0, True), (170, 4.0, False), (5, 4.0, False), (90, 0.0, False)]
+)
+def test_what_would_slide_along_a_lane_is_said(street, yaw_deg, speed, said):
+    warnings = insert(street, car(), Placement("car", 12, 3, math.radians(yaw_deg), speed, "lane")).warnings
+    assert any(f"car is turned by {yaw_deg}deg from the lane that it goes along, so it slides sideways" in w for w in warnings) == said
+
+
 def test_oncoming_faces_the_other_way(street):
     pose = insert(street, car(), Placement("car", 12, 3, math.pi, 4.0, "lane")).actor.trajectory.at(START_US)
     assert abs(float(yaw_of(pose))) == pytest.approx(math.pi, abs=1e-3)

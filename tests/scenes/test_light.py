@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from scenes import Gaussians, Placed, Sky
+from scenes.edit import unparked
 from scenes.harmonics import sh_from_rgb
 from scenes.hdr import load_hdr
 from scenes.light import COUNT, clear_sky_share, clearness, disc, light_of, shadows_beside_parked, solar_position, sun_of_sky
@@ -88,7 +89,7 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
     """Cars along a road whose ground is dark on the far side from the sun, or as bright on both."""
     sun = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
     boxes = [translation(float(x)).tolist() for x in range(0, 50, 10)]
-    parked = [{"track": "veh", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": box} for box in boxes]
+    parked = [{"track": f"veh_{i}", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": b} for i, b in enumerate(boxes)]
     ground = street.background.gaussians.select(street.background.gaussians.means[:, 2] == 0)
     ground = Gaussians.cat([ground.map(lambda t: t)] * 3)
     for dim, expected in ((0.4, 0.6), (1.0, 0.0), (1.5, 0.0)):
@@ -99,6 +100,8 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
             background=Placed(replace(ground, sh=sh_from_rgb(colour)[:, None].contiguous()), street.background.world_from_local),
         )  # fmt: skip
         assert shadows_beside_parked(scene, sun) == pytest.approx(expected, abs=0.02)
+        gone = replace(scene, meta=unparked(scene.meta, ["veh_1", "veh_2", "veh_3"]))
+        assert len(gone.meta["parked"]) == 2 and shadows_beside_parked(gone, sun) == pytest.approx(expected, abs=0.02)
     assert shadows_beside_parked(street, sun) is None
     assert shadows_beside_parked(replace(scene, meta={"parked": parked[:2]}), sun) is None
 

@@ -28,6 +28,7 @@ def test_a_placement_says_asset_place_heading_and_speed():
         ("car/0003@12m,3m,yow=5deg", "Did you mean yaw?"),
         ("car/0003@12m,3m,speed=5m", "a length, not a speed"),
         ("car/0003@1m,2m,trajectory=t.csv", "a trajectory says it all"),
+        ("car/0003@12m,3m,yaw=5deg,yaw=6deg", "says yaw twice; say it once"),
     ],
 )
 def test_a_wrong_placement_names_the_fix(text, says):

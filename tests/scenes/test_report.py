@@ -5,7 +5,7 @@ import pytest
 import torch
 from randomized import asset, gaussians, scene, trajectory
 
-from scenes import Actor, Databank, Gaussians, add_edit, describe, save, validate
+from scenes import Actor, Databank, Gaussians, add_edit, describe, load, save, validate
 from scenes.files import Dropping
 from scenes.report import summary
 
@@ -112,6 +112,13 @@ def test_missing_and_foreign_files_are_problems(saved, bank, tmp_path):
     assert all(len(validate(tmp_path / name)) == 1 for name in ("a.ply", "a.txt", "folder"))
 
 
+def test_an_assets_own_entry_that_is_lost_or_empty_is_a_problem(bank):
+    (bank / "assets/car/0001/asset.json").write_text("{}")
+    (bank / "assets/bus/0001/asset.json").unlink()
+    lost, corrupt = validate(bank)
+    assert lost == f"bus/0001 lacks its file {bank / 'assets/bus/0001/asset.json'}" and "car/0001/asset.json is corrupt" in corrupt
+
+
 def test_an_index_that_disagrees_with_an_asset_is_a_problem(bank):
     index = bank / "index.json"
     index.write_text(index.read_text().replace('"splats": 6', '"splats": 7'))
@@ -130,6 +137,40 @@ def test_impossible_scenes_are_problems(tmp_path):
     problems = validate(tmp_path / "s1")
     assert any("camera left took 1 frames" in p for p in problems)
     assert any("the ground has heights that are not finite" in p for p in problems)
+
+
+def test_a_camera_whose_times_fall_is_a_problem(tmp_path):
+    bad = scene()
+    times = bad.rig["front camera"].times_us.clone()
+    times[[2, 3]] = times[[3, 2]]
+    object.__setattr__(bad.rig["front camera"], "times_us", times)
+    save(bad, tmp_path / "s1")
+    assert validate(tmp_path / "s1") == [
+        f"{tmp_path / 's1'}: the times of camera front camera must rise, but frame 3 is taken no later than the one before"
+    ]
+
+
+GOOD = {"track": "veh_7", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": torch.eye(4).tolist()}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"track": None}, {"size": [4.2, 1.8]}, {"size": [4.2, 1.8, "wide"]}, {"world_from_box": [[1.0]]}, {"size": [4.2, 1.8, float("nan")]}],
+    ids=lambda damage: next(iter(damage)),
+)
+def test_a_damaged_parked_vehicle_is_named_and_refused(tmp_path, damage):
+    save(replace(scene(), meta={"parked": [GOOD, GOOD]}), tmp_path / "s1")
+    assert validate(tmp_path / "s1") == []
+    file = tmp_path / "s1" / "metadata.json"
+    told = json.loads(file.read_text())
+    told["meta"]["parked"][1] |= damage
+    file.write_text(json.dumps(told))
+    (problem,) = validate(tmp_path / "s1")
+    assert "metadata.json is corrupt: entry 1 of parked needs a track, a label, a size of 3" in problem
+    del told["meta"]["parked"][1]["size"]
+    file.write_text(json.dumps(told))
+    with pytest.raises(ValueError, match="entry 1 of parked"):
+        load(tmp_path / "s1")
 
 
 def test_a_path_among_the_meta_does_not_fill_the_terminal(street, tmp_path):

@@ -53,6 +53,14 @@ def test_writing_what_was_read_changes_nothing_more(tmp_path, suffix):
     assert told.rotation < (1.1 if suffix in (".splat", ".sog") else 0.2 if suffix in (".spz", ".compressed.ply") else 1e-4)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_splats_beyond_what_a_float_holds_are_written_without_a_word_of_numpys(tmp_path, suffix):
+    g = splats(20)
+    g.log_scales[3], g.log_scales[4], g.sh[5], g.logit_opacities[6], g.quats[7] = 1e5, -1e5, 1e30, 1e30, 1e-40
+    convert(g, tmp_path / f"a{suffix}")
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("count", [0, 1, 256, 257])
 def test_any_number_of_splats_survives(tmp_path, suffix, count):
