@@ -83,13 +83,12 @@ class Databank:
     def add(self, asset: Asset, thumb_png: bytes | None = None, half: bool = False) -> str:
         """Store an asset under the next free number of its class and return the id. It appears whole or not at all.
 
-        Of `asset.meta`, licence, attribution, source and views go into the index. ValueError where the index is corrupt, or is lost and an
-        asset's own entry, too.
+        Of `asset.meta`, licence, attribution, source and views go into the index. Raises as `ready` does.
         """
         from scenes.usd_splats import save_asset, to_json
 
         asset.gaussians.validate(f"asset {asset.label!r}")
-        entries = self.entries() if (self.path / "index.json").exists() else self._beside()
+        entries = self.ready()
         kind = slug(asset.label)
         folder = self.path / "assets" / kind
         names = [e.id for e in entries] + [f"{kind}/{p.name}" for p in folder.glob("*")]  # a killed add leaves a folder without an entry
@@ -128,8 +127,20 @@ class Databank:
             partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
 
-    def _beside(self) -> list[Entry]:
-        """The entries that assets hold themselves, of a databank whose index was lost."""
+    def ready(self) -> list[Entry]:
+        """The entries that a further one will stand beside: those that assets hold themselves, of a databank whose index was lost; none
+        where there is no databank. To be asked before work whose result is to be added.
+
+        ValueError where a file has its name, where the index is corrupt, or is lost and an asset's own entry is corrupt; PermissionError
+        where it takes no files.
+        """
+        if self.path.is_file():
+            fix = "give another name with --databank"
+            raise ValueError(f"{self.path} is a file; a databank is a folder, and made where there is none: {fix}")
+        if self.path.is_dir() and not os.access(self.path, os.W_OK | os.X_OK):
+            raise PermissionError(f"{self.path} takes no files of yours; give another databank with --databank")
+        if (self.path / "index.json").exists():
+            return self.entries()
         return [read_entry(file) for file in sorted(self.path.glob("assets/*/*/asset.json"))]
 
 

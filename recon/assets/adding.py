@@ -30,13 +30,16 @@ def add_mesh(
     databank: Path, file: Path, label: str, scale: float | None, up: str | None, forward: str | None, share: dict, force: bool = False,
     config: MeshFit = MeshFit(),  # noqa: B008 - frozen
 ) -> tuple[str, str]:  # fmt: skip
-    """Store a mesh file as a splat asset; its id, and what a person should know. ValueError where its size is odd and not `force`d."""
+    """Store a mesh file as a splat asset; its id, and what a person should know. ValueError where its size is odd and not `force`d, and as
+    `Databank.ready` says."""
+    bank = Databank(databank)
+    bank.ready()
     mesh = read_mesh(file, up or "y", forward or "z", scale or 1.0)
     _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), force)
     with Progress("fit", total=config.steps) as steps:
         meta = {**share, "source": file.name}
         asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
-    id = Databank(databank).add(asset, thumbnail(asset))
+    id = bank.add(asset, thumbnail(asset))
     likeness = f"{asset.meta['psnr_unseen_whole_picture']:.1f} dB (over its own pixels {asset.meta['psnr_unseen']:.1f} dB)"
     return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views"
 

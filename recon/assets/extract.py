@@ -82,8 +82,8 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
 
     What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
-    if Path(databank).exists() and not Path(databank).is_dir():  # before the scene is looked through, which takes long
-        raise ValueError(f"{databank} is a file; a databank is a folder, and made where there is none: give another name with --databank")
+    bank = Databank(databank)
+    bank.ready()  # before the scene is looked through, which takes long
     shots: list[Shot] = []
     if not isinstance(scene, Scene):
         scene = scene_folder(scene)
@@ -92,7 +92,8 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
         recorded = load_recorded(scene)
         shots, scene = shots_in(scene, recorded), recorded
     found = sorted(candidates(scene), key=lambda c: (len(unseen_sides(c.asset)), -len(c.asset.gaussians)))
-    bank, ids, far = Databank(databank), [], [c.track for c in found if not c.asset.meta["views"]]
+    ids: list[str] = []
+    far = [c.track for c in found if not c.asset.meta["views"]]
     if far:
         said = f"{far[0]}: no camera saw it" if len(far) == 1 else f"{len(far)} ({', '.join(sorted(far))}): no camera saw them"
         print(f"left out {said} from within {FARTHEST:.0f} m", file=sys.stderr)

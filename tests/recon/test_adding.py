@@ -6,6 +6,7 @@ import torch
 from randomized import gaussians
 from street import box, car
 
+from recon.assets import adding
 from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
 from scenes import Asset, Databank, save
 from scenes.poses import matrix_from_quat
@@ -117,3 +118,13 @@ def test_the_index_of_a_mesh_tells_its_licence(tmp_path):
     add_splats(tmp_path / "bank", file, "car", 1000.0, None, None, {"licence": "CC BY 3.0", "attribution": "OSRF"})
     (entry,) = json.loads((tmp_path / "bank" / "index.json").read_text())["entries"]
     assert (entry["licence"], entry["attribution"], entry["source"]) == ("CC BY 3.0", "OSRF", "car.ply")
+
+
+def test_a_databank_that_takes_nothing_is_told_before_the_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr(adding, "read_mesh", lambda *_: pytest.fail("it is looked at first"))
+    (tmp_path / "bank").mkdir()
+    (tmp_path / "bank/index.json").write_text("{")
+    (tmp_path / "file").write_text("")
+    for name, said in (("bank", "index.json is corrupt"), ("file", "file is a file; a databank is a folder")):
+        with pytest.raises(ValueError, match=said):
+            adding.add_mesh(tmp_path / name, tmp_path / "car.glb", "car", None, None, None, {})
