@@ -95,3 +95,13 @@ def test_a_held_out_sweep_that_is_damaged_is_told_before_the_fit(own_drive, tmp_
     with pytest.raises(ValueError, match="04.pkl.gz is cut off or corrupt"):
         reconstruct(open_log(own_drive), tmp_path / "scene")
     assert not (tmp_path / "scene.fit").exists()
+
+
+def test_photos_of_two_places_do_not_leap(log):
+    poses = log.ego.world_from_body.clone()
+    poses[5:, 0, 3] += 150.0
+    two = replace(log, ego=replace(log.ego, world_from_body=poses))
+    span = (int(log.ego.times_us[0]), int(log.ego.times_us[-1]))
+    check_path(replace(two, meta={**log.meta, "world_from_model": {}}), span)
+    with pytest.raises(ValueError, match="leaps by"):
+        check_path(two, span)
