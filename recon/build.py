@@ -15,6 +15,7 @@ from recon.adjust import adjusted
 from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
+from recon.exposed import exposed_by
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
@@ -28,6 +29,7 @@ from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
+from recon.seeds.triangulate import triangulated
 from recon.skies import seen_sky
 from recon.sound import check_path
 from recon.start import Start, prepare
@@ -255,11 +257,18 @@ def begin(
         frames = load_frames(log, names, span, size, held_out, steps.step, "gains" in config.refine)
     if exposed is not None:
         frames = replace(frames, views=[replace(v, gain=exposed[names[v.camera]].gain_at(v.time_us)) for v in frames.views])
-    if start is None:
-        with Progress("prepare") as steps:
-            coefficients = (config.sh_degree + 1) ** 2
-            known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
-            start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), known)
+    if start is not None:
+        frames = replace(frames, views=[replace(v, gain=gain) for v, gain in zip(frames.views, start.gains, strict=True)])
+        return start, _fit(frames, start, config, device)
+    sparse = log.points
+    if sparse is None and not log.sweeps_within(span):
+        sparse = triangulated(log, frames)
+        if exposed is None and "gains" in config.refine:
+            frames = replace(frames, views=exposed_by(sparse, log, names, frames.views))
+    with Progress("prepare") as steps:
+        coefficients = (config.sh_degree + 1) ** 2
+        known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
+        start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), sparse, known)
     return start, _fit(frames, start, config, device)
 
 

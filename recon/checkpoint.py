@@ -21,7 +21,7 @@ from scenes.lenses import LENSES
 from scenes.state import save_state
 from scenes.trajectory import Trajectory
 
-VERSION = 14
+VERSION = 15
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -83,6 +83,7 @@ def _plain_start(start: Start) -> dict:
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
         "measured": [[m.views, m.weight] for m in start.measured],
         "swept": start.swept.keys,
+        "gains": list(start.gains),
     }  # fmt: skip
 
 
@@ -111,4 +112,4 @@ def _start(plain: dict, fit: dict) -> Start:
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
     measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
-    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, measured, swept)
+    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, measured, swept, tuple(plain["gains"]))

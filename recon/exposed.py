@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from scipy import ndimage
 
 from recon.gains import gains_along, picture_gains
-from recon.log import Log
+from recon.log import Log, SparsePoints
 from recon.project import project
 from recon.view import View
 from scenes.camera import Camera
@@ -50,7 +51,8 @@ def _divided(view: View, gain: torch.Tensor) -> View:
 
 
 def exposed(log: Log, names: list[str], views: list[View]) -> list[View]:
-    """The views with their gains, where a camera's vary, which it says; those of held-out views are what their neighbours' make likely."""
+    """The views with their gains, where a camera's vary by what lidar points look like in them, which it says; those of held-out views are
+    what their neighbours' make likely."""
     sweeps = log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views)))
     if not sweeps:
         return views
@@ -63,6 +65,17 @@ def exposed(log: Log, names: list[str], views: list[View]) -> list[View]:
             near = xyz[np.linalg.norm(xyz - camera.world_from_cam[:3, 3].numpy(), axis=1) < REACH]
             known[nearest.index] = near[:: max(1, len(near) // PROBED)]
         return known[nearest.index]
+
+    return _gained(log, names, views, points)
+
+
+def exposed_by(sparse: SparsePoints, log: Log, names: list[str], views: list[View]) -> list[View]:
+    """As `exposed`, of a drive without lidar, by the points that its pictures showed."""
+    return _gained(log, names, views, lambda view, _: sparse.xyz[sparse.seen[names[view.camera]][view.index]])
+
+
+def _gained(log: Log, names: list[str], views: list[View], points: Callable[[View, Camera], np.ndarray]) -> list[View]:
+    """The views with their gains, by world points `[N, 3]` that each view and camera shows."""
 
     def gains(mine: list[View], name: str) -> np.ndarray:
         cameras = [log.camera(name).camera(v.index) for v in mine]

@@ -15,7 +15,7 @@ from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.frames import Frames
 from recon.ground import estimate_ground
-from recon.log import Log, Sweep, Track
+from recon.log import Log, SparsePoints, Sweep, Track
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
@@ -23,7 +23,6 @@ from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, splats_from, thin
 from recon.seeds.standing import by_all_sweeps
-from recon.seeds.triangulate import triangulated
 from recon.skies import SkyPicture, like_sky
 from recon.view import View
 from scenes.camera import RigCamera
@@ -51,7 +50,7 @@ WIDEST_SEED = 0.012
 @dataclass
 class Start:
     """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig, the
-    depths that were measured in views, and where nothing stands."""
+    depths that were measured in views, where nothing stands, and the views' gains."""
 
     splats: Splats
     tracks: list[Track]
@@ -62,6 +61,7 @@ class Start:
     rig: dict[str, RigCamera]
     measured: tuple[Measured, ...]
     swept: Swept
+    gains: tuple[torch.Tensor | None, ...]
 
 
 def prepare(
@@ -71,9 +71,10 @@ def prepare(
     budget: int,
     sh_count: int,
     report: Callable[[str], None],
+    sparse: SparsePoints | None = None,
     exposures: torch.Tensor | None = None,
 ) -> Start:
-    """Read the sweeps of the span and make the start of a fit; where it has none, points are found in the pictures.
+    """Read the sweeps of the span and make the start of a fit; where it has none, of the points that pictures show, `sparse`.
 
     exposures: of the cameras, affine `[C, 3, 4]`, where they are known. ValueError where a drive has no lidar point in view.
     """
@@ -86,7 +87,6 @@ def prepare(
     split = split_points(log, sweeps, movers)
     taken = _began(sweeps, split.static_sweep)
     report("colouring points")
-    sparse = log.points or (None if sweeps else triangulated(log, frames))
     if sparse is not None:
         ground = estimate_ground(sparse.xyz, driven)
         gains = np.ones((len(frames.names), 3)) if told is None else told
@@ -133,7 +133,8 @@ def prepare(
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *reaches])
-    return Start(splats, tracks, sky, exposures, ego, ground, rig, tuple(measured), swept)
+    told_gains = tuple(v.gain for v in frames.views)
+    return Start(splats, tracks, sky, exposures, ego, ground, rig, tuple(measured), swept, told_gains)
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:

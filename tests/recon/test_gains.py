@@ -2,15 +2,19 @@
 
 import json
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pytest
 import torch
+from painted import drive as drive_without_lidar
 from PIL import Image
 
 from recon import open_log, reconstruct
+from recon.build import begin
 from recon.frames import load_frames
 from recon.gains import gains_along
+from recon.log import Packed
 from render import render_frame
 from render.compare import psnr
 from scenes import load
@@ -67,6 +71,29 @@ def test_views_say_how_they_were_exposed_and_held_out_ones_what_is_likely(follow
     assert np.abs(found[shown] / wanted[shown] - 1).max() < 0.04
     assert found[4] == pytest.approx(np.sqrt(found[3] * found[5]), rel=0.02), "not looked at, between its neighbours"
     assert all(v.gain is None for v in load_frames(open_log(drive), names, span, SIZE, 4).views), "nothing to do, nothing done"
+
+
+def test_a_drive_without_lidar_tells_its_gains_by_the_points_that_its_pictures_show(capsys):
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+    log = drive_without_lidar([0.0] + [0.6] * 7)
+
+    def taken(file: Packed, gain: np.ndarray) -> Packed:
+        buffer = BytesIO()
+        image = np.asarray(Image.open(BytesIO(file.read()))) * gain
+        Image.fromarray(image.clip(0, 255).round().astype(np.uint8)).save(buffer, "png")
+        return Packed(file.name, buffer.getvalue)
+
+    front = log.camera("front")
+    following = replace(front, files=tuple(taken(f, g) for f, g in zip(front.files, TRUE, strict=True)))
+    log, names, size = replace(log, cameras={**log.cameras, "front": following}), ["front", "left"], (320, 180)
+    start, fit = begin(log, names, (0, 10**9), size, replace(CONFIG, budget=3000), held_out=0)
+    assert "front: its exposure varies" in capsys.readouterr().err
+    found = torch.stack([v.gain for v in fit.frames.views if v.camera == 0]).numpy()
+    wanted = TRUE[:, None] / np.exp(np.log(TRUE).mean())
+    assert np.abs(found / wanted - 1).max() < 0.06
+    assert all(v.gain is None for v in fit.frames.views if v.camera == 1), "nothing to do, nothing done"
+    _, again = begin(log, names, (0, 10**9), size, replace(CONFIG, budget=3000), held_out=0, start=start)
+    assert all(a.gain is b.gain for a, b in zip(fit.frames.views, again.frames.views, strict=True)), "they are not looked for again"
 
 
 def test_a_scene_shows_each_frame_as_it_was_exposed(following, tmp_path):
