@@ -29,10 +29,13 @@ APART = 300.0
 
 
 def find_model(folder: Path) -> Path | None:
-    """The model's folder in a COLMAP workspace: `folder` itself, its sparse/0, or another one up to two levels down; the fullest."""
-    inside = [p for level in ("*", "*/*") for p in sorted(folder.glob(level)) if p.is_dir()]
-    models = [p for p in [folder, *inside] if is_model(p)]
-    return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")), default=None)
+    """The model's folder in a COLMAP workspace: `folder` itself, its sparse/0, another one up to two levels down, or colmap/sparse/0, as
+    nerfstudio has it; of several equally deep the fullest, as those that are deeper may be of other pictures (distorted/sparse/0)."""
+    for level in ("", "*", "*/*", "*/sparse/*"):
+        models = [p for p in (sorted(folder.glob(level)) if level else [folder]) if p.is_dir() and is_model(p)]
+        if models:
+            return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")))
+    return None
 
 
 def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, pictures: Path | None = None) -> Log:

@@ -445,3 +445,16 @@ def test_a_clock_of_another_unit_is_refused(own, unit):
     (own / "sparse/0/times.json").write_text(json.dumps({n: unit * i for i, n in enumerate(names)}))
     with pytest.raises(ValueError, match="times.json must give whole microseconds by picture name; it has 0"):
         open_log(own)
+
+
+def test_a_model_is_found_where_tools_leave_it_and_the_nearest_is_taken(own, workspace):
+    (own / "colmap").mkdir()
+    (own / "sparse").rename(own / "colmap/sparse")  # ns-process-data
+    found = open_log(own).camera("camera")
+    assert len(found) == len(open_log(workspace).camera("camera")) and found.files[0].parent == own / "images"
+    shutil.copytree(own / "colmap/sparse", own / "sparse")  # 3D Gaussian splatting's convert.py leaves one of distorted pictures deeper
+    shutil.move(own / "colmap", own / "distorted")
+    cameras = own / "distorted/sparse/0/cameras.txt"
+    cameras.write_text(cameras.read_text().replace(" 96 54 ", " 192 108 "))
+    (own / "distorted/sparse/0/images.txt").open("a").write("# the fuller one\n" * 100)
+    assert len(open_log(own).camera("camera")) == len(found)
