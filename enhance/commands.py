@@ -47,31 +47,33 @@ class Pairs:
 
     def run(self) -> None:
         from enhance.clips import PairConfig
-        from enhance.pairs import check_cameras, check_kinds, claim_pairs, make_pairs, open_reconstruction, prepare_sources
+        from enhance.pairs import check_cameras, check_kinds, claim_pairs, make_pairs, open_reconstruction, open_recording, prepare_sources
         from enhance.photo_pairs import check_names, make_photo_pairs
-        from recon import open_log
         from render.progress import Progress
 
+        _some("--kinds", self.kinds)
+        _some("--cameras", self.cameras)
+        _check_seed(self.seed)
         if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
             counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
             raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
-        _some("--kinds", self.kinds)
-        _some("--cameras", self.cameras)
         names = [path.resolve().name for path in self.scenes]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
         config = PairConfig(width=self.size)
         check_kinds(self.kinds or ())
         check_names(self.photos)
+        _check_there(*self.skies, *self.photos)
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
         with stopped_saying(lambda: "the same command goes on from here"):
             for path, name, data in zip(self.scenes, names, self.data, strict=True):
-                scene, log = open_reconstruction(path), open_log(data)
+                scene = open_reconstruction(path)
+                log = open_recording(data, scene)
                 cameras = check_cameras(scene, log, self.cameras)
                 out = self.output if len(self.scenes) == 1 else self.output / name
-                claim_pairs(out, scene, log, self.seed, config)
+                claim_pairs(out, scene, log, self.seed, config, self._made_of())
                 relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
                 sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
                 with Progress(f"pairs {name}") as steps:
@@ -83,6 +85,25 @@ class Pairs:
                     make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
             make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
+
+    def _made_of(self) -> dict[str, str]:
+        """What kinds are made of besides, of those that are asked for: a clip that is there is not made again of other things."""
+        skies, bank = sorted(path.name for path in self.skies), str(self.databank and self.databank.resolve())
+        lit = "DiffusionRenderer" if self.relit else "normals"
+        of = {"relight": {"skies": str(skies), "light": lit}, "shadow": {"skies": str(skies), "databank": bank}}
+        return {f"{what} of {k}": told for k, by in of.items() if self.kinds is None or k in self.kinds for what, told in by.items()}
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed must be a whole number from 0 to 2^63 - 1, got {seed}")
+
+
+def _check_there(*paths: Path) -> None:
+    """FileNotFoundError where a path that will be wanted late is not there now."""
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(f"{path} does not exist")
 
 
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
@@ -124,6 +145,10 @@ class Train:
         if not self.pairs:
             raise UsageError("give at least one folder of pairs; sidestep pairs makes them")
         _some("--only", self.only)
+        if self.only and self.start is None:
+            raise UsageError("--only takes weights to start from; give --start, as --start builtin")
+        _check_seed(self.seed)
+        _check_there(*self.photos)
         check_device(self.device)
         pairs = PairSet(*self.pairs)
         with Progress("train", 1000) as steps:

@@ -39,6 +39,8 @@ def drift(enhancer: Steps, pictures: Sequence[Frame | torch.Tensor], frames: int
     """Of a rollout over `frames` frames: as `of_video` has them, or told their objects. ValueError where there are fewer than two."""
     if len(pictures) < 2:
         raise ValueError(f"a rollout takes two frames at least, got {len(pictures)}; give a longer video")
+    part = min(PART, frames // 2)
+    pictures = pictures[: (frames - part) // 2 + 1]  # there and back again, or no two frames that are compared would show the same
     found, memory = [], None
     for frame in _back_and_forth(pictures, frames):
         rgb = frame.rgb if isinstance(frame, Frame) else frame
@@ -50,7 +52,6 @@ def drift(enhancer: Steps, pictures: Sequence[Frame | torch.Tensor], frames: int
         colour = (after / after.mean()) / (before / before.mean())
         sharp = sharpness(better, everywhere) / max(sharpness(rgb, everywhere), 1e-9)
         found.append([float(after.mean() / before.mean()), *colour.tolist(), sharp])
-    part = min(PART, frames // 2)
     period = 2 * len(pictures) - 2
     again = period * ((frames - part) // period)  # the last time that the same pictures came
     first, last = np.mean(found[:part], 0), np.mean(found[again : again + part], 0)

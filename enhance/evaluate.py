@@ -109,7 +109,10 @@ def evaluate(
             grades = [_grade_of(_siblings(s, pairs, split)) for s in shards] if method == GRADED else None
             rows.append(measured(kind, method, shards, others.get(method, mine), features, grades))
     if not rows:
-        raise ValueError(f'the pairs hold no clip of split "{split}"; make pairs of the held-out camera too')
+        fix = (
+            "make pairs of another camera too, or of photos (sidestep pairs --photos), or look at those that were trained on, --split train"
+        )
+        raise ValueError(f'the pairs hold no clip of split "{split}"; {fix}')
     return rows
 
 
@@ -254,13 +257,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_device(options.device)
         rollout = of_video(options.rollout) if options.rollout else []  # now: a wrong one must not cost the wait for the table
         pairs, enhancer = PairSet(*options.pairs), Enhancer.load(options.weights, options.device)
-        others = {Path(path).name: Enhancer.load(path, options.device) for path in options.beside}
-        beside = {f"{one.about.get('model', 'weights')} ({name})": one for name, one in others.items()}
+        others = {path: Enhancer.load(path, options.device) for path in options.beside}
+        beside = {f"{one.about.get('model', 'weights')} ({path})": one for path, one in others.items()}
+        told = _told(pairs.of("clean", options.split)) if rollout else []
+        if rollout and len(told) < 2:
+            raise ValueError(f'--rollout takes two frames at least of clean pairs of split "{options.split}" too, beside the video')
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
         if rollout:
             print(drift_text(options.rollout.name, drift(enhancer, rollout)))
-            print(drift_text("clean frames told their objects", drift(enhancer, _told(pairs.of("clean", options.split)))))
+            print(drift_text("clean frames told their objects", drift(enhancer, told)))
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

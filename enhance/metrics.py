@@ -40,9 +40,10 @@ def feature_distance(better: torch.Tensor, target: torch.Tensor, region: torch.T
 
 
 def sharpness(rgb: torch.Tensor, region: torch.Tensor) -> float:
-    """Variance of the Laplacian of luma of `[H, W, 3]` within `region` `[H, W]`: falls where detail is smoothed away."""
+    """Variance of the Laplacian of luma of `[H, W, 3]` within `region` `[H, W]`: falls where detail is smoothed away. Beyond the picture
+    is what is at its border, since black there would be an edge of its own."""
     kernel = torch.tensor([[0.0, 1, 0], [1, -4, 1], [0, 1, 0]])[None, None]
-    return float(F.conv2d((rgb @ LUMA)[None, None], kernel, padding=1)[0, 0][region].var())
+    return float(F.conv2d(F.pad((rgb @ LUMA)[None, None], (1, 1, 1, 1), mode="replicate"), kernel)[0, 0][region].var())
 
 
 def warp_error(better: torch.Tensor, previous: torch.Tensor, flow: torch.Tensor, visible: torch.Tensor) -> float | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch.nn import functional as F
 
@@ -16,7 +17,7 @@ from enhance.clips import Clip, PairConfig, clip_label, of_scene
 from enhance.damage import Damage, Sources, make
 from enhance.diffusion_renderer import Relit
 from enhance.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed_as, refits, shots_of
-from enhance.shards import KINDS, PairSet, to_bytes, write_shard
+from enhance.shards import KINDS, NOTE, PairSet, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.align import as_aligned
 from recon.assets.extract import FEWEST_SPLATS, Candidate, candidates
@@ -26,12 +27,14 @@ from recon.log import Log, LogCamera
 from render.references import References
 from scenes.atomic import atomic_file
 from scenes.databank import Databank
-from scenes.files import load
+from scenes.files import kind_of, load
 from scenes.hdr import load_hdr
 from scenes.names import unknown
+from scenes.opening import scene_folder
 from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.spread import spread
+from scenes.usd_scene import load_recorded
 
 ANYWHERE = ("underfit", "isp", "isp_frame", "clean")
 """Kinds that need nothing but a scene and its recording."""
@@ -63,7 +66,7 @@ def make_pairs(
     """
     config, sources = config or PairConfig(), sources or Sources()
     scene = open_reconstruction(scene_path)
-    log = of_scene(log_path if isinstance(log_path, Log) else open_log(log_path), scene)
+    log = of_scene(log_path if isinstance(log_path, Log) else open_recording(log_path, scene), scene)
     kinds = check_kinds(kinds)
     chosen, kept = check_cameras(scene, log, cameras), held_out_camera(scene, log)
     out = claim_pairs(out, scene, log, seed, config)
@@ -71,11 +74,11 @@ def make_pairs(
     log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]
     if "relight" in kinds and sources.relit is not None:
-        _ask(sources.relit, starts, config)
+        _ask(sources.relit, [s for s in starts if not _is_made(out, "relight", s[0], s[1])], config)
     untouched = dict.fromkeys(kinds, 0)
     for done, (camera, start) in enumerate(starts):
         name = clip_label(camera.name, start)
-        missing = [kind for kind in kinds if not (out / kind / f"{name}.json").exists()]
+        missing = [kind for kind in kinds if not _is_made(out, kind, camera, start)]
         split = {"split": "held out" if camera.name == kept else "train"}
         clip = Clip(scene, camera, start, config, seed, split | rights, device) if missing else None
         for kind in missing:
@@ -91,6 +94,11 @@ def make_pairs(
     for kind in kinds:
         contact_sheet(PairSet(out), kind, out / f"{kind}.png")
     return out
+
+
+def _is_made(out: Path, kind: str, camera: LogCamera, start: int) -> bool:
+    """Whether a clip is there, whose description is written last."""
+    return (out / kind / f"{clip_label(camera.name, start)}.json").exists()
 
 
 def _ask(relit: Relit, starts: list[tuple[LogCamera, int]], config: PairConfig) -> None:
@@ -162,11 +170,35 @@ def _returns(candidate: Candidate) -> bool:
 
 
 def open_reconstruction(path: str | Path | Scene) -> Scene:
-    """A scene; ValueError where the path holds something else."""
-    scene = path if isinstance(path, Scene) else load(path)
-    if not isinstance(scene, Scene):
+    """A scene as it was recorded, whatever was edited since: the photos show none of that. ValueError where the path holds something
+    else."""
+    if isinstance(path, Scene):
+        return path
+    if kind_of(path) != "scene":
         raise ValueError(f"{path} is not a scene; pairs are made from a scene that sidestep recon wrote")
-    return scene
+    return load_recorded(scene_folder(path))
+
+
+def open_recording(path: str | Path, scene: Scene) -> Log:
+    """The recording that a scene was made from, in the scene's world: of pictures alone with its metres, not those guessed anew. ValueError
+    where it is another one; stderr says where only its name is."""
+    told = scene.meta.get("world_from_model")
+    log = open_log(path) if told is None else open_log(path, metres_per_unit=float(told["scale"]))
+    fix = "give each scene's own recording with --data"
+    for key, much in (("world_origin", 1.0), ("world_from_model", 1e-3)):
+        ours, theirs = (_numbers(meta.get(key)) for meta in (scene.meta, log.meta))
+        if len(ours) == len(theirs) and (np.abs(ours - theirs) > much * (1 + np.abs(ours) * (key != "world_origin"))).any():
+            raise ValueError(f"{path} is not the recording that the scene {scene.meta.get('name')} was made from: it is elsewhere; {fix}")
+    if log.name != scene.meta.get("name"):
+        print(f"{path} is called {log.name}, and its scene {scene.meta.get('name')}: if it is another drive, {fix}", file=sys.stderr)
+    return log
+
+
+def _numbers(told: object) -> np.ndarray:
+    """All numbers in json-like data, in its order."""
+    if isinstance(told, dict | list):
+        return np.concatenate([np.zeros(0), *map(_numbers, told.values() if isinstance(told, dict) else told)])
+    return np.array([told], dtype=float) if isinstance(told, int | float) and not isinstance(told, bool) else np.zeros(0)
 
 
 def check_cameras(scene: Scene, log: Log, cameras: Sequence[str] | None) -> list[str]:
@@ -210,16 +242,17 @@ def _write(path: Path, kind: str, clip: Clip, damage: Damage) -> None:
     write_shard(path, tensors, {"kind": kind, **clip.meta, **damage.what})
 
 
-def claim_pairs(out: str | Path, scene: Scene, log: Log, seed: int, config: PairConfig) -> Path:
-    """The folder for a scene's pairs, which is noted in it; ValueError where it holds others, before anything is reconstructed for them."""
+def claim_pairs(out: str | Path, scene: Scene, log: Log, seed: int, config: PairConfig, made_of: dict[str, str] | None = None) -> Path:
+    """The folder for a scene's pairs, which is noted in it; ValueError where it holds others, before anything is reconstructed for them.
+    made_of: what else they are made of, by what it is called: skies, a databank."""
     settings = {"seed": seed, "width": config.width, "frames": config.frames, "every": config.every}
-    claim(Path(out), settings, {"scene": _digest(scene), "recording": log.name})
+    claim(Path(out), settings, {"scene": _digest(scene), "recording": log.name, **(made_of or {})})
     return Path(out)
 
 
 def claim(out: Path, settings: dict, made_of: dict) -> None:
     """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
-    note, before = out / "pairs.json", {}
+    note, before = out / NOTE, {}
     if note.exists():
         try:
             before = dict(json.loads(note.read_text()))

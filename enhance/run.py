@@ -44,8 +44,8 @@ class TrainConfig:
     """Clips of smallest crops in a temporal batch."""
     looked_at: int = 32
     """Objects in a batch of objects' colours, and of missing shadows."""
-    frames: int = 4
-    """Frames of a training clip."""
+    frames: int = 5
+    """Frames of a training clip: one, and as many as the network looks back to."""
     temporal_every: int = 4
     """Every how many steps a temporal batch comes; the others are images."""
     rate: float = 8e-4
@@ -171,9 +171,10 @@ class Run:
         return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 
     def done(self, stage: str) -> float:
-        """How much of a stage's budget is spent, from 0 to 1."""
-        share = self.share(stage)
-        if share <= 0:
+        """How much of a stage's budget is spent, 0 to 1: all where a later one has begun, though the budget be longer now, since what a
+        stage learnt is lost where an earlier one goes on below it."""
+        share, later = self.share(stage), STAGES[STAGES.index(stage) + 1 :]
+        if share <= 0 or any(self.step[other] for other in later):
             return 1.0
         if self.steps is not None:
             return min(1.0, self.step[stage] / max(share * self.steps, 1))

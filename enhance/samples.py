@@ -50,6 +50,10 @@ class Images(Batch):
     rgb: torch.Tensor
 
 
+SMALLEST = 16
+"""Pixels of a photo's shorter side, at least."""
+
+
 class Photos:
     """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
 
@@ -57,7 +61,10 @@ class Photos:
         self.frames: list[np.ndarray] = []
         for path in map(Path, paths):
             before = len(self.frames)
-            self.frames += [(shrunk(frame, width) * 255).round().to(torch.uint8).numpy() for frame in frames_of(path, stride)]
+            for frame in frames_of(path, stride):
+                if min(frame.shape[:2]) < SMALLEST:
+                    raise ValueError(f"{path} holds a picture of {frame.shape[1]}x{frame.shape[0]} pixels, too small to tell; leave it out")
+                self.frames.append((shrunk(frame, width) * 255).round().to(torch.uint8).numpy())
             if len(self.frames) == before:
                 raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PHOTO_SUFFIXES)} or a video")
 
@@ -81,6 +88,7 @@ class Sampler:
         for kind in PLACED:  # where nothing could be changed, there is nothing to learn
             self.shards[kind] = [s for s in self.shards[kind] if s.meta.get("instances")]
         self.rendered = [kind for kind in RENDERED if self.shards[kind]]
+        self.longest = max((s.frames for kind in self.rendered for s in self.shards[kind]), default=1)
         self._shade = ShadeSampler(self.shards["shadow"], seed)
         self.has_objects = photos is not None or bool(self.shards["clean"] or self.shards["isp"])
         self._objects = ObjectSampler(self.shards, photos.frames if photos else [], "isp" in kinds)
@@ -126,11 +134,9 @@ class Sampler:
         return _flipped(rng, Sample(damaged, w.target, mask, w.flow, w.visible, w.reference * (trust > 0), trust))
 
     def _rendered(self, rng: np.random.Generator, frames: int, size: int) -> Window:
-        weights = np.array([KIND_WEIGHTS[k] for k in self.rendered])
-        kind = self.rendered[rng.choice(len(weights), p=weights / weights.sum())]
-        shards = [s for s in self.shards[kind] if s.frames >= frames]
-        if not shards:
-            raise ValueError(f"no training clip of kind {kind} has {frames} frames; make pairs of longer clips")
+        able = {kind: some for kind in self.rendered if (some := [s for s in self.shards[kind] if s.frames >= frames])}
+        weights = np.array([KIND_WEIGHTS[k] for k in able])
+        shards = list(able.values())[rng.choice(len(weights), p=weights / weights.sum())]
         return _crop(rng, shards[rng.integers(len(shards))], frames, size)
 
     def _right(self, rng: np.random.Generator, size: int) -> torch.Tensor:

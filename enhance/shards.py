@@ -35,6 +35,8 @@ from scenes.atomic import atomic_file
 from scenes.checks import check_tensor
 
 KINDS = ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert", "isp_frame")
+NOTE = "pairs.json"
+"""In a folder of pairs: how they are made, and of what."""
 RENDERED = ("underfit", "sparse", "cycle", "crossref")
 """Kinds whose whole frame comes from a reconstruction."""
 FIELDS = {
@@ -159,11 +161,13 @@ class PairSet:
 
     def __init__(self, *folders: str | Path):
         self.shards: list[Shard] = []
+        seen: set[Path] = set()  # a folder may be named twice, or with one in it
         for folder in map(Path, folders):
             if not folder.is_dir():
                 raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
             for file in sorted([*folder.glob("*/*.json"), *folder.glob("*/*/*.json")]):
-                if file.parent.name in KINDS:
+                if file.parent.name in KINDS and file.name != NOTE and not file.name.startswith(".") and file.resolve() not in seen:
+                    seen.add(file.resolve())
                     self.shards.append(_read_meta(file))
         if not self.shards:
             raise ValueError(

@@ -35,7 +35,7 @@ from enhance.seam import usual_changes
 from enhance.shade import optical_depth, shaded
 from enhance.shade_samples import Grounds
 from enhance.shards import RENDERED, PairSet
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, load_net, save_net
+from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
 from scenes.names import unknown
 from scenes.stops import Stops
 
@@ -107,6 +107,10 @@ def train(
     if config is None:
         config = TrainConfig(**opened(checkpoint)["config"]) if checkpoint.exists() else TrainConfig.of(torch.device(device))
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
+    if sampler.rendered and sampler.longest < config.frames:
+        print(
+            f"the longest training clip has {sampler.longest} of {config.frames} frames: that is as far as is looked back", file=sys.stderr
+        )
     first = BUILTIN if start == "builtin" else start
     begun, origin = load_net(first) if first is not None else (None, None)
     if begun is None:
@@ -178,9 +182,24 @@ def _gain(run: Run, pairs: PairSet | None, origin: dict | None) -> dict[str, obj
     # on clips that were trained on a network gains a whole dB by knowing the place
     rendered = [] if pairs is None else [s for s in pairs.of() if s.meta["kind"] in RENDERED]
     held_out = [s for s in rendered if s.meta["split"] == "held out"]
-    if origin is not None and not ("enhancer" in run.stages and held_out):
+    trained = "enhancer" in run.stages
+    if origin is not None and not (trained and held_out):
+        if trained and REPAIR_GAIN in origin:
+            print(
+                f"nothing of these pairs is held out to judge the repairing by: {_works(origin[REPAIR_GAIN])}, as before", file=sys.stderr
+            )
         return {REPAIR_GAIN: origin[REPAIR_GAIN]} if REPAIR_GAIN in origin else {}
-    return {REPAIR_GAIN: repair_gain(run.average, held_out or rendered)}
+    gains = repair_gain(run.average, held_out or rendered)
+    if trained:
+        where = "clips that are held out" if held_out else "the clips it was trained on, since none is held out"
+        print(f"on {where} the repairing gains {gains[0]:.2f} dB, and {gains[1]:.2f} beside photos: {_works(gains)}", file=sys.stderr)
+    return {REPAIR_GAIN: gains}
+
+
+def _works(gains: Sequence[float]) -> str:
+    """Where an enhancer of such weights repairs (`Enhancer`), for messages."""
+    where = [name for name, gain in zip(("frames without photos", "frames with photos"), gains, strict=True) if gain >= WORTH]
+    return f"it works on {' and '.join(where)}" if where else f"it rests, as less than {WORTH} dB are not worth its time"
 
 
 def _stage(
@@ -272,7 +291,7 @@ def _clips(run: Run, sampler: Sampler, step: int) -> Sample:
     temporal = step % c.temporal_every == 1 and c.frames > 1
     _, scale = _crops(run, step)
     count = max(1, round((c.clips if temporal else c.images) / scale**2))
-    return sampler.batch(2 * step + 1, count, c.frames if temporal else 1, round(c.crop * scale / 16) * 16)
+    return sampler.batch(2 * step + 1, count, min(c.frames, sampler.longest) if temporal else 1, round(c.crop * scale / 16) * 16)
 
 
 def _enhancer_step(run: Run, perceptual: PatchPerceptual, sample: Sample, step: int) -> torch.Tensor:

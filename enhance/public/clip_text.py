@@ -75,7 +75,11 @@ def encoded(path: Path, state: Mapping[str, object], config: Mapping, ids: torch
     """`[1, N, D]`: the last layer's states, normed, of `ids` `[1, N]`. ValueError as `strict`."""
     kept = strict(path, NAME, state, shapes(path, state, int(config["intermediate_size"])), r"text_model\.embeddings\.position_ids")
     w: State = {name.removeprefix("text_model."): value.float() for name, value in kept.items()}
-    heads, eps, act = int(config["num_attention_heads"]), float(config.get("layer_norm_eps", 1e-5)), ACTIVATIONS[config["hidden_act"]]
+    heads, eps, act = int(config["num_attention_heads"]), float(config.get("layer_norm_eps", 1e-5)), ACTIVATIONS.get(config["hidden_act"])
+    width = w["final_layer_norm.weight"].numel()
+    if act is None or heads < 1 or width % heads:
+        told = f"{width} channels in {heads} heads, and the activation {config['hidden_act']!r}"
+        raise ValueError(f"{path.parent / 'config.json'}: {told}, are no text encoder of Difix's; fetch the folder again")
     x = w["embeddings.token_embedding.weight"][ids] + w["embeddings.position_embedding.weight"][: ids.shape[1]]
 
     def linear(x: torch.Tensor, name: str) -> torch.Tensor:

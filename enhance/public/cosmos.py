@@ -55,7 +55,7 @@ class Sizes:
         head = sides("blocks.0.self_attn.q_norm.weight", 1)[0]
         blocks = 1 + max(int(name.split(".")[1]) for name in state if name.startswith("blocks.") and name.split(".")[1].isdigit())
         masks = columns // PATCH**2 - LATENT
-        if columns % PATCH**2 or masks not in STRETCH or width % head or head % 2:
+        if columns % PATCH**2 or masks not in STRETCH or head < 1 or width % head or head % 2:
             raise ValueError(f"{path}: {width} channels in heads of {head}, {columns} values a patch are no size of {NAME}; fetch it again")
         return cls(
             width,

@@ -106,7 +106,18 @@ def read_difix(folder: Path, read_state) -> Difix:
     return difix.eval().requires_grad_(False)
 
 
-def config_of(path: Path) -> dict:
+class Config(dict[str, Any]):
+    """What a json file says, by key. ValueError naming the file for a key that it lacks."""
+
+    def __init__(self, path: Path, found: Mapping[str, Any]):
+        super().__init__(found)
+        self.path = path
+
+    def __missing__(self, key: str) -> Any:
+        raise ValueError(f"{self.path} does not say {key}; fetch the model's folder again")
+
+
+def config_of(path: Path) -> Config:
     """A json file's dict. ValueError where it is not there or not whole."""
     try:
         found = json.loads(path.read_text())
@@ -114,7 +125,7 @@ def config_of(path: Path) -> dict:
         raise ValueError(f"{path} cannot be read ({error}); fetch the model's folder again") from error
     if not isinstance(found, dict):
         raise ValueError(f"{path} must hold an object, got a {type(found).__name__}; fetch the model's folder again")
-    return found
+    return Config(path, found)
 
 
 def variance_kept(path: Path) -> float:
@@ -124,8 +135,11 @@ def variance_kept(path: Path) -> float:
     for name, value in wanted.items():
         if config.get(name, value) != value:
             raise ValueError(f"{path}: {name} is {config[name]!r}, wanted {value!r} of SD-Turbo; fetch the folder again")
+    steps = int(config.get("num_train_timesteps", 1000))
+    if steps <= TIMESTEP:
+        raise ValueError(f"{path}: num_train_timesteps is {steps}, and the release runs at step {TIMESTEP}; fetch the folder again")
     ends = float(config["beta_start"]) ** 0.5, float(config["beta_end"]) ** 0.5
-    betas = torch.linspace(*ends, int(config.get("num_train_timesteps", 1000)), dtype=torch.float64) ** 2
+    betas = torch.linspace(*ends, steps, dtype=torch.float64) ** 2
     return float((1 - betas)[: TIMESTEP + 1].prod())
 
 

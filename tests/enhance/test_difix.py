@@ -107,6 +107,12 @@ def test_text_looks_at_earlier_words_only(release):
         ("scheduler/scheduler_config.json", {"prediction_type": "v_prediction"}, "v_prediction"),
         ("tokenizer/vocab.json", {"remove</w>": None}, "tokenizer"),
         ("text_encoder/config.json", {"intermediate_size": 7}, "fc1"),
+        ("text_encoder/config.json", {"intermediate_size": None}, "config.json does not say intermediate_size"),
+        ("text_encoder/config.json", {"num_attention_heads": 5}, "in 5 heads"),
+        ("text_encoder/config.json", {"hidden_act": "relu"}, "the activation 'relu'"),
+        ("vae/config.json", {"scaling_factor": None}, "config.json does not say scaling_factor"),
+        ("scheduler/scheduler_config.json", {"beta_start": None}, "scheduler_config.json does not say beta_start"),
+        ("scheduler/scheduler_config.json", {"num_train_timesteps": 100}, "num_train_timesteps is 100, and the release runs at step 199"),
     ],
 )
 def test_a_folder_that_is_not_whole_is_refused(release, tmp_path, file, change, says):

@@ -43,6 +43,13 @@ def test_equal_pictures_have_no_distance_and_any_size_is_taken():
     assert feature_distance(rgb, rgb, torch.ones(45, 61), lambda x: features(x)[:2]) == 0
 
 
+def test_a_pictures_border_is_no_edge():
+    whole = torch.ones(20, 30, dtype=torch.bool)
+    assert sharpness(torch.full((20, 30, 3), 0.5), whole) < 1e-12
+    ramp = torch.linspace(0, 1, 30)[None, :, None].expand(20, 30, 3)
+    assert sharpness(ramp, whole) < 1e-3
+
+
 def test_smoothing_costs_sharpness():
     rgb, whole = picture(), torch.ones(48, 64, dtype=torch.bool)
     smooth = torch.nn.functional.avg_pool2d(rgb.permute(2, 0, 1)[None], 3, 1, 1)[0].permute(1, 2, 0)
@@ -74,3 +81,13 @@ def test_the_identity_does_not_drift_and_a_stirred_network_may(tmp_path):
     assert max(still.brightness, still.colour, still.sharpness) < 1e-6
     other = drift(Enhancer(stirred()), of_video(tmp_path / "v.mp4"), frames=20)
     assert np.isfinite([other.brightness, other.colour, other.sharpness]).all()
+
+
+def test_a_long_clips_rollout_comes_back_to_where_it_began():
+    """Or its first frames would be compared with themselves."""
+    from types import SimpleNamespace
+
+    generator = torch.Generator().manual_seed(3)
+    pictures = [torch.rand(8, 8, 3, generator=generator) for _ in range(40)]
+    fading = SimpleNamespace(step=lambda rgb, memory: (rgb * 0.99 ** (memory or 0), (memory or 0) + 1))
+    assert drift(fading, pictures, frames=30).brightness > 10

@@ -1,11 +1,14 @@
 """Pairs of a made-up street: its "recording" is rendered from it."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from made_colmap import pictures_along, write_colmap
+from made_drive import write_drive
 from PIL import Image
 from street import car
 
@@ -13,18 +16,22 @@ from enhance.clips import Clip, PairConfig, of_scene
 from enhance.damage import ORDER, Sources
 from enhance.degrade import Underfit, unfinish
 from enhance.lighting import random_sky
-from enhance.pairs import held_out_camera, kinds_for, make_pairs, prepare_sources
+from enhance.pairs import claim_pairs, held_out_camera, kinds_for, make_pairs, open_reconstruction, open_recording, prepare_sources
 from enhance.photo_pairs import make_photo_pairs
 from enhance.refits import REFITS, Refit, as_reconstructed, shots_of
 from enhance.shards import KINDS, PairSet
+from recon import open_log
 from recon.assets.extract import FEWEST_SPLATS, Candidate
 from recon.log import LogCamera
 from render import render_frame
 from render.compare import psnr
 from render.references import References
 from render.video import write_image
+from scenes import load, save
 from scenes.databank import Databank
+from scenes.edit import Edit
 from scenes.trajectory import Trajectory
+from scenes.usd_edit import add_change
 
 CONFIG = PairConfig(width=96, frames=3, every=4)
 
@@ -313,6 +320,53 @@ def test_damaged_pair_folders_say_what_to_do(tmp_path):
     (tmp_path / "isp" / "a.json").write_text(json.dumps({"frames": 1, "height": 2, "width": 2, "kind": "isp", "split": "train"}))
     with pytest.raises(FileNotFoundError, match="a.safetensors"):
         PairSet(tmp_path)
+
+
+def test_what_is_no_clip_is_passed_over_and_a_clip_named_twice_counts_once(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "clean")  # a folder called as a kind: its note lies where a clip's description would
+    (tmp_path / "clean" / "clean" / ".half.json").write_text("{")
+    assert len(PairSet(tmp_path / "clean", tmp_path).shards) == len(PairSet(folder).shards)
+    assert len(PairSet(tmp_path, tmp_path / "clean").shards) == len(PairSet(folder).shards)
+
+
+def test_a_scene_of_pictures_alone_is_met_by_its_recording_in_its_own_metres(street, tmp_path, capsys):
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+    workspace = write_colmap(tmp_path / "walk", street, {"": pictures_along(street, count=6)})
+    log = open_log(workspace, metres_per_unit=7.0)
+    scene = replace(street, meta=log.meta)
+    found = open_recording(workspace, scene)
+    assert torch.equal(found.camera("camera").world_from_cam, log.camera("camera").world_from_cam)
+    assert np.array_equal(found.points.xyz, log.points.xyz) and not capsys.readouterr().err
+    other = write_colmap(tmp_path / "other", street, {"": pictures_along(street, count=6, step=0.7)[1:]})
+    with pytest.raises(ValueError, match="other is not the recording that the scene walk was made from: it is elsewhere; give each"):
+        open_recording(other, scene)
+    workspace.rename(tmp_path / "renamed")
+    open_recording(tmp_path / "renamed", scene)
+    assert "renamed is called renamed, and its scene walk: if it is another drive" in capsys.readouterr().err
+
+
+def test_another_drives_recording_is_refused_by_where_it_is(street, tmp_path):
+    own_drive = write_drive(tmp_path / "drive", street)
+    log = open_log(own_drive)
+    open_recording(own_drive, replace(street, meta=log.meta))
+    away = {**log.meta, "world_origin": [v + 400 for v in log.meta["world_origin"]]}
+    with pytest.raises(ValueError, match="is not the recording that the scene"):
+        open_recording(own_drive, replace(street, meta=away))
+
+
+def test_pairs_are_of_what_was_recorded_whatever_was_edited_since(street, tmp_path):
+    save(street, tmp_path / "s")
+    add_change(tmp_path / "s", "edit", street, Edit(remove=(street.actors[0].track,)), {"kind": "edit"})
+    assert not load(tmp_path / "s").actors and len(open_reconstruction(tmp_path / "s").actors) == len(street.actors)
+    with pytest.raises(ValueError, match="is not a scene; pairs are made from a scene"):
+        open_reconstruction(tmp_path / "s" / "background.usdc")
+
+
+def test_a_clip_that_is_there_is_not_made_again_of_other_things(street, recording, tmp_path):
+    claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "[]"})
+    claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of shadow": "['a.hdr']"})
+    with pytest.raises(ValueError, match="holds pairs of another skies of relight"):
+        claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "['a.hdr']"})
 
 
 def test_photos_become_pairs_that_are_held_out_and_told_their_region(tmp_path):

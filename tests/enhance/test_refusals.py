@@ -181,7 +181,7 @@ def test_photos_of_one_name_and_other_settings_are_refused(tmp_path):
 
 
 def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("recon.open_log", lambda _: recording)
+    monkeypatch.setattr("enhance.pairs.open_recording", lambda *_: recording)
     monkeypatch.setattr("enhance.pairs.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
     save(street, tmp_path / "street")
     one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))
@@ -191,6 +191,12 @@ def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street,
         replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
     with pytest.raises(UsageError, match="--cameras names none"):
         replace(one, cameras=()).run()
+    with pytest.raises(FileNotFoundError, match="gone.hdr does not exist"):
+        replace(one, cameras=None, skies=(tmp_path / "gone.hdr",)).run()
+    with pytest.raises(UsageError, match="--seed must be a whole number from 0"):
+        replace(one, cameras=None, seed=-1).run()
+    with pytest.raises(UsageError, match="--only takes weights to start from; give --start"):
+        Train((tmp_path,), tmp_path / "t", only=("objects",)).run()
     for size in (0, -5, 31):
         with pytest.raises(ValueError, match=f"at least 32 pixels wide, got {size}"):
             replace(one, cameras=None, size=size).run()

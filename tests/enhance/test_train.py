@@ -13,7 +13,7 @@ from small_net import SMALL
 
 from enhance.enhancer import Enhancer
 from enhance.evaluate import ALL_TOLD, ALONE, METHODS, PUT_IN, _told, evaluate, table
-from enhance.net import Net
+from enhance.net import Net, NetConfig
 from enhance.run import TrainConfig, opened
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import train
@@ -249,3 +249,23 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
     rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
     assert [r.method for r in rows] == [*METHODS, ALONE, ALL_TOLD, "half", *METHODS, PUT_IN, "half", *METHODS, "half"]
     assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)
+
+
+def test_a_longer_budget_begins_no_stage_anew_that_a_later_one_stands_on(pairs, tmp_path, capsys):
+    """What the autoencoder and the prior learn is lost on a network that was trained on theirs."""
+    first = train(pairs, tmp_path, steps=20, net=SMALL, config=QUICK)
+    shorter = opened(tmp_path / "checkpoint.pt")["step"]
+    assert "clips that are held out the repairing gains" in capsys.readouterr().err
+    train(pairs, tmp_path, steps=60, net=SMALL, config=QUICK, resume=True)
+    longer = opened(tmp_path / "checkpoint.pt")["step"]
+    assert first.is_file() and longer["enhancer"] > shorter["enhancer"] > 0
+    assert all(longer[stage] == shorter[stage] for stage in ("autoencoder", "prior", "objects"))
+
+
+def test_clips_shorter_than_what_is_looked_back_to_are_said_and_trained_on(pairs, tmp_path, capsys):
+    train(pairs, tmp_path, steps=12, net=SMALL, config=replace(QUICK, frames=9))
+    assert "the longest training clip has 3 of 9 frames" in capsys.readouterr().err
+
+
+def test_a_clip_is_as_long_as_the_network_looks_back():
+    assert TrainConfig().frames == NetConfig().history + 1
