@@ -25,7 +25,7 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at
 from recon.fit.turns import Turns
-from recon.fit.unseen import as_neighbours, shown_parts
+from recon.fit.unseen import as_neighbours, curtains, footprint, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -266,12 +266,16 @@ class Fit:
     def _guess(self) -> None:
         """Give what pictures hardly show its neighbours' colours, to keep, once what went astray since the last growth is gone."""
         self._renew(*kept(self.splats, self.descent.tensors(), ~self.swept.holds(self.splats)))
-        part = torch.zeros_like(self.splats.reach)
+        part, inside = torch.zeros_like(self.splats.reach), torch.zeros_like(self.splats.reach, dtype=torch.bool)
         for view in self.training:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
             which = self._in_sight(view, camera, [], None)
-            shown = torch.cat(shown_parts(self._placed(self.splats.select(which, 1), view, camera), camera))
-            part[which] = torch.maximum(part[which], shown)
+            placed = self._placed(self.splats.select(which, 1), view, camera)
+            part[which] = torch.maximum(part[which], torch.cat(shown_parts(placed, camera)))
+            inside[which] |= torch.cat([footprint(p, camera) > 0 for p in placed])
+        stays = ~curtains(self.splats, inside, self.descent.coloured())
+        self._renew(*kept(self.splats, self.descent.tensors(), stays))
+        part = part[stays]
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured())
         self.descent.still_colours(self.guessed)
 

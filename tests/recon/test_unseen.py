@@ -10,7 +10,7 @@ from recon import open_log
 from recon.build import begin, choose
 from recon.fit.fit import GUESSED_FROM
 from recon.fit.model import Splats
-from recon.fit.unseen import NEIGHBOURS, SEEN, as_neighbours, footprint, shown_parts
+from recon.fit.unseen import NEIGHBOURS, SEEN, as_neighbours, curtains, footprint, shown_parts
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
@@ -51,6 +51,33 @@ def test_a_splats_whole_weight_is_that_of_its_ellipse():
             one = replace(balls([(0.5, 0.4, 7.0)], [1.0], [0.8]), quats=turn, log_scales=scales.log())
             drawn = rasterize([Placed(one, pose)], camera, ("alpha",)).alpha.sum()
             assert float(footprint(Placed(one, pose), camera)) == pytest.approx(float(drawn), rel=0.12)
+
+
+def test_what_only_its_rim_shows_is_a_curtain_unless_it_lies_flat():
+    """Two upright, one of which is seen whole and one never, one lying, and an actor's."""
+    upright = torch.tensor([[0.5, 0.02, 0.5]]).log()
+    lying = torch.tensor([[0.5, 0.5, 0.02]]).log()
+    ground = replace(balls([(0.0, 0, 5)] * 4, [1.0] * 4, [0.9] * 4), log_scales=torch.cat([upright, upright, upright, lying]))
+    actor = replace(balls([(0.0, 0, 5)], [1.0], [0.9]), log_scales=upright)
+    splats = Splats.of([ground, actor], [torch.ones(4), torch.ones(1)])
+    inside = torch.tensor([False, True, False, False, False])
+    pulled = torch.tensor([True, True, False, True, True])
+    assert curtains(splats, inside, pulled).tolist() == [True, False, False, False, False]
+
+
+def test_a_fit_of_one_standing_camera_hangs_no_curtain_beside_its_pictures(street, drive, tmp_path):
+    log = open_log(drive)
+    names, span = choose(log, ["front_camera"])
+    _, fit = begin(log, names, span, SIZE, replace(CONFIG, steps=120), 4)
+    while fit.step_count < 120:
+        fit.step()
+    background = fit.splats.select(torch.arange(fit.splats.sizes[0]), 1)
+    inside = torch.zeros(len(background), dtype=torch.bool)
+    for view in fit.training:
+        placed = Placed(background.groups(1)[0].detach(), torch.eye(4, dtype=torch.float64))
+        inside |= footprint(placed, fit.motion.camera(view).resized(*SIZE)) > 0
+    left = curtains(background, inside, fit.descent.coloured()[: len(background)])
+    assert float(left.float().mean()) < 0.0015, "none but what went beyond the border since; 0.0035 where they stay"
 
 
 def splats_of(groups: list[list[float]], colour) -> tuple[Splats, torch.Tensor]:
