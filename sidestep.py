@@ -172,9 +172,9 @@ class Render:
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
-            witnesses = seeing(result.actor, cameras)
-            warnings += absence_warning(result.actor, cameras, witnesses)
-            warnings += unseen_warning(result.actor, witnesses)
+            warnings += absence_warning(result.actor, cameras, seeing(result.actor, cameras))
+        for actor in (a for a in scene.actors if not a.recorded):  # those of edits too: a shift may show another side of them
+            warnings += unseen_warning(actor, seeing(actor, cameras))
         warnings += odd_warning(self.output, *(self.size or (cameras[0].width, cameras[0].height)))
         warnings += stale_warning(self.output, self.outputs)
         warn(warnings)

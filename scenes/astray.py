@@ -1,10 +1,14 @@
-"""What to tell of actors that an edit shifts to where nobody knows the ground."""
+"""What to tell of actors that an edit brings to where nobody knows the ground, where something else is, or whose unseen sides it shows."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from scenes.collide import collisions
 from scenes.edit import Edit
 from scenes.insert import outside_ground
 from scenes.scene import Scene
+from scenes.seen import seeing, unseen_warning
 from scenes.trajectory import Trajectory
 
 
@@ -16,6 +20,25 @@ def astray(edit: Edit, scene: Scene) -> list[str]:
         if now > was:
             said.append(f"{actor.track} is shifted {now:.3g} m beyond the known ground and keeps the height of its edge there")
     return said
+
+
+def meeting(edit: Edit, scene: Scene) -> list[str]:
+    """A sentence for what each actor that an edit changes runs into, and did not before, and for sides of one that took another's place
+    which recorded cameras see and no photo of it shows."""
+    changed = {a.track: edit.apply(a, scene) for a in scene.actors if a.track in {*edit.shift, *edit.replace, *edit.retime}}
+    left = tuple(changed.get(a.track, a) for a in scene.actors if a.track not in edit.remove)
+    after, said = replace(scene, actors=left), []
+    for before in (a for a in scene.actors if a.track in changed and a.track not in edit.remove):
+        actor, known = changed[before.track], collisions(scene, before)
+        said += [f"{actor.track} {line}" for line in collisions(after, actor) if not any(_alike(line, old) for old in known)]
+        if before.track in edit.replace:
+            said += unseen_warning(actor, seeing(actor, [scene.camera(n, int(t)) for n in scene.rig for t in scene.frame_times(n)]))
+    return said
+
+
+def _alike(a: str, b: str) -> bool:
+    """Whether two sentences tell of one thing, at whatever time."""
+    return a.split()[:3] == b.split()[:3]
 
 
 def _beyond(scene: Scene, path: Trajectory) -> float:

@@ -17,6 +17,9 @@ SLACK = 0.1
 CLEARANCE = 0.4
 """Metres above the ground below which the background is road, kerb and their roughness."""
 
+HALF = 0.9
+"""Metres that the recording car is wide to either side."""
+
 SOLID = 0.5
 """Opacity from which a splat is something to run into."""
 
@@ -37,6 +40,9 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
         hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
         if hit is not None:
             found.append(f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment")
+    hit = next((t for t in times if scene.ego.covers(t) and _holds(actor, scene.ego.at(t), t)), None)
+    if hit is not None:
+        found.append(f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment")
     still = len(actor.trajectory) == 1
     times = times[:1] if still else times
     solid = _along(scene, actor, times)
@@ -47,6 +53,12 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
             found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
             break
     return found
+
+
+def _holds(actor: Actor, world_from_body: torch.Tensor, time_us: int) -> bool:
+    """Whether a body's own place lies within an actor's box, or nearer to it than half a car."""
+    place = (inverse(actor.trajectory.at(time_us)) @ world_from_body)[:2, 3].abs()
+    return bool((place < actor.asset.size[:2] / 2 + HALF).all())
 
 
 def _meet(a: Actor, b: Actor) -> bool:

@@ -127,7 +127,7 @@ class Edit:
         """Write the edit's layer; what to warn of, and what was done."""
         from scenes import Databank
         from scenes import edit as edits
-        from scenes.astray import astray
+        from scenes.astray import astray, meeting
         from scenes.match import other_model
         from scenes.usd_edit import add_change, free_name
 
@@ -142,7 +142,7 @@ class Edit:
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
         layer = self.scene / "edits" / f"{name}.usda"
         done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
-        return [*others, *astray(edit, scene), *edits.absences(edit, scene)], [done]
+        return [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)], [done]
 
 
 def _without(scene: Path, edit: Undone) -> str:

@@ -59,7 +59,8 @@ class Databank:
                 raise ValueError(f"format {data['format']!r} version {data['version']}, not {FORMAT!r} version {VERSION}")
             entries = [_entry(record) for record in data["entries"]]
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{index} is corrupt: {type(error).__name__} {error}") from error
+            fix = "delete it, and the next asset that is added makes it anew of what all say of themselves"
+            raise ValueError(f"{index} is corrupt: {type(error).__name__} {error}; {fix}") from error
         return sorted(entries, key=lambda e: e.id)
 
     def entry(self, id: str) -> Entry:
@@ -137,8 +138,9 @@ class Databank:
         if self.path.is_file():
             fix = "give another name with --databank"
             raise ValueError(f"{self.path} is a file; a databank is a folder, and made where there is none: {fix}")
-        if self.path.is_dir() and not os.access(self.path, os.W_OK | os.X_OK):
-            raise PermissionError(f"{self.path} takes no files of yours; give another databank with --databank")
+        there = next(folder for folder in (self.path, *self.path.absolute().parents) if folder.is_dir())
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise PermissionError(f"{there} takes no files of yours; give another databank with --databank")
         if (self.path / "index.json").exists():
             return self.entries()
         return [read_entry(file) for file in sorted(self.path.glob("assets/*/*/asset.json"))]

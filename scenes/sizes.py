@@ -25,8 +25,9 @@ ANYTHING = (0.01, 40.0)
 AXES = ("length", "width", "height")
 
 
-def odd_size(label: str, size: Sequence[float]) -> str:
-    """What is odd about the size `[length, width, height]` in metres of a thing of a class, with the likely cause; '' where nothing is."""
+def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
+    """What is odd about the size `[length, width, height]` in metres of a thing of a class, with the likely cause; '' where nothing is.
+    scale: by which the size was multiplied already."""
     told = " x ".join(f"{v:.3g}" for v in size)
     ranges = SIZES.get(slug(label), (ANYTHING,) * 3)
     wrong = [axis for axis, v, r in zip(AXES, size, ranges, strict=True) if not r[0] <= v <= r[1]]
@@ -36,14 +37,15 @@ def odd_size(label: str, size: Sequence[float]) -> str:
     said = f"is {told} m long, wide and high, but a {label} has {low} to {high} m"
     for factor, unit in ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"), (1000.0, "kilometres")):
         if _fits([v * factor for v in size], ranges):
-            return f"{said}: it seems to be in {unit}; give --scale {factor:g}"
+            cause = f"it seems to be in {unit}" if scale == 1 else "the scale is not the file's"
+            return f"{said}: {cause}; give --scale {factor * scale:g}"
     turned = [size[1], size[0], size[2]]
     if _fits(turned, ranges):
         return f"{said}: it seems to stand across; give another --forward"
     if any(_fits([size[i] for i in order], ranges) for order in ((0, 2, 1), (2, 1, 0), (2, 0, 1), (1, 2, 0))):
         return f"{said}: it seems to lie on its side; give another --up"
     middle = [(r[0] * r[1]) ** 0.5 for r in ranges]
-    return f"{said}; if it is one, give --scale {max(middle) / max(max(size), 1e-9):.2g} or so"
+    return f"{said}; if it is one, give --scale {scale * max(middle) / max(max(size), 1e-9):.2g} or so"
 
 
 def _fits(size: Sequence[float], ranges: Sequence[tuple[float, float]]) -> bool:

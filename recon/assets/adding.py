@@ -35,7 +35,7 @@ def add_mesh(
     bank = Databank(databank)
     bank.ready()
     mesh = read_mesh(file, up or "y", forward or "z", scale or 1.0)
-    _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), force)
+    _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), scale or 1.0, force)
     with Progress("fit", total=config.steps) as steps:
         meta = {**share, "source": file.name}
         asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
@@ -63,7 +63,7 @@ def add_splats(
     asset = Asset(
         replace(upright, means=upright.means - base), (high - low).double(), label, model_of(file), {**share, "source": file.name}
     )
-    _check_size(file, label, asset.size.tolist(), force)
+    _check_size(file, label, asset.size.tolist(), scale or metres, force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
 
 
@@ -150,8 +150,8 @@ def _misplaced(asset: Asset) -> str:
     return ""
 
 
-def _check_size(file: Path, label: str, size: list[float], force: bool) -> None:
-    if not force and (odd := odd_size(label, size)):
+def _check_size(file: Path, label: str, size: list[float], scale: float, force: bool) -> None:
+    if not force and (odd := odd_size(label, size, scale)):
         raise ValueError(f"{file} {odd}, or --force to keep it so")
 
 

@@ -67,9 +67,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
     for key in sorted(names, key=lambda k: (k != lead, names[k])):
-        chosen = [k for k, i in enumerate(model.images) if i.camera == key and ego.covers(moments[k])]
-        chosen.sort(key=lambda k: moments[k])
-        if not chosen:
+        chosen = sorted((k for k, i in enumerate(model.images) if i.camera == key), key=lambda k: moments[k])
+        if not any(ego.covers(moments[k]) for k in chosen):
             fix = f"name pictures of one moment alike, as front/001.jpg and left/001.jpg, or give times in {where / 'times.json'}"
             print(f"{path}: camera {names[key]} is left out, for it took no picture while {names[lead]} did; {fix}", file=sys.stderr)
             continue

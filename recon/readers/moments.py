@@ -18,16 +18,19 @@ STEP_US = 500_000
 FASTEST_US = 100
 """Microseconds between a picture and the next, below which a clock counts seconds or milliseconds."""
 
+SINCE, UNTIL, DAY_S = 900_000_000, 4_100_000_000, 86_400
+"""Seconds since 1970 of the years 1998 and 2099, and of a day: what is in between is a time."""
+
 Name = tuple[Decimal | str, ...]
 
 
 def moments_of(where: Path, model: Model, lead: int) -> list[int]:
-    """Microseconds of every picture of the model in the folder `where`: as its times.json says, else half a second apart in the order of
-    the numbers in their names.
+    """Microseconds of every picture of the model in the folder `where`: as its times.json says, or as their names, where these are times
+    since 1970 (in seconds, or thousandths, millionths or billionths), else half a second apart in the order of the numbers in their names.
 
     Those of one frame of a rig share a moment, as do those of several cameras whose names differ in what all of one camera's have alone
-    (front_001.png, 001/left.png). Where what differs else is one number, and cameras do not share them, they are times: pictures of other
-    cameras were taken as far between those of `lead` as the numbers are. ValueError where a camera takes two pictures at one moment.
+    (front_001.png, 001/left.png). Where what differs else is one number, and cameras do not share them, pictures of other cameras were
+    taken as far between those of `lead` as the numbers are. ValueError where a camera takes two pictures at one moment.
     """
     clock = where / "times.json"
     if clock.is_file():
@@ -57,12 +60,14 @@ def _by_clock(clock: Path, model: Model) -> list[int]:
 
 def _by_name(model: Model, lead: int) -> list[int]:
     names = _without_cameras(model)
+    numbers = [name[0] for name in names if len(name) == 1 and isinstance(name[0], Decimal)]
+    told = not model.rigid and len(numbers) == len(names)
+    if told and (unit := _unit(numbers)) is not None:
+        return [round((number - min(numbers)) * unit) for number in numbers]
     others = [name for name, i in zip(names, model.images, strict=True) if i.camera != lead]
     leading = {name for name, i in zip(names, model.images, strict=True) if i.camera == lead}
-    if not model.rigid and others and 2 * sum(name in leading for name in others) < len(others):
-        numbers = [name[0] for name in names if len(name) == 1 and isinstance(name[0], Decimal)]
-        if len(numbers) == len(names):
-            return _between(numbers, sorted(name[0] for name in leading if isinstance(name[0], Decimal)))
+    if told and others and 2 * sum(name in leading for name in others) < len(others):
+        return _between(numbers, sorted(name[0] for name in leading if isinstance(name[0], Decimal)))
     keys: list[Hashable] = [i.frame for i in model.images] if model.rigid else list(names)
     first: dict[Hashable, Name] = {}
     for key, name in zip(keys, names, strict=True):
@@ -72,14 +77,10 @@ def _by_name(model: Model, lead: int) -> list[int]:
 
 
 def _without_cameras(model: Model) -> list[Name]:
-    """The pictures' names without suffix, as text and numbers by turns; of several cameras' those of which all of a camera's pictures have
-    the same are left out."""
+    """The pictures' names without suffix, as their texts and numbers, but for those that all pictures of a camera share."""
     split = [_split(i.name) for i in model.images]
-    cameras = {i.camera for i in model.images}
-    if len(cameras) == 1:
-        return split
     out: list[Name] = list(split)
-    for camera in cameras:
+    for camera in {i.camera for i in model.images}:
         mine = [k for k, i in enumerate(model.images) if i.camera == camera]
         if len({len(split[k]) for k in mine}) == 1:
             varies = [len(set(tokens)) > 1 for tokens in zip(*(split[k] for k in mine), strict=True)]
@@ -90,7 +91,16 @@ def _without_cameras(model: Model) -> list[Name]:
 
 def _split(name: str) -> Name:
     parts = [NUMBER.split(part) for part in PurePosixPath(name).with_suffix("").parts]
-    return tuple(Decimal(token) if i % 2 else token for part in parts for i, token in enumerate(part))
+    return tuple(Decimal(token) if i % 2 else token for part in parts for i, token in enumerate(part) if token)
+
+
+def _unit(numbers: list[Decimal]) -> Decimal | None:
+    """Microseconds in one of the numbers, where all are times since 1970 on one day; None where they are no times."""
+    for unit in (Decimal(10) ** power for power in (6, 3, 0, -3)):
+        first, last = min(numbers) * unit / 10**6, max(numbers) * unit / 10**6
+        if first > SINCE and last < UNTIL and last - first < DAY_S:
+            return unit
+    return None
 
 
 def _sorting(name: Name) -> list[tuple[bool, Decimal, str]]:

@@ -64,7 +64,7 @@ def test_turning_splats_turns_their_axes_and_their_harmonics():
     ("scale", "up", "forward", "said"),
     [
         (1.0, "-y", "z", "a car has 2.5 x 1.3 x 1 to 6 x 2.6 x 2.3 m"),
-        (1e6, "-y", "z", "in millimetres; give --scale 0.001"),
+        (1e6, "-y", "z", "the scale is not the file's; give --scale 1000"),
         (1000.0, "-y", "x", "stand across; give another --forward"),
         (1000.0, "z", "y", "lie on its side; give another --up"),
     ],
@@ -128,3 +128,11 @@ def test_a_databank_that_takes_nothing_is_told_before_the_fit(tmp_path, monkeypa
     for name, said in (("bank", "index.json is corrupt"), ("file", "file is a file; a databank is a folder")):
         with pytest.raises(ValueError, match=said):
             adding.add_mesh(tmp_path / name, tmp_path / "car.glb", "car", None, None, None, {})
+
+
+def test_the_scale_that_is_advised_counts_the_one_that_was_given():
+    metres = (4.2, 1.8, 1.5)
+    assert "give --scale 0.001" in odd_size("car", [1000 * v for v in metres])
+    assert "the scale is not the file's; give --scale 1" in odd_size("car", [1000 * v for v in metres], scale=1000.0).replace(":", ";")
+    advised = float(odd_size("car", [0.1 * v for v in metres], scale=0.1).split("--scale ")[1].split()[0])
+    assert 0.7 < advised < 1.4

@@ -422,9 +422,28 @@ def test_pictures_of_one_moment_are_known_by_what_differs_in_a_cameras_names(str
     torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
 
 
-def test_names_that_are_times_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):
+@pytest.mark.parametrize("name", ["{us}.png", "{us}000.png", "f_{ms}_x.png", "{s:.6f}.png"])
+def test_names_that_are_times_are_a_clock(street, tmp_path, name, capsys):
     pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    names = [f"{c}/{1533151603547590 + 100_000 * i + 20_000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
+    begun = 1533151603547000
+    times = [begun + 100_000 * i + 20_000 * k for k in range(2) for i in range(4)]
+    names = [f"{c}/" + name.format(us=t, ms=t // 1000, s=t / 1e6) for t, c in zip(times, 4 * ["front"] + 4 * ["left"], strict=True)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
+    assert log.cameras["front"].times_us.tolist() == [0, 100_000, 200_000, 300_000]
+    assert log.cameras["left"].times_us.tolist() == [20_000, 120_000, 220_000, 320_000] and not capsys.readouterr().err
+
+
+def test_pictures_that_another_camera_took_before_or_after_the_first_are_named(street, tmp_path, capsys):
+    pair = {"front": pictures_along(street, count=5), "left": pictures_along(street, "left_camera", count=5)}
+    names = [f"{c}_{i + 2 * k:03d}.png" for k, c in enumerate(pair) for i in range(5)]
+    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
+    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["camera_2"]) == 3
+    assert "2 of 5 pictures of camera_2 are left out, the first of them" in capsys.readouterr().err
+
+
+def test_names_that_are_numbers_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):
+    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
+    names = [f"{c}/{100_000 * i + 20_000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
     assert log.cameras["front"].times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
     assert log.cameras["left"].times_us.tolist() == [100_000, 600_000, 1_100_000, 1_600_000]

@@ -10,12 +10,13 @@ from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, STEP_US, box, car, street
 
 from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
-from scenes.astray import astray
+from scenes.astray import astray, meeting
 from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
+from scenes.seen import SECTORS
 from scenes.usd import new_stage, usd_problems
 from scenes.usd_edit import add_change, add_edit, undo, undone
 from scenes.usd_root import RECORDED, add_sublayer
@@ -417,3 +418,19 @@ def test_an_edited_scene_moved_elsewhere_keeps_its_edits(saved, tmp_path):
     add_change(saved, "mine", load(saved), ALL, {})
     shutil.move(saved, tmp_path / "elsewhere")
     same(load(tmp_path / "elsewhere"), edited(busy(), ALL))
+
+
+def test_an_edit_says_what_it_brings_an_actor_into_and_not_what_it_was_in_before():
+    scene = busy()
+    clear = meeting(Edit(retime={"veh_2": 0}), scene)
+    into = meeting(Edit(shift={"veh_3": (-13.0, -5.0)}), scene)
+    assert not clear and any(line.startswith("veh_3 ") for line in into)
+    assert not meeting(Edit(shift={"veh_3": (-13.0, -5.0)}, remove=("veh_3",)), scene)
+
+
+def test_a_replaced_actor_whose_unseen_side_recorded_cameras_see_is_said():
+    seen = {**dict.fromkeys(SECTORS, 0), "front": 30}
+    guessed = replace(VAN, meta={"id": "van/0001", "sectors": seen})
+    told = meeting(Edit(replace={"veh_2": guessed}), busy())
+    assert any("van/0001 is shown from its" in line and "is a guess" in line for line in told)
+    assert not any("is a guess" in line for line in meeting(Edit(replace={"veh_2": VAN}), busy()))

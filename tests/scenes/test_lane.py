@@ -146,3 +146,12 @@ def test_what_would_slide_along_a_lane_is_said(street, yaw_deg, speed, said):
 def test_oncoming_faces_the_other_way(street):
     pose = insert(street, car(), Placement("car", 12, 3, math.pi, 4.0, "lane")).actor.trajectory.at(START_US)
     assert abs(float(yaw_of(pose))) == pytest.approx(math.pi, abs=1e-3)
+
+
+def test_standing_in_the_recording_cars_way_is_said(street):
+    """It drives along x, 1 m a frame or so, and a car of 1.8 m has to stand 1.8 m beside its path."""
+    last = street.ego.world_from_body[-1, :3, 3] - street.ego.world_from_body[0, :3, 3]
+    half = float(last.norm()) / 2
+    for left, said in ((0.0, True), (1.5, True), (2.2, False)):
+        told = collisions(street, insert(street, car(), Placement("car", half, left)).actor)
+        assert any("is where the recording car drives" in line for line in told) is said, left
