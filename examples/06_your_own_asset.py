@@ -35,7 +35,7 @@ def main(
 
     drive = load(scene)
     for x in (8.0, 11.0, 14.0):
-        result = insert(drive, Databank(databank).load(id), Placement(id, x, 1.2))
+        result = insert(drive, Databank(databank).load(id), Placement(id, x, 2.0))
         drive = result.scene
         for warning in result.warnings:
             print(warning)

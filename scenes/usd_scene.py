@@ -168,12 +168,12 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
 
 
 def _check_edits(stage: Usd.Stage, path: Path) -> None:
-    """ValueError where an edit's layer is there, and USD left it or one below it out."""
+    """ValueError where an edit's layer is there, and USD left it or one below it out, or it ends with its header and says nothing."""
     root = stage.GetRootLayer()
     for sub in (s for s in root.subLayerPaths if s != RECORDED and (path / s).exists()):
         layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
         below = {path / "edits" / s: Sdf.Layer.Find(layer.ComputeAbsolutePath(s)) for s in layer.subLayerPaths} if layer else {}
-        for file in (file for file, found in {path / sub: layer, **below}.items() if not found):
+        for file in (file for file, found in {path / sub: layer, **below}.items() if not found or not found.GetPrimAtPath("/World")):
             how, name = "damaged" if file.exists() else "missing", Path(sub).stem
             fix = f"restore it, or undo the edit: sidestep edit {path} --undo {name}"
             raise ValueError(f"{file} is {how}, so the edit {name} cannot be applied; {fix}")

@@ -304,6 +304,8 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     [
         ("mine.usda", 300, "mine.usda is damaged"),
         ("mine.usda", 0, "mine.usda is damaged"),
+        ("mine.usda", b"over", "mine.usda is damaged"),
+        ("mine/hidden.usda", b"over", "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
     ],
@@ -312,8 +314,9 @@ def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, le
     add_change(saved, "mine", load(saved), ALL, {})
     if left is None:
         (saved / "edits" / file).unlink()
-    else:
-        os.truncate(saved / "edits" / file, left)
+    else:  # bytes: cut right before the first of them, where what is left is a whole layer that says nothing
+        path = saved / "edits" / file
+        os.truncate(path, left if isinstance(left, int) else path.read_bytes().index(b"\n" + left) + 1)
     with pytest.raises(ValueError, match=f"{said}.*restore it, or undo the edit: sidestep edit {saved} --undo mine"):
         load(saved)
     assert any(said in problem for problem in validate(saved)) and not any("deleted" in problem for problem in validate(saved))
