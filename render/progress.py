@@ -26,8 +26,8 @@ class Progress:
         self.before = 0
         self.stream = stream or sys.stderr
         self.bar = self.stream.isatty()
-        self.start = time.monotonic()
-        self.said = self.start
+        self.start = self.said = time.monotonic()
+        self._first: tuple[float, int] | None = None  # when the first step was done, which may compile kernels for minutes, and the count
         self._said_count = -1
 
     def __enter__(self) -> Progress:
@@ -44,6 +44,8 @@ class Progress:
     def step(self, count: int = 1, note: str | None = None) -> None:
         """`count` more steps are done; `note` stands behind the count until the next note."""
         self.done += count
+        if self._first is None and count:
+            self._first = time.monotonic(), self.done
         self.note = self.note if note is None else note
         if time.monotonic() - self.said >= (BAR_SECONDS if self.bar else PLAIN_SECONDS):
             self._say()
@@ -58,8 +60,10 @@ class Progress:
         of = f"/{self.total}" if self.total else ""
         parts = [f"{self.label} {self.done}{of}"]
         now = self.done - self.before
-        if self.total and now > 0 and self.done < self.total:
-            parts.append(f"{_clock(spent * (self.total - self.done) / now)} left")
+        begun, first = self._first or (self.start, self.before)
+        if self.total and self.done > first and self.done < self.total:
+            left = (time.monotonic() - begun) * (self.total - self.done) / (self.done - first)
+            parts.append(f"{_clock(left)} left")
         elif now:
             parts.append(_clock(spent))
         return "  ".join(parts + ([self.note] if self.note else []))
