@@ -273,7 +273,7 @@ class Fit:
             placed = self._placed(self.splats.select(which, 1), view, camera)
             part[which] = torch.maximum(part[which], torch.cat(shown_parts(placed, camera)))
             inside[which] |= torch.cat([footprint(p, camera) > 0 for p in placed])
-        stays = ~curtains(self.splats, inside, self.descent.coloured())
+        stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         part = part[stays]
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured())

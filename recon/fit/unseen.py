@@ -16,14 +16,15 @@ from scipy.spatial import cKDTree
 from recon.fit.model import Splats, draw
 from scenes.camera import Camera
 from scenes.gaussians import Placed
+from scenes.ground import Ground
 from scenes.harmonics import C0
 from scenes.poses import inverse, matrix_from_quat
 
 SEEN = 0.05
 """Part of a splat that the picture showing most of it must show for its colour to be known."""
 
-FLAT = 0.8
-"""Of a splat's normal, its part that points up, from which on it lies rather than stands."""
+LOW = 0.2
+"""Metres above the ground up to which a splat is part of the street."""
 
 NEIGHBOURS = 16
 """Splats of known colour beside one of unknown, whose mean it is given."""
@@ -59,16 +60,16 @@ def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
     return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * inside
 
 
-def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor) -> torch.Tensor:
+def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
     """Which splats of the background, bool `[N]`, stand beyond the pictures' borders and are seen by their rims alone: at their colours
     pictures have `pulled`, though none has their middle `inside`, bool `[N]` both.
 
     A rim is all that holds such a splat, so it grows as large and as dense as that likes, and from aside it hangs before the street as a
-    curtain. What lies flat stays: it is the street beyond the border.
+    curtain. What lies on the ground stays: it is the street beyond the border.
     """
-    thinnest = splats.fields["log_scales"].argmin(1)[:, None, None].expand(-1, 3, 1)
-    lies = matrix_from_quat(splats.fields["quats"]).gather(2, thinnest)[:, 2, 0].abs() > FLAT
-    out = pulled & ~inside & ~lies
+    means = splats.fields["means"].detach().cpu()
+    high = means[:, 2] - ground.height(means[:, :2]) > LOW
+    out = pulled & ~inside & high.to(pulled.device)
     out[splats.sizes[0] :] = False
     return out
 

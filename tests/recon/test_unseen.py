@@ -14,6 +14,7 @@ from recon.fit.unseen import NEIGHBOURS, SEEN, as_neighbours, curtains, footprin
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
+from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Fisheye, Pinhole
 from tests.bench.presets import random_splats
@@ -53,16 +54,14 @@ def test_a_splats_whole_weight_is_that_of_its_ellipse():
             assert float(footprint(Placed(one, pose), camera)) == pytest.approx(float(drawn), rel=0.12)
 
 
-def test_what_only_its_rim_shows_is_a_curtain_unless_it_lies_flat():
-    """Two upright, one of which is seen whole and one never, one lying, and an actor's."""
-    upright = torch.tensor([[0.5, 0.02, 0.5]]).log()
-    lying = torch.tensor([[0.5, 0.5, 0.02]]).log()
-    ground = replace(balls([(0.0, 0, 5)] * 4, [1.0] * 4, [0.9] * 4), log_scales=torch.cat([upright, upright, upright, lying]))
-    actor = replace(balls([(0.0, 0, 5)], [1.0], [0.9]), log_scales=upright)
-    splats = Splats.of([ground, actor], [torch.ones(4), torch.ones(1)])
+def test_what_only_its_rim_shows_is_a_curtain_unless_it_is_the_street():
+    """Three that stand, one of which is seen whole and one never, one on the ground, and an actor's."""
+    some = balls([(0.0, 0, 5), (0.0, 0, 5), (0.0, 0, 5), (1.0, 0, 4.1)], [1.0] * 4, [0.9] * 4)
+    splats = Splats.of([some, balls([(0.0, 0, 5)], [1.0], [0.9])], [torch.ones(4), torch.ones(1)])
+    street = Ground(torch.full((9, 9), 4.0), (-4.0, -4.0), 1.0)
     inside = torch.tensor([False, True, False, False, False])
     pulled = torch.tensor([True, True, False, True, True])
-    assert curtains(splats, inside, pulled).tolist() == [True, False, False, False, False]
+    assert curtains(splats, inside, pulled, street).tolist() == [True, False, False, False, False]
 
 
 def test_a_fit_of_one_standing_camera_hangs_no_curtain_beside_its_pictures(street, drive, tmp_path):
@@ -76,7 +75,7 @@ def test_a_fit_of_one_standing_camera_hangs_no_curtain_beside_its_pictures(stree
     for view in fit.training:
         placed = Placed(background.groups(1)[0].detach(), torch.eye(4, dtype=torch.float64))
         inside |= footprint(placed, fit.motion.camera(view).resized(*SIZE)) > 0
-    left = curtains(background, inside, fit.descent.coloured()[: len(background)])
+    left = curtains(background, inside, fit.descent.coloured()[: len(background)], fit.ground)
     assert float(left.float().mean()) < 0.0015, "none but what went beyond the border since; 0.0035 where they stay"
 
 
