@@ -169,12 +169,15 @@ class Render:
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)
         warnings += cut_warning(scene, camera, self.start, self.duration)
         warnings += shift_warning(scene, clip_cameras(scene, camera, 0.0, times), scene.ego, self.lateral_shift)
+        put_in: set[str] = set()
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
-            warnings += absence_warning(result.actor, cameras, seeing(result.actor, cameras))
+            put_in.add(result.actor.track)
         for actor in (a for a in scene.actors if not a.recorded):  # those of edits too: a shift may show another side of them
-            warnings += unseen_warning(actor, seeing(actor, cameras))
+            witnesses = seeing(actor, cameras)
+            warnings += absence_warning(actor, cameras, witnesses) if actor.track in put_in else []
+            warnings += unseen_warning(actor, witnesses)
         warnings += odd_warning(self.output, *(self.size or (cameras[0].width, cameras[0].height)))
         warnings += stale_warning(self.output, self.outputs)
         warn(warnings)

@@ -185,9 +185,9 @@ def open_recording(path: str | Path, scene: Scene) -> Log:
     told = scene.meta.get("world_from_model")
     log = open_log(path) if told is None else open_log(path, metres_per_unit=float(told["scale"]))
     fix = "give each scene's own recording with --data"
-    for key, much in (("world_origin", 1.0), ("world_from_model", 1e-3)):
+    for key, part, much in (("world_origin", 0.0, 1.0), ("world_from_model", 1e-3, 1e-3)):
         ours, theirs = (_numbers(meta.get(key)) for meta in (scene.meta, log.meta))
-        if len(ours) == len(theirs) and (np.abs(ours - theirs) > much * (1 + np.abs(ours) * (key != "world_origin"))).any():
+        if len(ours) == len(theirs) and not np.allclose(theirs, ours, rtol=part, atol=much):
             raise ValueError(f"{path} is not the recording that the scene {scene.meta.get('name')} was made from: it is elsewhere; {fix}")
     if log.name != scene.meta.get("name"):
         print(f"{path} is called {log.name}, and its scene {scene.meta.get('name')}: if it is another drive, {fix}", file=sys.stderr)

@@ -160,15 +160,14 @@ class PairSet:
     """All finished shards of a pairs folder, or of several; of a folder with one such folder a scene, all of these."""
 
     def __init__(self, *folders: str | Path):
-        self.shards: list[Shard] = []
-        seen: set[Path] = set()  # a folder may be named twice, or with one in it
+        found: dict[Path, Path] = {}  # a folder may be named twice, or with one in it
         for folder in map(Path, folders):
             if not folder.is_dir():
                 raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
             for file in sorted([*folder.glob("*/*.json"), *folder.glob("*/*/*.json")]):
-                if file.parent.name in KINDS and file.name != NOTE and not file.name.startswith(".") and file.resolve() not in seen:
-                    seen.add(file.resolve())
-                    self.shards.append(_read_meta(file))
+                if file.parent.name in KINDS and file.name != NOTE and not file.name.startswith("."):
+                    found.setdefault(file.resolve(), file)
+        self.shards = [_read_meta(file) for file in found.values()]
         if not self.shards:
             raise ValueError(
                 f"no pairs in {', '.join(map(str, folders))}; "

@@ -112,7 +112,7 @@ def reconstruct(
     saved = load_checkpoint(checkpoint, options) if resume else None
 
     within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
-    for sweep in within:
+    for sweep in () if saved else within:
         sweep.read()  # they are used after the fit: a damaged one is told before it
     log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size)
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
@@ -254,7 +254,8 @@ def begin(
     exposed: cameras by name as a scene has them, whose exposures and frames' gains are taken; estimated where None.
     """
     with Progress("images") as steps:
-        frames = load_frames(log, names, span, size, held_out, steps.step, "gains" in config.refine)
+        asked = start is None and exposed is None and "gains" in config.refine  # else they are known
+        frames = load_frames(log, names, span, size, held_out, steps.step, asked)
     if exposed is not None:
         frames = replace(frames, views=[replace(v, gain=exposed[names[v.camera]].gain_at(v.time_us)) for v in frames.views])
     if start is not None:
@@ -263,7 +264,7 @@ def begin(
     sparse = log.points
     if sparse is None and not log.sweeps_within(span):
         sparse = triangulated(log, frames)
-        if exposed is None and "gains" in config.refine:
+        if asked:
             frames = replace(frames, views=exposed_by(sparse, log, names, frames.views))
     with Progress("prepare") as steps:
         coefficients = (config.sh_degree + 1) ** 2

@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
-import numpy as np
 import torch
 
 from recon.log import Log, LogCamera
@@ -76,6 +75,6 @@ def _astray(mounts: torch.Tensor) -> torch.Tensor:
 
 
 def _tell(log: Log, camera: LogCamera, wrong: torch.Tensor, why: str) -> None:
-    first = camera.files[int(np.flatnonzero(wrong.numpy())[0])]
+    first = camera.files[int(wrong.nonzero()[0])]
     count = f"{int(wrong.sum())} of {len(camera)} pictures of {camera.name}"
     print(f"{log.path}: {count} are left out, the first of them {first}: {why}", file=sys.stderr)

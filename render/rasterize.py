@@ -26,7 +26,7 @@ from render.settings import Settings
 from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed, SplatModel
-from scenes.poses import inverse
+from scenes.poses import inverse, unturned
 
 STRETCHED = 0.01
 """What R R^T of a pose's turn is off the unit matrix, summed, from which on it is none; poses that are optimised drift by less."""
@@ -225,8 +225,7 @@ def _check(placed, camera, outputs, flow_to, model) -> None:
 def _check_poses(placed: list[Placed], camera: Camera) -> None:
     given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
     stacked = torch.stack(given).detach()
-    turns = stacked[:, :3, :3]
-    off = (turns @ turns.mT - torch.eye(3, dtype=turns.dtype, device=turns.device)).abs().sum((1, 2))
+    off = unturned(stacked).abs().sum((1, 2))
     if not (off + 0 * stacked.sum((1, 2)) < STRETCHED).all():  # one value that is not finite makes the sum so
         for name, pose, bent in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, off.tolist(), strict=True):
             if not torch.isfinite(pose).all():

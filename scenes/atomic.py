@@ -64,9 +64,11 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
 
 
 def need_folder(path: Path) -> None:
-    """Raise FileNotFoundError unless the folder that `path` would stand in exists."""
+    """Raise FileNotFoundError unless the folder that `path` would stand in exists, PermissionError unless it takes files."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write {path}: {path.parent.resolve()} takes no files of yours; give a folder of your own")
 
 
 def _umask() -> int:

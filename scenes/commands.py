@@ -78,8 +78,6 @@ class Convert:
     """Replace an existing file."""
 
     def run(self) -> None:
-        if self.target.exists() and not self.overwrite:
-            raise FileExistsError(f"{self.target} exists; give -w to replace it, or another name")  # there is no -o here
         fresh(self.target, self.overwrite)
         from scenes.convert import convert
         from scenes.formats.trained import model_of

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from scenes.atomic import need_folder
 
 if TYPE_CHECKING:
     from scenes import Asset, Gaussians, Scene
@@ -21,11 +22,8 @@ def fresh(path: Path, overwrite: bool) -> Path:
     """A path that may be written; FileExistsError where something stands there and -w was not given, FileNotFoundError and PermissionError
     where its folder is not there or takes no files."""
     if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists; give -w to replace it, or another name with -o")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"cannot write {path}: {path.parent.resolve()} takes no files of yours; give a folder of your own")
+        raise FileExistsError(f"{path} exists; give -w to replace it, or another name")
+    need_folder(path)
     return path
 
 

@@ -34,6 +34,12 @@ def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
     return (u * flip[..., None, :]) @ v
 
 
+def unturned(pose: torch.Tensor) -> torch.Tensor:
+    """What R R^T of poses `[..., 4, 4]` differs by from the unit matrix, `[..., 3, 3]`: 0 where they only move and turn, or mirror."""
+    turn = pose[..., :3, :3]
+    return turn @ turn.mT - torch.eye(3, dtype=pose.dtype, device=pose.device)
+
+
 def quat_from_matrix(rotation: torch.Tensor) -> torch.Tensor:
     """Unit quaternions wxyz `[..., 4]`, w >= 0, from rotations `[..., 3, 3]` (Shepperd's method: the largest term leads)."""
     m = rotation

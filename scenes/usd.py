@@ -16,7 +16,7 @@ import torch
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from scenes.atomic import atomic_file
-from scenes.poses import quat_from_matrix
+from scenes.poses import quat_from_matrix, unturned
 from scenes.usd_crate import check_crate
 
 TICKS = 1_000_000  # time codes a second: one a microsecond
@@ -163,9 +163,7 @@ def _rigid(prim: Usd.Prim, matrix: Gf.Matrix4d) -> torch.Tensor:
 
 
 def _check_rigid(where: str, pose: torch.Tensor) -> None:
-    turn = pose[:3, :3]
-    off = (turn @ turn.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max()
-    if not off < 1e-6 or not torch.linalg.det(turn) > 0 or not torch.isfinite(pose).all():
+    if not unturned(pose).abs().max() < 1e-6 or not torch.linalg.det(pose[:3, :3]) > 0 or not torch.isfinite(pose).all():
         raise ValueError(f"{where} has a transform that scales, shears, mirrors or is not finite; poses here only move and turn")
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 
-from scenes.poses import nearest_rotation, pose_from
+from scenes.poses import nearest_rotation, pose_from, unturned
 
 ROUNDED = 0.01
 """What R R^T of a rotation in a file may be off the unit matrix: numbers of two or three decimals are; other axes and scales are more."""
@@ -18,12 +18,9 @@ def rigid(poses: torch.Tensor, where: str) -> torch.Tensor:
 
     ValueError naming `where` and the first pose that is not finite, scales, shears or mirrors.
     """
-    turns = poses[..., :3, :3]
-    off = (turns @ turns.mT - torch.eye(3, dtype=poses.dtype)).abs().amax((-2, -1))
-    wrong = ~(torch.isfinite(poses).all(-1).all(-1) & (off < ROUNDED) & (torch.linalg.det(turns) > 0)).reshape(-1)
-    if wrong.any():
-        number = f" {int(wrong.nonzero()[0])}" if len(wrong) > 1 else ""
-        raise ValueError(f"{where}: pose{number} is no rotation and place: it scales, shears, mirrors or is not finite; export it again")
+    turns, off = poses[..., :3, :3], unturned(poses).abs().amax((-2, -1))
+    right = torch.isfinite(poses).all(-1).all(-1) & (off < ROUNDED) & (torch.linalg.det(turns) > 0)
+    _check(right, where, "is no rotation and place: it scales, shears, mirrors or is not finite; export it again")
     out = poses.clone()
     out[..., :3, :3] = nearest_rotation(turns)
     return out
@@ -31,11 +28,16 @@ def rigid(poses: torch.Tensor, where: str) -> torch.Tensor:
 
 def posed(quats: torch.Tensor, places: torch.Tensor, where: str) -> torch.Tensor:
     """Poses float64 `[..., 4, 4]` from quaternions wxyz `[..., 4]` of any length and places `[..., 3]`. ValueError as `rigid` has it."""
-    wrong = ~(torch.isfinite(quats).all(-1) & torch.isfinite(places).all(-1) & (quats.norm(dim=-1) > 1e-6)).reshape(-1)
-    if wrong.any():
-        number = f" {int(wrong.nonzero()[0])}" if len(wrong) > 1 else ""
-        raise ValueError(f"{where}: pose{number} is not finite or has no rotation; fetch it again")
+    right = torch.isfinite(quats).all(-1) & torch.isfinite(places).all(-1) & (quats.norm(dim=-1) > 1e-6)
+    _check(right, where, "is not finite or has no rotation; fetch it again")
     return pose_from(quats, places)
+
+
+def _check(right: torch.Tensor, where: str, wrong: str) -> None:
+    """ValueError naming the first of several poses, bool `[...]`, that is not right."""
+    lost = (~right).reshape(-1).nonzero()
+    if len(lost):
+        raise ValueError(f"{where}: pose{f' {int(lost[0])}' if right.numel() > 1 else ''} {wrong}")
 
 
 @contextmanager
