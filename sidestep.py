@@ -168,12 +168,12 @@ class Render:
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         cameras = clip_cameras(scene, camera, self.lateral_shift, times)
         warnings += cut_warning(scene, camera, self.start, self.duration)
-        warnings += shift_warning(scene, clip_cameras(scene, camera, 0.0, times), scene.ego, self.lateral_shift)
         put_in: set[str] = set()
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
             put_in.add(result.actor.track)
+        warnings += shift_warning(scene, clip_cameras(scene, camera, 0.0, times), self.lateral_shift)
         for actor in (a for a in scene.actors if not a.recorded):  # those of edits too: a shift may show another side of them
             witnesses = seeing(actor, cameras)
             warnings += absence_warning(actor, cameras, witnesses) if actor.track in put_in else []

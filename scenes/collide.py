@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from scenes.asset import Actor
@@ -33,26 +35,40 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     begin, end = during or (first, last)
     times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
-    found = []
-    for other in scene.actors:
-        if other.track == actor.track or not _meet(actor, other):
-            continue
-        hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
-        if hit is not None:
-            found.append(f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment")
+    found = [
+        f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment"
+        for other, hit in met(scene, actor, times)
+    ]
     hit = next((t for t in times if scene.ego.covers(t) and _holds(actor, scene.ego.at(t), t)), None)
     if hit is not None:
         found.append(f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment")
     still = len(actor.trajectory) == 1
-    times = times[:1] if still else times
+    if struck := into(scene, actor, times[:1] if still else times):
+        hit, count = struck
+        when = "" if still else f" {(hit - first) / 1e6:.1f}s after the drive's first moment"
+        found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
+    return found
+
+
+def met(scene: Scene, actor: Actor, times: Sequence[int]) -> list[tuple[Actor, int]]:
+    """Other actors of the scene whose boxes an actor's touches at one of these times, all covered by its path, each with the first."""
+    found = []
+    for other in scene.actors:
+        if other.track != actor.track and _meet(actor, other):
+            hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
+            found += [(other, hit)] if hit is not None else []
+    return found
+
+
+def into(scene: Scene, actor: Actor, times: Sequence[int]) -> tuple[int, int] | None:
+    """The first of these times, all covered by an actor's path, at which its box holds something solid of the background, and how many
+    splats of it; None where its way is free."""
     solid = _along(scene, actor, times)
     for t in times:
         count = _inside(solid, inverse(actor.trajectory.at(t)) @ scene.background.world_from_local, actor.asset.size)
         if count >= FEWEST:
-            when = "" if still else f" {(t - first) / 1e6:.1f}s after the drive's first moment"
-            found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
-            break
-    return found
+            return t, count
+    return None
 
 
 def _holds(actor: Actor, world_from_body: torch.Tensor, time_us: int) -> bool:
@@ -69,7 +85,7 @@ def _meet(a: Actor, b: Actor) -> bool:
     return bool((low.amax(0) < high.amin(0) + room).all())
 
 
-def _along(scene: Scene, actor: Actor, times: list[int]) -> torch.Tensor:
+def _along(scene: Scene, actor: Actor, times: Sequence[int]) -> torch.Tensor:
     """Means `[M, 3]` of the background's solid splats within the box that holds all of an actor's boxes at these times."""
     splats, local_from_world = scene.background.gaussians, inverse(scene.background.world_from_local)
     if not times:

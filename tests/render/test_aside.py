@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from street import START_US, box
+from street import START_US, box, car
 
 from render.aside import room_aside, shift_warning
 from render.clip import clip_cameras
@@ -17,7 +17,7 @@ def room(scene, left, reach=500.0):
 
 
 def told(scene, shift):
-    return shift_warning(scene, clip_cameras(scene, CAMERA), scene.ego, shift)
+    return shift_warning(scene, clip_cameras(scene, CAMERA), shift)
 
 
 def test_a_camera_can_go_aside_up_to_the_houses(street):
@@ -53,3 +53,25 @@ def test_beside_a_wall_no_shift_makes_sense(street):
     walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, wall])))
     (said,) = told(walled, 2.0)
     assert said.endswith("no shift to that side makes sense") and not told(walled, -2.0)
+
+
+def test_a_car_below_the_cameras_eye_is_in_the_cars_way(street):
+    """The camera, 1.5 m above the ground, looks over it and at the houses behind."""
+    low = box((4.2, 1.8, 0.9), (0.7, 0.2, 0.2))
+    low = replace(low, means=low.means + torch.tensor([4.0, -2.5, 0.0]))
+    parked = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, low])))
+    assert room(parked, False, reach=3.0) == 3
+    (said,) = told(parked, -2.5)
+    assert "-2.5m takes the recording car through what stands there" in said and said.endswith("at -0.5m its way is free")
+    assert not told(parked, -0.5) and not told(parked, 2.5) and not told(street, -2.5)
+
+
+def test_an_actor_is_in_the_cars_way_as_long_as_it_is_there(street):
+    beside = Actor(car(), Trajectory(torch.zeros(1, dtype=torch.int64), translation(6.0, 2.5, 0.0)[None]), "t")
+    (said,) = told(replace(street, actors=(beside,)), 2.5)
+    assert "through t (car), 0." in said and said.endswith("at 0.5m its way is free")
+    away = replace(
+        beside,
+        trajectory=Trajectory(street.ego.times_us[-1:] + torch.tensor([10**7, 2 * 10**7]), translation(6.0, 2.5, 0.0).repeat(2, 1, 1)),
+    )
+    assert not told(replace(street, actors=(away,)), 2.5)
