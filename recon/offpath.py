@@ -31,6 +31,9 @@ CELL = 4
 HIDING = 1.25
 """How many times nearer a point must be to hide its neighbours: less is a slope."""
 
+NEARER = 0.5
+"""Part of a lidar point's distance nearer than which what is drawn stands in the way of it: no error of a surface, but another thing."""
+
 CALM_FRAMES = 10
 """Consecutive frames of which flicker is measured."""
 
@@ -44,10 +47,12 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
     depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees past these and what moves, d
-    being the expected depth; points: how many those are. movers_error: the same of points in moving boxes, where these are at the picture's
-    moment. holes: share of pixels below the horizon with alpha under 0.9; holes_above: the same above it, where from the recorded path no
-    sky is ever seen (None where it is seen everywhere): between a tree and the house behind it, and through windows. flicker: mean absolute
-    difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
+    being the expected depth; points: how many those are. in_the_way: share of these points before which something is drawn at less than
+    half of their distance: walls and floaters where lidar looked through, of which a median says nothing. movers_error: as depth_error, of
+    points in moving boxes, where these are at the picture's moment. holes: share of pixels below the horizon with alpha under 0.9;
+    holes_above: the same above it, where from the recorded path no sky is ever seen (None where it is seen everywhere): between a tree and
+    the house behind it, and through windows. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit
+    levels, over pixels visible in both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
     splits = [(s, split_points(log, [s], movers)) for s in sweeps]
@@ -73,30 +78,34 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 off = depth_errors(depth.numpy(), points, camera)
                 errors.append(off[: len(split.static)])
                 moving.append(off[len(split.static) :])
-        row = {"shift_m": shift, "depth_error": _median(errors), "movers_error": _median(moving)}
-        row["points"] = int(sum(np.isfinite(e).sum() for e in errors))
+        still, going = _finite(errors), _finite(moving)
+        row = {"shift_m": shift, "depth_error": _median(still), "movers_error": _median(going), "points": len(still)}
+        row["in_the_way"] = float((still < -NEARER).mean()) if len(still) else None
         row |= {which: float(open_ / solid) if solid else None for which, (open_, solid) in holes.items()}
         rows.append(row | {"flicker": flicker_along(scene, shift)})
     return rows
 
 
 def depth_errors(depth: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Relative errors `[N]` of `depth` `[H, W]` at world points `[N, 3]`; NaN at those that `camera` does not see, 1 where nothing was
-    drawn."""
+    """Relative errors `[N]` of `depth` `[H, W]` at world points `[N, 3]`, below 0 where it is too near; NaN at those that `camera` does not
+    see, 1 where nothing was drawn."""
     row, column, z, seen = project(points, inverse(camera.world_from_cam).numpy(), camera)
     nearest = np.full(depth.shape, np.inf)
     np.minimum.at(nearest, (row[seen], column[seen]), z[seen])
     nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
     drawn = depth[row, column]
-    off = np.where(np.isfinite(drawn), np.abs(drawn - z) / np.where(seen, z, 1.0), 1.0)
+    off = np.where(np.isfinite(drawn), (drawn - z) / np.where(seen, z, 1.0), 1.0)
     return np.where(seen & (z <= HIDING * nearest[row, column]), off, np.nan)
 
 
-def _median(parts: Sequence[np.ndarray]) -> float | None:
-    """Of what is known; None where nothing is."""
+def _finite(parts: Sequence[np.ndarray]) -> np.ndarray:
     found = np.concatenate([np.zeros(0), *parts])
-    found = found[np.isfinite(found)]
-    return float(np.median(found)) if len(found) else None
+    return found[np.isfinite(found)]
+
+
+def _median(errors: np.ndarray) -> float | None:
+    """Of their sizes; None where there are none."""
+    return float(np.median(np.abs(errors))) if len(errors) else None
 
 
 def flicker_along(scene: Scene, shift: float) -> float:
@@ -128,10 +137,12 @@ def _planes(image: torch.Tensor | None) -> torch.Tensor:
 
 def off_path_text(rows: Sequence[dict]) -> str:
     """The rows for people."""
-    heads = ("lidar points", "depth error", "movers'", "holes", "above", "flicker, levels")
+    heads = ("lidar points", "depth error", "in the way", "movers'", "holes", "above", "flicker, levels")
     lines = [f"{'off the path':<14}" + "".join(f" {head:>15}" for head in heads)]
     for r in rows:
-        parts = ("-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "movers_error", "holes", "holes_above"))
+        parts = (
+            "-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "in_the_way", "movers_error", "holes", "holes_above")
+        )
         where = f"{r['shift_m']:g} m aside" if r["shift_m"] else "as recorded"
         lines.append(f"{where:<14}" + "".join(f" {part:>15}" for part in (r["points"], *parts, f"{r['flicker']:.2f}")))
     return "\n".join(lines)

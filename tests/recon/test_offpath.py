@@ -77,13 +77,21 @@ def test_a_gap_before_the_sky_that_opens_only_beside_the_path_shows_as_a_hole_ab
     assert on_it == 0 and beside > 0.005 and closed == [0, 0]
 
 
+def test_a_wall_over_a_third_of_the_picture_stands_in_the_way_of_lidar_though_the_median_is_right(street, log):
+    wall = splats(board(9.0, 5.0, 5.0).means + torch.tensor([0.0, -4.0, 0.0]), (0.1, 0.1, 0.1), (0.02, 0.2, 0.2))
+    walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, wall])))
+    right, wrong = (off_path_table(s, log, held_out_sweeps(log, 4), (0.0,))[0] for s in (street, walled))
+    assert right["in_the_way"] < 0.02 and wrong["in_the_way"] > 0.1
+    assert wrong["depth_error"] < 2 * right["depth_error"] and "in the way" in off_path_text([wrong])
+
+
 def test_points_behind_nearer_points_do_not_count(street):
     camera = street.camera("front_camera", int(street.frame_times("front_camera")[0]))
     pose = camera.world_from_cam
     near, far = ((pose @ torch.tensor([0.01, 0.01, z, 1.0], dtype=torch.float64))[:3].numpy() for z in (5.0, 50.0))
     depth = np.full((camera.height, camera.width), 5.0)
     assert np.allclose(depth_errors(depth, np.stack([near, far]), camera), [0.0, np.nan], atol=1e-6, equal_nan=True)
-    assert np.allclose(depth_errors(depth, far[None], camera), [0.9])
+    assert np.allclose(depth_errors(depth, far[None], camera), [-0.9])
     assert np.allclose(depth_errors(np.full_like(depth, np.inf), near[None], camera), [1.0])
 
 
