@@ -119,10 +119,10 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
         if not actor.recorded:
             continue  # it came from a databank
         sight = sight_of(views, actor.trajectory, actor.asset.size)
-        half = len(actor.trajectory) // 2
-        middle, gain = actor.trajectory.world_from_body[half], scene.followed(int(actor.trajectory.times_us[half]))
+        shown = _shown_best(actor.trajectory, scene.ego)
+        gain = scene.followed(shown)
         cut = cleaned(within_box(at_rest(actor), actor.asset.size), actor.asset.size)
-        meta = share | {"track": actor.track, "moved": True} | _ground(scene, middle)
+        meta = share | {"track": actor.track, "moved": True} | _ground(scene, actor.trajectory.at(shown))
         yield _judged(cut, actor.asset, meta, sight, actor.trajectory, None if actor.deformation else instance, gain)
     for entry in scene.meta.get("parked", []):
         world_from_box = torch.tensor(entry["world_from_box"], dtype=torch.float64)
@@ -135,6 +135,16 @@ def candidates(scene: Scene) -> Iterator[Candidate]:
         sight = sight_of(views, stands, size)
         asset = Asset(cut, size, entry["label"], scene.model)
         yield _judged(cut, asset, share | {"track": entry["track"], "moved": False} | _ground(scene, world_from_box), sight, stands, 0)
+
+
+def _shown_best(path: Trajectory, ego: Trajectory) -> int:
+    """The time of a mover's poses at which it was nearest to the recording car: its colours are those of the light of there, and far ahead
+    the ground is hardly known."""
+    times = path.times_us[ego.covers_each(path.times_us)]
+    if not len(times):
+        return int(path.times_us[len(path) // 2])
+    away = (path.at_each(times)[:, :2, 3] - ego.at_each(times)[:, :2, 3]).norm(dim=1)
+    return int(times[away.argmin()])
 
 
 def at_rest(actor: Actor) -> Gaussians:
@@ -170,7 +180,7 @@ def _judged(
     if sight.views < FEWEST_VIEWS:
         flaw = f"{sight.views} views within {FARTHEST:.0f} m that show a side of it, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
-        flaw = f"only {part:.0%} of its side was reconstructed, less than {FULL_SIDE:.0%}"
+        flaw = f"only {math.floor(100 * part)}% of its side was reconstructed, less than {FULL_SIDE:.0%}"
     whole, mirrored = completed(cut, sight.left, sight.right) if not flaw else (cut, False)
     if not flaw and len(whole) < FEWEST_SPLATS:
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"

@@ -245,3 +245,14 @@ def test_a_scene_without_objects_says_so(street, tmp_path):
     with pytest.raises(ValueError, match="good enough"):
         extract_assets(replace(street, actors=()), tmp_path / "bank")
     assert not (tmp_path / "bank").exists()
+
+
+def test_a_movers_light_is_that_of_where_it_was_nearest(street):
+    """The one that comes along is lit as the road at its path's end, though that is dark where half of its path is done."""
+    g = street.background.gaussians
+    dark = replace(g, sh=torch.where((g.means[:, 0] > 17.5)[:, None, None], g.sh - 0.8, g.sh))
+    found = {
+        c.track: c.asset.meta["ground_linear"] for c in candidates(replace(street, background=replace(street.background, gaussians=dark)))
+    }
+    bright = {c.track: c.asset.meta["ground_linear"] for c in candidates(street)}
+    assert found["veh_1"] == pytest.approx(bright["veh_1"], rel=0.1)
