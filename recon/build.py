@@ -16,6 +16,7 @@ from recon.album import keep_album
 from recon.align import aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
 from recon.exposed import exposed_by
+from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
@@ -260,7 +261,7 @@ def begin(
         frames = replace(frames, views=[replace(v, gain=exposed[names[v.camera]].gain_at(v.time_us)) for v in frames.views])
     if start is not None:
         frames = replace(frames, views=[replace(v, gain=gain) for v, gain in zip(frames.views, start.gains, strict=True)])
-        return start, _fit(frames, start, config, device)
+        return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
     sparse = log.points
     if sparse is None and not log.sweeps_within(span):
         sparse = triangulated(log, frames)
@@ -270,7 +271,7 @@ def begin(
         coefficients = (config.sh_degree + 1) ** 2
         known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
         start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), sparse, known)
-    return start, _fit(frames, start, config, device)
+    return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
 
 
 def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) -> tuple[int, int]:
@@ -290,7 +291,7 @@ def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) ->
     return first - slack, max(last, first) + slack
 
 
-def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
+def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: str) -> Fit:
     trained = torch.tensor([v.time_us for v in frames.of(0)])
     motion = Motion(frames, start.rig, Knots(start.ego, trained), start.tracks)
     limbed = [(i + 1, t) for i, t in enumerate(start.tracks) if t.label in LIMBED and "limbs" in config.refine]
@@ -298,7 +299,7 @@ def _fit(frames: Frames, start: Start, config: FitConfig, device: str) -> Fit:
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
     splats = start.splats.to(device)
-    return Fit(frames, motion, splats, start.sky, start.exposures, limbs, config, start.measured, start.ground, start.swept)
+    return Fit(frames, motion, splats, start.sky, start.exposures, limbs, config, start.measured, start.ground, start.swept, clear)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from scipy import ndimage
@@ -25,6 +27,9 @@ RING = 2.0
 STEP = 0.4
 """Metres that ground may be off what the ground around leads one to expect: kerbs and steep streets are, cars are not."""
 
+NOISE, TELLING = 0.1, 4
+"""Metres that lidar's points of the ground are off it at most, by their noise and that of poses, and how many of a cell tell its height."""
+
 STEEPEST = 0.2
 """Metres by which ground may rise or fall with every metre away from the path."""
 
@@ -32,9 +37,10 @@ STEEPEST = 0.2
 def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     """Height field from static points `[N, 3]` and the body's path, uphill and down.
 
-    A cell's height is the 5th percentile of its points. Ground is what lies below the path as most of the road does, and what goes on from
-    there without a step, outwards ring by ring; cells that stand more than 0.3 m above the median of the 5 m around them (cars, walls) are
-    dropped, and the gaps filled from ever wider averages. Without points the ground goes with the body.
+    A cell's height is the 5th percentile of its points, and in the end as much more as makes it the mean of those that lie on it. Ground is
+    what lies below the path as most of the road does, and what goes on from there without a step, outwards ring by ring; cells that stand
+    more than 0.3 m above the median of the 5 m around them (cars, walls) are dropped, and the gaps filled from ever wider averages. Without
+    points the ground goes with the body.
     """
     path = ego.world_from_body[:, :3, 3].numpy()
     low, high = path[:, :2].min(0) - REACH, path[:, :2].max(0) + REACH
@@ -56,7 +62,21 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     level = level + (float(np.percentile(known, 30)) if len(known) else 0.0)
     # what is filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
     heights = level + _filled(_without_objects(heights - level, distance, cell), 0.0, cell)
-    return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
+    ground = Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
+    return replace(ground, heights=ground.heights + _noise_under(points, place, ground)) if len(points) else ground
+
+
+def _noise_under(points: np.ndarray, place: np.ndarray, ground: Ground) -> torch.Tensor:
+    """How far points `[N, 3]` in cells `place` lie above a ground that the lowest of them tell, where they are its own and differ by noise:
+    heights `[Y, X]` to be added, so that it goes through their middle."""
+    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    usual = float(np.median(off[np.abs(off) < 2 * NOISE])) if (np.abs(off) < 2 * NOISE).any() else 0.0
+    lying = np.abs(off - usual) < NOISE
+    cells = ground.heights.numel()
+    count = np.bincount(place[lying], minlength=cells)
+    total = np.bincount(place[lying], off[lying], minlength=cells)
+    mean = np.where(count >= TELLING, total / np.maximum(count, 1), np.nan).reshape(ground.heights.shape)
+    return torch.from_numpy(_filled(mean, 0.0, ground.cell)).float()
 
 
 def _beside(path: np.ndarray, low: np.ndarray, shape: tuple[int, ...], cell: float) -> tuple[np.ndarray, np.ndarray]:

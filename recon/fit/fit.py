@@ -9,6 +9,7 @@ from functools import partial
 
 import torch
 
+from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.densify import Growth, grow, joined, kept
 from recon.fit.descent import Descent, rates_at
@@ -25,7 +26,7 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at
 from recon.fit.turns import Turns
-from recon.fit.unseen import as_neighbours, curtains, footprint, shown_parts
+from recon.fit.unseen import LOW, above, as_neighbours, curtains, footprint, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -85,6 +86,7 @@ class Fit:
         measured: Sequence[Measured],
         ground: Ground,
         swept: Swept,
+        clear: Clear,
     ):
         self.device = splats.reach.device
         self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
@@ -99,7 +101,7 @@ class Fit:
         self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
         self.openings = Openings(frames, motion, self.device)
-        self.ground, self.swept = ground, swept.to(self.device)
+        self.ground, self.swept, self.clear = ground, swept.to(self.device), clear
         self.flat_ground = FlatGround(ground, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
@@ -161,7 +163,8 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            haze = haze + self.openings.gaps(draw(self._placed(shown, view, aside), aside, "alpha")[0], aside)
+            closing = shown.held(self.flat_ground.on(shown), ("means", "quats", "log_scales"))
+            haze = haze + self.openings.gaps(draw(self._placed(closing, view, aside), aside, "alpha")[0], aside)
         for weight, there in known:
             haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)
         unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
@@ -173,7 +176,7 @@ class Fit:
             colours.mul_(~self.guessed[which, None, None])
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
-        self.flat_ground.press(self.splats, which, self.descent, rates, self._settled())
+        self.flat_ground.press(self.splats, which, self.descent, rates, self._settled(), camera.world_from_cam.detach()[:3, 3])
         if blank is not None and blank.grad is not None:
             self.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()
@@ -265,7 +268,7 @@ class Fit:
     @torch.no_grad()
     def _guess(self) -> None:
         """Give what pictures hardly show its neighbours' colours, to keep, once what went astray since the last growth is gone."""
-        self._renew(*kept(self.splats, self.descent.tensors(), ~self.swept.holds(self.splats)))
+        self._renew(*kept(self.splats, self.descent.tensors(), ~(self.swept.holds(self.splats) | self.clear.holds(self.splats))))
         part, inside = torch.zeros_like(self.splats.reach), torch.zeros_like(self.splats.reach, dtype=torch.bool)
         for view in self.training:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
@@ -276,7 +279,8 @@ class Fit:
         stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         part = part[stays]
-        self.guessed = as_neighbours(self.splats, part, self.descent.coloured())
+        self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
+        self.flat_ground.lay(self.splats, self.guessed & (above(self.splats, self.ground) < LOW))
         self.descent.still_colours(self.guessed)
 
     def _settled(self) -> float:
@@ -328,7 +332,8 @@ class Fit:
 
     @torch.no_grad()
     def _refill(self) -> None:
-        """Add splats where the sky stands in for what pictures show."""
+        """Add splats where the sky stands in for what pictures show, once what stands where lidar looked through is gone."""
+        self._renew(*kept(self.splats, self.descent.tensors(), ~self.clear.holds(self.splats)))
         path, sh_count = self.motion.path(), self.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 import warp as wp
 from scipy import ndimage
 
@@ -13,13 +14,25 @@ from recon.kernels.descent import Rates
 from recon.kernels.press import Grid, press
 from render.launch import run, stage, view
 from scenes.ground import Ground
+from scenes.poses import matrix_from_quat, quat_from_matrix
 
 PRESSED = 0.008
 """Of its extent across the ground, what a splat on it loses in a step that pulls at it. A picture taken from a car tells hardly how thick a
 road is; seen at a grazing angle the upper sides of thick splats hide what is behind, and depth is too near."""
 
+PULLED, SUNK = 0.01, 0.005
+"""Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays; and metres
+that its middle then lies lower, since of splats that overlap the nearer is drawn first. Pictures of a straight drive do not tell a line
+painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds."""
+
 ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
+
+NEAR = 0.3
+"""Metres from the ground within which splats that no picture shows are the street's."""
+
+THIN = 0.03
+"""Metres of a splat's standard deviation across the ground at most, once it is laid there."""
 
 SMOOTH = 1.0
 """Metres over which the ground's slope is taken: a kerb is no ramp."""
@@ -29,18 +42,49 @@ class FlatGround:
     """Presses splats onto a ground, on its device."""
 
     def __init__(self, ground: Ground, device: torch.device):
+        self.ground = ground
         smooth = ndimage.gaussian_filter(ground.heights.double().numpy(), SMOOTH / ground.cell, mode="nearest")
         along_y, along_x = np.gradient(smooth, ground.cell)
         self.slopes = torch.from_numpy(np.stack([along_x, along_y], -1)).float().to(device)
-        self.heights = ground.heights.to(device).contiguous()
+        self.heights = (ground.heights - SUNK).to(device).contiguous()
         self.grid = Grid()
         (self.grid.x, self.grid.y), self.grid.cell = ground.origin, ground.cell
 
-    def press(self, splats: Splats, which: torch.Tensor, descent: Descent, rates: Rates, settle: float) -> None:
+    def on(self, splats: Splats) -> torch.Tensor:
+        """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground. To hide a gap there only opacity may be raised: it
+        pays, too, to swell into fog over the road that no recorded picture shows."""
+        means = splats.fields["means"].detach()
+        at = (means[:, :2] - means.new_tensor(self.ground.origin)) / self.ground.cell
+        (rows, columns), (x, y) = self.heights.shape, at.round().long().T
+        near = (means[:, 2] - self.heights[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]).abs() < NEAR
+        near[splats.sizes[0] :] = False
+        return near
+
+    def lay(self, splats: Splats, which: torch.Tensor) -> None:
+        """Put splats, bool `[N]`, onto the ground and flatten them, in place: such as no picture shows, of which nothing else is known."""
+        means = splats.fields["means"][which]
+        at = means[:, :2].double().cpu()
+        z = self.ground.height(at).to(means)
+        row, column = ((at.flip(1) - at.new_tensor(self.ground.origin[::-1])) / self.ground.cell).round().long().T
+        rows, columns = self.ground.heights.shape
+        slope = self.slopes[row.clamp(0, rows - 1).to(z.device), column.clamp(0, columns - 1).to(z.device)]
+        up = F.normalize(torch.cat([-slope, torch.ones_like(z)[:, None]], 1))
+        axes = matrix_from_quat(splats.fields["quats"][which]) * splats.fields["log_scales"][which].exp()[:, None]
+        thick = (axes * up[:, :, None]).sum(1).norm(dim=1)
+        lost = (1 - THIN / thick).clamp_min(0)
+        axes = axes - lost[:, None, None] * up[:, :, None] * (axes * up[:, :, None]).sum(1, keepdim=True)
+        turned, extents, _ = torch.linalg.svd(axes)
+        turned[:, :, 2] *= torch.linalg.det(turned)[:, None]
+        splats.fields["means"][which] = torch.cat([means[:, :2], z[:, None]], 1)
+        splats.fields["quats"][which] = quat_from_matrix(turned)
+        splats.fields["log_scales"][which] = extents.clamp_min(1e-6).log()
+
+    def press(self, splats: Splats, which: torch.Tensor, descent: Descent, rates: Rates, settle: float, eye: torch.Tensor) -> None:
         """Flatten those of the splats at indices `which` `[M]` that are background, lie on the ground, and were moved in the step
         `rates.now`, by `settle` of what a step does."""
         fields = [view(splats.fields[name], kind) for name, kind in (("means", wp.vec3), ("quats", wp.vec4), ("log_scales", wp.vec3))]
         with stage(which.device):
             moved = [view(which, wp.int64), splats.sizes[0], view(descent.last, float), rates.now]
             ground = [self.grid, view(self.heights, float), view(self.slopes, wp.vec2), settle * PRESSED, ON]
-            run(press, len(which), [*moved, *ground, *fields], which.device)
+            pull = [wp.vec3(*eye.tolist()), settle * PULLED]
+            run(press, len(which), [*moved, *ground, *pull, *fields], which.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +54,11 @@ class Splats:
         fields = {k: (v[:, :sh_count] if k == "sh" else v).detach().index_select(0, which).requires_grad_() for k, v in self.fields.items()}
         ends = torch.searchsorted(which, upload(torch.tensor(self.sizes).cumsum(0), which.device))
         return Splats(fields, ends.diff(prepend=ends.new_zeros(1)).tolist(), self.reach.index_select(0, which))
+
+    def held(self, which: torch.Tensor, names: Sequence[str]) -> Splats:
+        """The same splats, of which some, bool `[N]`, are not differentiated by these fields."""
+        still = {name: torch.where(which[:, None], self.fields[name].detach(), self.fields[name]) for name in names}
+        return Splats(self.fields | still, self.sizes, self.reach)
 
     def group_of(self) -> torch.Tensor:
         """Group index `[N]` of every splat."""

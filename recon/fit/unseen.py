@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 from scipy.spatial import cKDTree
 
+from recon.fit.flat import ON
 from recon.fit.model import Splats, draw
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -60,6 +61,13 @@ def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
     return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * inside
 
 
+def above(splats: Splats, ground: Ground) -> torch.Tensor:
+    """Metres `[N]` by which splats of the background are off the ground, up or down; infinite of others."""
+    means = splats.fields["means"].detach().cpu()
+    off = (means[:, 2] - ground.height(means[:, :2])).abs().to(splats.reach)
+    return torch.where(splats.group_of() == 0, off, torch.inf)
+
+
 def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
     """Which splats of the background, bool `[N]`, stand beyond the pictures' borders and are seen by their rims alone: at their colours
     pictures have `pulled`, though none has their middle `inside`, bool `[N]` both.
@@ -67,30 +75,35 @@ def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground:
     A rim is all that holds such a splat, so it grows as large and as dense as that likes, and from aside it hangs before the street as a
     curtain. What lies on the ground stays: it is the street beyond the border.
     """
-    means = splats.fields["means"].detach().cpu()
-    high = means[:, 2] - ground.height(means[:, :2]) > LOW
-    out = pulled & ~inside & high.to(pulled.device)
-    out[splats.sizes[0] :] = False
-    return out
+    return pulled & ~inside & (above(splats, ground) > LOW) & (splats.group_of() == 0)
 
 
-def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor) -> torch.Tensor:
+def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
     """Give splats at whose colours pictures have `pulled`, bool `[N]`, but which none shows to `SEEN`, by the largest `part` `[N]` of each
     in any picture, the colours of their group's nearest others, in place. Returns which these are, bool `[N]`; of groups without any other
-    none."""
-    unknown, begin = torch.zeros_like(part, dtype=torch.bool), 0
-    for size in splats.sizes:
-        mine = slice(begin, begin + size)
-        begin += size
-        hidden = pulled[mine] & (part[mine] < SEEN)
-        known = (part[mine] >= SEEN).nonzero()[:, 0]
-        if len(known) < NEIGHBOURS or not hidden.any():
-            continue
-        means, sh = splats.fields["means"][mine], splats.fields["sh"][mine]
-        away, nearest = cKDTree(means[known].cpu().numpy()).query(means[hidden].cpu().numpy(), NEIGHBOURS)
-        wide = splats.fields["log_scales"][mine][hidden].exp().mean(1)
-        share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
-        found = sh[known[torch.from_numpy(nearest).to(known)]]
-        sh[hidden] = (found * (share / share.sum(1, keepdim=True))[:, :, None, None]).sum(1)
-        unknown[mine] = hidden
+    none.
+
+    What is hidden of the street, pulled at or not, takes the street's: beside a parked car the nearest are the car's.
+    """
+    hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
+    high = above(splats, ground)
+    asked = [(hidden & (high < LOW), known & (high < ON))]
+    asked += [(pulled & hidden & (group == i), known & (group == i)) for i in range(len(splats.sizes))]
+    unknown = torch.zeros_like(hidden)
+    for which, beside in asked:
+        unknown |= _coloured(splats, which & ~unknown, beside)
     return unknown
+
+
+def _coloured(splats: Splats, which: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Give some of the splats the colours of the nearest known, both bool `[N]`. Returns which those are; none where too few are known."""
+    known = known.nonzero()[:, 0]
+    if len(known) < NEIGHBOURS or not which.any():
+        return torch.zeros_like(which)
+    means, sh = splats.fields["means"], splats.fields["sh"]
+    away, nearest = cKDTree(means[known].cpu().numpy()).query(means[which].cpu().numpy(), NEIGHBOURS)
+    wide = splats.fields["log_scales"][which].exp().mean(1)
+    share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
+    found = sh[known[torch.from_numpy(nearest).to(known)]]
+    sh[which] = (found * (share / share.sum(1, keepdim=True))[:, :, None, None]).sum(1)
+    return which

@@ -8,6 +8,8 @@ wp.set_module_options(OPTIONS)
 
 ROUNDNESS = wp.constant(0.01)  # keeps a turn finite where two axes are as long as one another, and any direction is an axis
 
+LOWEST = wp.constant(0.3)  # metres that an eye must be above what it looks down on
+
 
 @wp.struct
 class Grid:
@@ -21,7 +23,7 @@ class Grid:
 @wp.kernel
 def press(
     which: wp.array[wp.int64], count: int, last: wp.array[float], now: float,
-    grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], part: float, near: float,
+    grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], part: float, near: float, eye: wp.vec3, pull: float,
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
@@ -47,7 +49,8 @@ def press(
     height = (heights[r, c] * (1.0 - u) + heights[r, c + 1] * u) * (1.0 - v) + (
         heights[r + 1, c] * (1.0 - u) + heights[r + 1, c + 1] * u
     ) * v
-    if wp.abs(p[2] - height) > near:
+    rise = p[2] - height
+    if wp.abs(rise) > near:
         return
     slope = slopes[int(row + 0.5), int(column + 0.5)]
     up = wp.normalize(wp.vec3(-slope[0], -slope[1], 1.0))
@@ -62,6 +65,9 @@ def press(
     thick = wp.length(wp.vec3(n[0] * wp.exp(scales[0]), n[1] * wp.exp(scales[1]), n[2] * wp.exp(scales[2])))
     if thick > near:
         return
+    drop = eye[2] - p[2]
+    if drop > LOWEST:
+        means[i] = p + (pull * rise / drop) * (p - eye)
     turn = wp.vec3()
     for k in range(3):
         a = (k + 1) % 3

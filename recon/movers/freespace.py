@@ -3,12 +3,13 @@ Revert")."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from recon.log import LidarPoints
+from recon.log import LidarPoints, Log
 from scenes.trajectory import Trajectory
 
 OFFSETS = (0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
@@ -22,6 +23,9 @@ BAND = 25.0
 
 FARTHER = 0.5, 0.02
 """Metres, and parts of the distance, that others must have seen farther than a point to have seen through it."""
+
+AUDIBLE, ROW = 10.0, 0.1
+"""Metres up to which whatever is there comes back, and the part of a row's cells that have a return where a lidar looks at all."""
 
 TURN = 16
 """Parts of a sweep in which the lidar goes straight on."""
@@ -44,13 +48,35 @@ class RangeImage:
 
     def votes(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether it saw through the world points `[N, 3]`, and whether it saw something where they are: bool `[N]` each."""
-        _, _, column = _cells(xyz - self.middle, self.cell)
-        away, row, column = _cells(xyz - self.stood[column], self.cell)
-        row = (row - self.lowest).clip(0, len(self.told) - 1)
+        away, row, column = self._where(xyz)
         margin = FARTHER[0] + FARTHER[1] * away
         clear = self.clear_m[row, column]
         through = (self.told[row, column] >= 2) & (clear > away + margin)
         return through, np.abs(self.range_m[row, column] - away) < margin
+
+    def silent(self, xyz: np.ndarray) -> np.ndarray:
+        """Whether it looked towards the world points `[N, 3]`, no farther than `AUDIBLE`, and nothing at all came back: bool `[N]`."""
+        away, row, column = self._where(xyz)
+        returned = np.isfinite(self.range_m)
+        looked = (returned.mean(1) > ROW)[row] & returned.any(0)[column]
+        return looked & (self.told[row, column] == 0) & (away < AUDIBLE)
+
+    def _where(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far world points `[N, 3]` were from it, and in which row and column of the image they are."""
+        _, _, column = _cells(xyz - self.middle, self.cell)
+        away, row, column = _cells(xyz - self.stood[column], self.cell)
+        return away, (row - self.lowest).clip(0, len(self.told) - 1), column
+
+
+def range_images(log: Log, read: Iterable[tuple[int, LidarPoints]]) -> list[tuple[int, RangeImage]]:
+    """Time and range image of each lidar that has points in a sweep and of which it is known where it stands; sweeps by time and points."""
+    found = []
+    for time, points in read:
+        for sensor in (k for k in np.unique(points.sensor).tolist() if k in log.lidars):
+            mine = points.sensor == sensor
+            some = LidarPoints(points.xyz[mine], points.times_us[mine], points.sensor[mine])
+            found.append((time, range_image(some, log.ego, log.lidars[sensor])))
+    return found
 
 
 def range_image(points: LidarPoints, ego: Trajectory, mount: np.ndarray) -> RangeImage:

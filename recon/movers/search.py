@@ -16,7 +16,7 @@ from recon.ground import estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.movers.boxing import boxed
 from recon.movers.following import FEWEST, Cluster, Followed, follow
-from recon.movers.freespace import RangeImage, range_image, tally
+from recon.movers.freespace import RangeImage, range_images, tally
 from recon.tracks import named
 from scenes.ground import Ground
 from scenes.poses import inverse
@@ -53,7 +53,7 @@ def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = 
     read = _read(sweeps)
     some = np.concatenate([p.xyz[:: max(1, len(p.xyz) // THIN)] for p in read.values()])
     ground = estimate_ground(some, log.ego.within((min(read), max(read))))
-    images = [(t, range_image(_of(p, k), log.ego, log.lidars[k])) for t, p in read.items() for k in _known(p, log)]
+    images = range_images(log, read.items())
     followed: list[Followed] = []
     asked: dict[int, np.ndarray] = {}
     for time, points in read.items():
@@ -115,16 +115,6 @@ def _within(one: Followed, track: Track) -> float:
     _, mine, its = np.intersect1d(times, track.times_us, return_indices=True)
     local = _seen_from(track.world_from_box[its], np.array(one.places)[mine])
     return float((np.abs(local) < track.size[:2] / 2 + MARGIN).all(1).sum()) / len(times)
-
-
-def _known(points: LidarPoints, log: Log) -> list[int]:
-    """Lidars that have points in a sweep, and of which it is known where they stand."""
-    return [k for k in np.unique(points.sensor).tolist() if k in log.lidars]
-
-
-def _of(points: LidarPoints, sensor: int) -> LidarPoints:
-    mine = points.sensor == sensor
-    return LidarPoints(points.xyz[mine], points.times_us[mine], points.sensor[mine])
 
 
 def candidates(log: Log, time_us: int, points: LidarPoints, ground: Ground) -> np.ndarray:

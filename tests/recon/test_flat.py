@@ -1,5 +1,6 @@
 """Splats on the ground become flat and lie along it; all others are left alone."""
 
+import numpy as np
 import pytest
 import torch
 from randomized import gaussians
@@ -7,7 +8,7 @@ from randomized import gaussians
 from recon import open_log
 from recon.build import begin, choose
 from recon.fit.descent import Descent, rates_at
-from recon.fit.flat import ON, PRESSED, FlatGround
+from recon.fit.flat import ON, PRESSED, SUNK, THIN, FlatGround
 from recon.fit.model import Splats
 from scenes.ground import Ground
 from scenes.poses import matrix_from_quat
@@ -16,6 +17,7 @@ from tests.recon.test_fit import CONFIG, SIZE
 SLOPE = (0.1, -0.05)
 UP = torch.nn.functional.normalize(torch.tensor([-SLOPE[0], -SLOPE[1], 1.0]), dim=0)
 NOW = 7
+EYE = torch.tensor([-25.0, 1.0, 4.0], dtype=torch.float64)
 
 
 def ground_of(height) -> Ground:
@@ -44,7 +46,7 @@ def pressed(splats: Splats, on: Ground, settle=1.0, times=1, moved=None) -> None
     descent, flat = Descent.begin(splats), FlatGround(on, torch.device("cpu"))
     descent.last[slice(None) if moved is None else moved] = NOW
     for _ in range(times):
-        flat.press(splats, torch.arange(len(splats)), descent, rates_at(NOW, {}), settle)
+        flat.press(splats, torch.arange(len(splats)), descent, rates_at(NOW, {}), settle, EYE)
 
 
 def covariance(splats: Splats) -> torch.Tensor:
@@ -117,6 +119,51 @@ def test_beyond_the_ground_nothing_is_pressed():
     assert not changed(splats, before).any()
 
 
+@pytest.mark.parametrize("height", [0.06, -0.06])
+def test_what_lies_off_the_ground_is_drawn_to_it_along_the_rays_to_the_eye(height):
+    splats = lying(hillside(), height=height)
+    before = splats.fields["means"].clone()
+    pressed(splats, hillside(), times=10)
+    after = splats.fields["means"]
+    off = after[:, 2] - hillside().height(after[:, :2]).float()
+    assert (off[:30] * np.sign(height) < 0.95 * abs(height)).all() and torch.equal(after[30:], before[30:])
+    ways = [torch.nn.functional.normalize(at - EYE.float(), dim=1) for at in (before, after)]
+    torch.testing.assert_close(*ways, atol=1e-5, rtol=0)
+    pressed(splats, hillside(), times=1500)
+    at = splats.fields["means"][:30]
+    torch.testing.assert_close(at[:, 2].double(), hillside().height(at[:, :2]) - SUNK, atol=0.001, rtol=0)
+
+
+def test_what_is_laid_onto_the_ground_is_thin_and_lies_along_it():
+    splats = lying(hillside(), height=0.15)
+    splats.fields["log_scales"] += 2
+    before, wide = splats.fields["means"].clone(), covariance(splats)
+    which = torch.arange(60) % 3 == 0
+    FlatGround(hillside(), torch.device("cpu")).lay(splats, which)
+    at, after = splats.fields["means"], covariance(splats)
+    assert torch.equal(at[~which], before[~which]) and torch.equal(after[~which], wide[~which])
+    assert torch.equal(at[:, :2], before[:, :2]) and float((at[which, 2] - hillside().height(at[which, :2])).abs().max()) < 1e-5
+    thick = torch.einsum("nij,i,j->n", after, UP.double(), UP.double()).sqrt()
+    was = torch.einsum("nij,i,j->n", wide, UP.double(), UP.double()).sqrt()
+    torch.testing.assert_close(thick[which], was[which].clamp_max(THIN), rtol=1e-3, atol=1e-6)
+    along = torch.linalg.cross(UP, torch.tensor([0.0, 1.0, 0.0])).double()
+    spans = [torch.einsum("nij,i,j->n", c, along, along)[which] for c in (wide, after)]
+    torch.testing.assert_close(*spans, rtol=1e-3, atol=1e-8)
+
+
+def test_what_closes_a_gap_on_the_ground_does_so_by_its_opacity_alone():
+    splats = lying(hillside(), height=0.2)
+    splats.fields["means"][:5, 2] += 1
+    low = FlatGround(hillside(), torch.device("cpu")).on(splats)
+    assert low.tolist() == [False] * 5 + [True] * 25 + [False] * 30, "what stands, the street, an actor"
+    shown = splats.select(torch.arange(60), 1)
+    held = shown.held(low, ("means", "quats", "log_scales"))
+    sum(field.square().sum() for field in held.fields.values()).backward()
+    for name, field in shown.fields.items():
+        moved = field.grad.reshape(60, -1).abs().sum(1) > 0
+        assert moved[~low].all() and moved[low].any() == (name in ("logits", "sh")), name
+
+
 def test_a_fit_presses_its_road(drive, monkeypatch):
     """As thick as it is after forty steps, against a fit that presses nothing."""
     log = open_log(drive)
@@ -128,7 +175,7 @@ def test_a_fit_presses_its_road(drive, monkeypatch):
             fit.step()
         means = fit.splats.fields["means"][: fit.splats.sizes[0]]
         on = (means[:, 2] - start.ground.height(means[:, :2])).abs() < ON
-        on &= fit.descent.last[: len(on)] > 0  # seen at all
+        on &= fit.descent.coloured()[: len(on)]  # seen by pictures, not from aside alone
         return covariance(fit.splats)[: len(on)][on][:, 2, 2].sqrt().median()
 
     flat = thickness()

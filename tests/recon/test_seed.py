@@ -5,10 +5,14 @@ import torch
 
 from recon import open_log
 from recon.frames import load_frames
+from recon.seeds.carpet import carpet
 from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, thin
 from recon.start import even_limit
+from scenes.ground import Ground
+from scenes.harmonics import rgb_from_sh
 from scenes.poses import matrix_from_quat
 from scenes.spread import spread
+from scenes.trajectory import Trajectory
 
 ALL = (0, 2**62)
 
@@ -104,3 +108,17 @@ def test_what_all_movers_may_have_goes_to_each_as_evenly_as_they_can_use_it():
         shared, more = (sum(min(n, which) for n in counts) for which in (limit, limit + 1))
         assert shared <= total and (more > total or limit >= max(counts)), "no more than all may have, and no less than they could"
     assert even_limit([5, 5], 20) >= 5 and even_limit([1, 100, 100], 101) == 50 and even_limit([], 10) > 0
+
+
+def test_the_carpet_takes_the_streets_colour_not_that_of_a_cars_sill():
+    """Grey points of the road lie all around a gap; a glint and blue sills, 15 cm up, stand in it."""
+    flat, ego = Ground(torch.zeros(41, 41), (-10.0, -10.0), 0.5), Trajectory(torch.zeros(1, dtype=torch.int64), torch.eye(4)[None].double())
+    x, y = np.meshgrid(np.arange(-9.9, 9.9, 0.2), np.arange(-9.9, 9.9, 0.2))
+    road = np.column_stack([x.ravel(), y.ravel(), 0.02 * np.sin(x.ravel())])
+    road = road[np.abs(road[:, :2]).max(1) > 1.5]
+    sill = np.array([[0.0, y, 0.15] for y in np.arange(-1, 1, 0.4)])
+    rgb = np.concatenate([np.full((len(road), 3), 0.4), np.tile([[0.1, 0.1, 0.9]], (len(sill), 1))])
+    laid = carpet(Cloud(np.concatenate([road, sill]), rgb), flat, ego, 4)
+    gap = laid.means[:, :2].abs().amax(1) < 1.3
+    assert gap.sum() > 20
+    torch.testing.assert_close(rgb_from_sh(laid.sh[gap, 0]), torch.full((int(gap.sum()), 3), 0.4), atol=1e-4, rtol=0)

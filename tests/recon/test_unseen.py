@@ -22,6 +22,8 @@ from tests.recon.test_fit import CONFIG, SIZE
 
 AHEAD = Camera(Pinhole(160.0, 160.0, 128.0, 96.0), 256, 192, torch.eye(4, dtype=torch.float64))
 
+DEEP = Ground(torch.full((9, 9), -50.0), (-4.0, -4.0), 1.0)
+
 
 def balls(places: list[tuple[float, float, float]], metres: list[float], opacity: list[float]) -> Gaussians:
     """Round splats of standard deviations `metres`."""
@@ -94,12 +96,12 @@ def test_hidden_splats_take_the_colours_of_known_ones_beside_them():
     groups = [[0.5] * 40 + [0.01] * 10 + [0.0] * 5, [0.9] * (NEIGHBOURS - 1) + [0.01] * 4]
     splats, part = splats_of(groups, lambda p: grey if p >= SEEN else orange)
     before = splats.fields["sh"].clone()
-    guessed = as_neighbours(splats, part, part > 0)
+    guessed = as_neighbours(splats, part, part > 0, DEEP)
     assert guessed.nonzero()[:, 0].tolist() == list(range(40, 50)), "not what no picture pulls at, nor an actor of which nothing is known"
     after = splats.fields["sh"]
     assert torch.equal(after[~guessed], before[~guessed])
     torch.testing.assert_close(after[40:50], before[:1].expand(10, -1, -1))
-    assert as_neighbours(splats, part, part >= 0)[50:55].all(), "pulled at, by a rim at a border: its middle is in no picture"
+    assert as_neighbours(splats, part, part >= 0, DEEP)[50:55].all(), "pulled at, by a rim at a border: its middle is in no picture"
 
 
 def test_the_nearest_count_most():
@@ -108,8 +110,26 @@ def test_the_nearest_count_most():
     means[:20], means[20:60], means[60] = torch.rand(20, 3) * 0.1, 3 + torch.rand(40, 3), torch.zeros(3)
     sh[20:60] += 1.0
     splats.fields["log_scales"][60] = math.log(0.05)
-    as_neighbours(splats, part, part > 0)
+    as_neighbours(splats, part, part > 0, DEEP)
     torch.testing.assert_close(sh[60], sh[0])
+
+
+def test_the_street_beside_a_parked_car_takes_the_streets_colour_pulled_at_or_not():
+    """Blue splats are nearer, and higher; one that stands there and is hidden takes theirs."""
+    flat = Ground(torch.zeros(21, 21), (-10.0, -10.0), 1.0)
+    splats, part = splats_of([[1.0] * 80 + [0.0] * 3], lambda p: [0.3, 0.3, 0.3])
+    means, sh = splats.fields["means"], splats.fields["sh"]
+    generator = torch.Generator().manual_seed(0)
+    means[:40] = torch.cat([3 + torch.rand(40, 2, generator=generator), 0.02 * torch.rand(40, 1, generator=generator)], 1)
+    means[40:80] = torch.rand(40, 3, generator=generator) * 0.2 + torch.tensor([0.0, 0.0, 0.15])
+    sh[40:80, 0] = sh_from_rgb(torch.tensor([0.1, 0.1, 0.8]))
+    means[80:] = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.12], [0.1, 0.1, 0.5]])
+    pulled = torch.ones(83, dtype=torch.bool)
+    pulled[80] = False
+    guessed = as_neighbours(splats, part, pulled, flat)
+    assert guessed.nonzero()[:, 0].tolist() == [80, 81, 82]
+    torch.testing.assert_close(sh[80:82, 0], sh[:2, 0])
+    torch.testing.assert_close(sh[82, 0], sh[40, 0])
 
 
 def test_a_fit_keeps_them_to_its_end(drive):

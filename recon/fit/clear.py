@@ -1,0 +1,55 @@
+"""Where lidar looked through, nothing stands: splats that hang there may look right from the recorded path, as a car that passes its camera
+or what a picture's border cuts, and are a ghost in the air from beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from recon.fit.model import Splats
+from recon.log import Log
+from recon.movers.freespace import RangeImage, range_images
+from scenes.ground import Ground
+from scenes.spread import spread
+
+LOOKS = 24
+"""Sweeps, spread over the drive, that are asked."""
+
+THROUGH, THERE = 4, 0.1
+"""Sweeps of a lidar that must have looked through a place for it to be clear, and times those that at most saw something there."""
+
+ABOVE = 0.3
+"""Metres above the ground from which on places are looked at: along a road beams say little."""
+
+FAR = 60.0
+"""Metres from a lidar up to which it is asked."""
+
+
+@dataclass(frozen=True)
+class Clear:
+    """What lidars saw of the space above a ground."""
+
+    images: Sequence[RangeImage]
+    ground: Ground
+
+    @staticmethod
+    def of(log: Log, span_us: tuple[int, int], ground: Ground) -> Clear:
+        """By some of a log's sweeps within a span of time."""
+        asked = spread(log.sweeps_within(span_us), LOOKS)
+        return Clear([image for _, image in range_images(log, ((s.time_us, s.read()) for s in asked))], ground)
+
+    def holds(self, splats: Splats) -> torch.Tensor:
+        """Mask `[N]` of the splats of the background whose middles lie where lidars looked through."""
+        mask = torch.zeros_like(splats.reach, dtype=torch.bool)
+        means = splats.fields["means"][: splats.sizes[0]].detach().double().cpu()
+        asked = (means[:, 2] - self.ground.height(means[:, :2]) > ABOVE).nonzero()[:, 0]
+        through, there = torch.zeros(2, len(asked), dtype=torch.int64)
+        for image in self.images:
+            near = ((means[asked] - torch.from_numpy(image.middle)).norm(dim=1) < FAR).nonzero()[:, 0]
+            beyond, struck = image.votes(means[asked[near]].numpy())
+            through[near] += torch.from_numpy(beyond | image.silent(means[asked[near]].numpy()))
+            there[near] += torch.from_numpy(struck)
+        mask[asked[(through >= THROUGH) & (there <= THERE * through)].to(mask.device)] = True
+        return mask

@@ -1,0 +1,54 @@
+"""Nothing stands where lidar looked through."""
+
+from dataclasses import replace
+
+import torch
+from made_sweeps import drive, standing
+
+from recon.fit.clear import LOOKS, Clear
+from scenes.ground import Ground
+from tests.recon.test_swept import splats
+
+EVER = (-(10**9), 10**9)
+FLAT = Ground(torch.zeros(2, 2), (0.0, 0.0), 1.0)
+THINGS = [standing(30, 0, (1, 60, 8)), standing(12, -5), standing(20, 4, (0.3, 0.3, 5.0))]
+
+
+def held(log, *places, actors=()):
+    return Clear.of(log, EVER, FLAT).holds(splats(*places, actors=actors)).tolist()
+
+
+def test_what_hangs_before_what_lidar_saw_goes_and_what_it_struck_or_could_not_see_stays():
+    log = drive(THINGS, count=12)
+    clear = {"over the road": (18.0, -1.0, 1.2), "beside the pole": (20.0, 2.0, 1.5)}
+    kept = {
+        "the wall": (29.4, 3.0, 2.0),
+        "just before the wall": (29.2, 3.0, 2.0),
+        "behind it": (34.0, 3.0, 2.0),
+        "the pole": (20.0, 4.0, 1.5),
+        "within the parked car": (12.0, -5.0, 0.8),
+        "on the road": (18.0, -1.0, 0.1),
+        "above what the lidar sees": (18.0, -1.0, 9.0),
+        "far away": (150.0, 0.0, 1.5),
+    }
+    found = held(log, *clear.values(), *kept.values(), actors=[list(clear.values())])
+    assert dict(zip([*clear, *kept], found, strict=False)) == {k: k in clear for k in [*clear, *kept]}
+    assert found[len(clear) + len(kept) :] == [False] * len(clear), "an actor's are where it is at other times"
+
+
+def test_where_nothing_came_back_nothing_is_near():
+    """Beside a wall in front the lidar's beams go into the sky; what stood three metres away would have been struck."""
+    log = drive(THINGS, count=12)
+    beside = (6.0, 3.0, 2.0)
+    assert held(log, beside) == [True]
+    assert held(replace(log, lidars={}), beside) == [False], "of a lidar that stands nobody knows where nothing is known"
+
+
+def test_a_drive_without_lidar_knows_nothing():
+    log = drive(THINGS, count=4)
+    assert held(replace(log, sweeps=()), (18.0, -1.0, 1.2)) == [False]
+
+
+def test_some_sweeps_of_a_long_drive_are_asked():
+    log = drive(THINGS, count=LOOKS + 9)
+    assert len(Clear.of(log, EVER, FLAT).images) == LOOKS
