@@ -308,6 +308,8 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
         ("mine/hidden.usda", b"over", "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
+        ("mine/veh_3.usdc", None, "mine/veh_3.usdc is missing"),
+        ("mine/veh_3.usdc", 300, "mine/veh_3.usdc is damaged"),
     ],
 )
 def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, left, said):
