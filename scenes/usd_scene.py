@@ -33,6 +33,7 @@ from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.hdr import load_hdr, save_hdr
 from scenes.lenses import LENSES, Orthographic
+from scenes.names import absent
 from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
@@ -143,6 +144,8 @@ def is_scene(path: Path) -> bool:
 def read_metadata(path: Path) -> dict:
     """metadata.json of a scene folder. FileNotFoundError or ValueError saying what is wrong with it."""
     file = path / "metadata.json"
+    if not path.exists():
+        raise FileNotFoundError(absent(path))
     if not file.is_file():
         raise FileNotFoundError(f"{path} is not a Sidestep scene: it has no metadata.json")
     try:

@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -234,6 +236,18 @@ def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
         pass
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
     assert {p.name for p in saved.iterdir()} == {p.relative_to(saved).parts[0] for p in before}
+
+
+def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_next_edit(saved):
+    add_change(saved, "mine", load(saved), ALL, {})
+    kill = "import os, sys; from scenes.usd_edit import undone\nwith undone(sys.argv[1], ['mine']): os.kill(os.getpid(), 9)"
+    for next_edit in (lambda: put_in(saved), lambda: undo(saved, "new")):
+        subprocess.run([sys.executable, "-c", kill, str(saved)], check=False)
+        (aside,) = saved.glob(".undone.*")
+        assert (aside / "mine.usda").exists() and validate(saved) == []
+        next_edit()
+        assert not aside.exists()
+        add_change(saved, "mine", load(saved), ALL, {})
 
 
 def shown(scene: Scene) -> torch.Tensor:
