@@ -67,8 +67,20 @@ def need_folder(path: Path) -> None:
     """Raise FileNotFoundError unless the folder that `path` would stand in exists, PermissionError unless it takes files."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"cannot write {path}: {path.parent.resolve()} takes no files of yours; give a folder of your own")
+    _need_access(path.parent, path)
+
+
+def made_folder(path: Path) -> Path:
+    """The folder `path`, made with those that it stands in where they are missing. PermissionError where it, or the one that it would be
+    made in, takes no files."""
+    _need_access(next(folder for folder in (path, *path.absolute().parents) if folder.is_dir()), path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _need_access(folder: Path, path: Path) -> None:
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write {path}: {folder.resolve()} takes no files of yours; give a folder of your own")
 
 
 def _umask() -> int:

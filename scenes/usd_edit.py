@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
-from scenes.atomic import atomic_file, atomic_folder
+from scenes.atomic import atomic_file, atomic_folder, need_folder
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
@@ -141,6 +141,7 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
     read_metadata(scene)
     root, out = scene / "scene.usda", list[Undone]()
     before = root.read_bytes()
+    need_folder(root)
     _sweep(scene)
     with TemporaryDirectory(prefix=ASIDE, dir=scene) as aside:
         try:
@@ -169,6 +170,7 @@ def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
     for each in (*gone.idle, name):
         drop_sublayer(scene, f"./edits/{each}.usda")
         for path in (p for p in (edits / f"{each}.usda", edits / each) if p.exists()):
+            need_folder(path)
             path.rename(aside / path.name)
     return gone
 

@@ -1,10 +1,12 @@
 import errno
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from scenes.atomic import atomic_file, atomic_folder
+from scenes.atomic import atomic_file, atomic_folder, made_folder
 
 
 def listing(folder):
@@ -77,3 +79,12 @@ def test_writing_into_a_missing_folder_names_it(tmp_path):
         pass
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"), atomic_folder(tmp_path / "nowhere" / "s1"):
         pass
+
+
+def test_a_folder_is_made_with_those_above_it_and_refused_where_none_takes_files(tmp_path, monkeypatch):
+    assert made_folder(tmp_path / "a" / "b").is_dir() and made_folder(tmp_path / "a") == tmp_path / "a"
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "a")  # root may write anywhere
+    for folder in (tmp_path / "a", tmp_path / "a" / "c" / "d"):
+        with pytest.raises(PermissionError, match=rf"cannot write {folder}: .*/a takes no files of yours; give a folder of your own"):
+            made_folder(folder)
+    assert listing(tmp_path / "a") == ["b"]

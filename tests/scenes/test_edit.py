@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -248,6 +249,15 @@ def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_nex
         next_edit()
         assert not aside.exists()
         add_change(saved, "mine", load(saved), ALL, {})
+
+
+def test_undoing_in_a_folder_that_takes_no_files_says_so_and_leaves_all(saved, monkeypatch):
+    put_in(saved)
+    for folder in (saved, saved / "edits"):
+        with monkeypatch.context() as context, pytest.raises(PermissionError, match=f"{folder} takes no files of yours"):
+            context.setattr(os, "access", lambda path, mode, folder=folder: Path(path) != folder)  # root may write anywhere
+            undo(saved, "new")
+    assert load(saved).actors[-1].track == "new"
 
 
 def shown(scene: Scene) -> torch.Tensor:
