@@ -1,9 +1,11 @@
-"""The order in which files were recorded, as their names tell it."""
+"""The order in which files were recorded, and what they have in common, as their names tell it."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from decimal import Decimal
+from pathlib import PurePosixPath
 
 NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?)")
 
@@ -12,3 +14,12 @@ def recorded(name: str) -> tuple:
     """A key that sorts names by the numbers in them: frame9.jpg before frame10.jpg, 12.5.jpg (seconds) after 12.45.jpg."""
     parts = NUMBER.split(name)  # text and numbers by turns
     return tuple(Decimal(part) if i % 2 else part for i, part in enumerate(parts)), name
+
+
+def shared_words(names: Sequence[str]) -> tuple[str, ...]:
+    """The words that all of these files' names have at the same place: frame and left of frame_001_left.jpg and frame_002_left.jpg."""
+    split = [[token for part in PurePosixPath(n).with_suffix("").parts for token in (*NUMBER.split(part), "/")] for n in names]
+    if len({len(parts) for parts in split}) > 1:
+        return ()
+    same = "".join(parts[0] if len(set(parts)) == 1 else " " for parts in zip(*split, strict=True))
+    return tuple(word for word in re.split(r"[\W_]+", same) if any(letter.isalpha() for letter in word))

@@ -176,7 +176,7 @@ def test_two_cameras_in_two_parts_of_a_drive_share_moments_part_by_part(street, 
     pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
     names = [layout.format(camera=c, part="ab"[i // 2], i=i % 2) for c in pair for i in range(4)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert [len(camera) for camera in log.cameras.values()] == [4, 4]
+    assert {name: len(camera) for name, camera in log.cameras.items()} == {"front": 4, "left": 4}
     for camera in log.cameras.values():
         assert camera.times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
         assert [f.parts[-3:] for f in camera.files] == sorted(f.parts[-3:] for f in camera.files)
@@ -415,6 +415,7 @@ def test_pictures_of_one_moment_are_known_by_what_differs_in_a_cameras_names(str
     names = [layout.format(camera=c, number=k + 1, i=i) for k, c in enumerate(pair) for i in range(4)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names), metres_per_unit=1 / UNIT)
     assert [c.times_us.tolist() for c in log.cameras.values()] == [[0, 500_000, 1_000_000, 1_500_000]] * 2
+    assert list(log.cameras) == (["cam1", "cam2"] if "{number}" in layout else ["front", "left"])
     front, left = log.cameras
     rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
     apart = inverse(rig[front].body_from_cam) @ rig[left].body_from_cam
@@ -437,8 +438,8 @@ def test_pictures_that_another_camera_took_before_or_after_the_first_are_named(s
     pair = {"front": pictures_along(street, count=5), "left": pictures_along(street, "left_camera", count=5)}
     names = [f"{c}_{i + 2 * k:03d}.png" for k, c in enumerate(pair) for i in range(5)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["camera_2"]) == 3
-    assert "2 of 5 pictures of camera_2 are left out, the first of them" in capsys.readouterr().err
+    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["left"]) == 3
+    assert "2 of 5 pictures of left are left out, the first of them" in capsys.readouterr().err
 
 
 def test_names_that_are_numbers_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):
