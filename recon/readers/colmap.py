@@ -52,7 +52,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     model = read_model(where)
     names = camera_names(model)
     lead = _lead(model)
-    moments = moments_of(where, model, lead)
+    moments, clock = moments_of(where, model, lead)
     poses = np.stack([np.linalg.inv(i.cam_from_world) for i in model.images])
     gauge = find_gauge(poses[[i.camera == lead for i in model.images]], model.xyz, camera_height, metres_per_unit)
     placed = gauge.poses(poses)
@@ -91,6 +91,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         "source": f"COLMAP model of {len(model.images)} pictures in {about.name}",
         "body": f"camera {names[lead]}, turned to x forward, y left, z up",
         "metric": gauge.metric,
+        "clock": clock,
         "world_from_model": {"rotation": gauge.rotation.tolist(), "origin": gauge.origin.tolist(), "scale": gauge.scale},
     }
     observed = any(len(shown) for frames in seen.values() for shown in frames)

@@ -50,6 +50,7 @@ def test_a_workspace_reads_as_its_pictures_were_taken(workspace, street):
     torch.testing.assert_close(relative(camera.world_from_cam), relative(truth), atol=1e-6, rtol=0)
     assert [f.name for f in camera.files] == [f"{i:03d}.png" for i in range(12)] and camera.image(3).shape == (54, 96, 3)
     assert log.sweeps == () and log.meta["metric"] is True and camera.times_us.diff().unique().tolist() == [500_000]
+    assert log.meta["clock"].startswith("made up, 0.5 s from one picture to the next")
 
 
 def test_z_is_up_and_the_body_looks_ahead_whatever_way_the_model_lies(workspace):
@@ -209,7 +210,8 @@ def test_pictures_of_another_size_than_the_models_are_named_with_the_fix(own):
 def test_a_clock_beside_the_model_is_read(own):
     names = sorted(p.name for p in (own / "images").iterdir())
     (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * i for i, n in enumerate(names)}))
-    assert open_log(own).camera("camera").times_us.diff().unique().tolist() == [40_000]
+    log = open_log(own)
+    assert log.camera("camera").times_us.diff().unique().tolist() == [40_000] and log.meta["clock"] == "times.json"
     (own / "sparse/0/times.json").write_text(json.dumps({names[0]: 0}))
     with pytest.raises(ValueError, match="times.json must give whole microseconds"):
         open_log(own)
@@ -432,6 +434,7 @@ def test_names_that_are_times_are_a_clock(street, tmp_path, name, capsys):
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
     assert log.cameras["front"].times_us.tolist() == [0, 100_000, 200_000, 300_000]
     assert log.cameras["left"].times_us.tolist() == [20_000, 120_000, 220_000, 320_000] and not capsys.readouterr().err
+    assert log.meta["clock"] == "times in the pictures' names"
 
 
 def test_pictures_that_another_camera_took_before_or_after_the_first_are_named(street, tmp_path, capsys):
