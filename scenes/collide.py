@@ -27,22 +27,23 @@ FEWEST = 12
 """Splats that make something: floaters come alone."""
 
 
-def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> list[str]:
-    """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment; []
-    where its way is free."""
+def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> dict[str, str]:
+    """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment, by
+    what that is: "actor <track>", "ego", "background"; {} where its way is free."""
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     begin, end = during or (first, last)
     times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
-    found = []
+    found = {}
     for other in scene.actors:
         if other.track == actor.track or not _meet(actor, other):
             continue
         hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
         if hit is not None:
-            found.append(f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment")
+            when = f"{(hit - first) / 1e6:.1f}s after the drive's first moment"
+            found[f"actor {other.track}"] = f"runs into {other.track} ({other.asset.label}) {when}"
     hit = next((t for t in times if scene.ego.covers(t) and _holds(actor, scene.ego.at(t), t)), None)
     if hit is not None:
-        found.append(f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment")
+        found["ego"] = f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment"
     still = len(actor.trajectory) == 1
     times = times[:1] if still else times
     solid = _along(scene, actor, times)
@@ -50,7 +51,8 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
         count = _inside(solid, inverse(actor.trajectory.at(t)) @ scene.background.world_from_local, actor.asset.size)
         if count >= FEWEST:
             when = "" if still else f" {(t - first) / 1e6:.1f}s after the drive's first moment"
-            found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
+            what = f"{count} solid splats lie in its box; a parked car, a wall, a tree"
+            found["background"] = f"stands in something of the background{when}: {what}"
             break
     return found
 

@@ -79,7 +79,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     there = at_place(asset, scene, path, start_us)
     marked = replace(there, meta={**there.meta, "inserted": True})
     actor = Actor(marked, path, _track(scene, placement.asset))
-    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us))]
+    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us)).values()]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
 
 

@@ -25,7 +25,7 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at
 from recon.fit.turns import Turns
-from recon.fit.unseen import as_neighbours, curtains, footprint, shown_parts
+from recon.fit.unseen import as_neighbours, curtains, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -271,8 +271,9 @@ class Fit:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
             which = self._in_sight(view, camera, [], None)
             placed = self._placed(self.splats.select(which, 1), view, camera)
-            part[which] = torch.maximum(part[which], torch.cat(shown_parts(placed, camera)))
-            inside[which] |= torch.cat([footprint(p, camera) > 0 for p in placed])
+            shown, within = shown_parts(placed, camera)
+            part[which] = torch.maximum(part[which], shown)
+            inside[which] |= within
         stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         part = part[stays]

@@ -457,6 +457,16 @@ def test_an_edit_says_what_it_brings_an_actor_into_and_not_what_it_was_in_before
     assert not meeting(Edit(shift={"veh_3": (-13.0, -5.0)}, remove=("veh_3",)), scene)
 
 
+def test_another_actor_of_much_the_same_name_is_told_though_one_was_in_the_way_before():
+    scene, still = busy(), Trajectory(torch.tensor([START_US]), translation(15.0, 5.0, 0.0)[None])
+    beside = Trajectory(torch.tensor([START_US]), translation(15.0, 15.0, 0.0)[None])
+    scene = replace(scene, actors=(*scene.actors, Actor(car(), still, "car 1"), Actor(car(), beside, "car 2")))
+    told = meeting(Edit(shift={"veh_3": (0.0, 10.0)}), scene)
+    assert any(line.startswith("veh_3 runs into car 2") for line in told)
+    told = meeting(Edit(shift={"car 2": (0.0, -10.0)}), scene)
+    assert {line.split(" (")[0] for line in told if "runs into" in line} == {"car 2 runs into veh_3", "car 2 runs into car 1"}
+
+
 def test_a_replaced_actor_whose_unseen_side_recorded_cameras_see_is_said():
     seen = {**dict.fromkeys(SECTORS, 0), "front": 30}
     guessed = replace(VAN, meta={"id": "van/0001", "sectors": seen})
