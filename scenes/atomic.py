@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 
 
@@ -29,6 +30,12 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
             error.filename = str(path)  # a full disk is told with the name that the user knows
         raise
     finally:
+        partial.unlink(missing_ok=True)
+
+
+def clear_partials(path: Path) -> None:
+    """Take away what `atomic_file` left behind where it was killed, of a file that nobody else writes now."""
+    for partial in path.parent.glob(f".{escape(path.stem)}.????????{escape(path.suffix)}"):
         partial.unlink(missing_ok=True)
 
 
