@@ -122,6 +122,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
         late.setattr("recon.build.keep_album", lambda *_: os.kill(os.getpid(), signal.SIGINT) or time.sleep(9))
         reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     assert checkpoint_path(out).is_file() and [p.name for p in tmp_path.iterdir()] == ["scene.fit"]
+    monkeypatch.setattr("recon.build.aligned", lambda *_: pytest.fail("sought how sweeps meet again"))
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     for name, tensor in resumed.background.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
