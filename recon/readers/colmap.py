@@ -6,7 +6,6 @@ left, z up.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ import torch
 from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
 from recon.readers.moments import moments_of
-from recon.readers.order import shared_words
+from recon.readers.order import names_apart
 from recon.readers.sfm import Model, ModelCamera, is_model, read_model
 from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
@@ -136,8 +135,8 @@ def colmap_lens(lens: Lens, where: Path) -> tuple[str, tuple[float, ...]]:
 
 
 def camera_names(model: Model) -> dict[int, str]:
-    """A name for every camera that took a picture: "camera" for the only one, else its pictures' folder, else the words that all of their
-    names have and not all cameras', else camera_<id>.
+    """A name for every camera that took a picture: "camera" for the only one, else what its pictures' names call it (`names_apart`), else
+    camera_<id>.
 
     ValueError where nearly every picture has a camera of its own: one lens a picture is no rig.
     """
@@ -147,14 +146,7 @@ def camera_names(model: Model) -> dict[int, str]:
     if len(model.images) < 2 * len(taken):
         fix = "let COLMAP share one: colmap feature_extractor --ImageReader.single_camera 1"
         raise ValueError(f"the model has {len(taken)} cameras for {len(model.images)} pictures; {fix}")
-    folders = {key: {str(Path(n).parent) for n in some} for key, some in taken.items()}
-    flat = [next(iter(f)) for f in folders.values() if len(f) == 1]
-    if len(set(flat)) == len(taken) and "." not in flat:
-        return {key: re.sub(r"\W", "_", next(iter(f))) for key, f in folders.items()}
-    words = {key: shared_words(some) for key, some in taken.items()}
-    common = set.intersection(*map(set, words.values()))
-    told = {key: "_".join(w for w in some if w not in common) or f"camera_{key}" for key, some in words.items()}
-    return told if len(set(told.values())) == len(taken) else {key: f"camera_{key}" for key in taken}
+    return names_apart(taken) or {key: f"camera_{key}" for key in taken}
 
 
 def _lead(model: Model) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import PurePosixPath
 
@@ -14,6 +14,19 @@ def recorded(name: str) -> tuple:
     """A key that sorts names by the numbers in them: frame9.jpg before frame10.jpg, 12.5.jpg (seconds) after 12.45.jpg."""
     parts = NUMBER.split(name)  # text and numbers by turns
     return tuple(Decimal(part) if i % 2 else part for i, part in enumerate(parts)), name
+
+
+def names_apart(taken: Mapping[int, Sequence[str]]) -> dict[int, str] | None:
+    """What the names of each camera's pictures call it: their folder, else the words that all of them have and not all cameras' do, which
+    one camera may lack. None where they tell no cameras apart."""
+    folders = [{str(PurePosixPath(name).parent) for name in names} for names in taken.values()]
+    flat = [next(iter(some)) for some in folders if len(some) == 1]
+    if len(set(flat)) == len(taken) and "." not in flat:
+        return {key: re.sub(r"\W", "_", folder) for key, folder in zip(taken, flat, strict=True)}
+    words = {key: shared_words(names) for key, names in taken.items()}
+    common = set.intersection(*map(set, words.values()))
+    told = {key: "_".join(word for word in some if word not in common) for key, some in words.items()}
+    return {key: name or f"camera_{key}" for key, name in told.items()} if len(set(told.values())) == len(taken) else None
 
 
 def shared_words(names: Sequence[str]) -> tuple[str, ...]:
