@@ -31,6 +31,7 @@ from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
+from recon.seeds.points import fewer
 from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
@@ -336,6 +337,7 @@ class Fit:
             cameras = [self.motion.camera(v) for v in views]
             search = Search(views, cameras, gain, self.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
+                more = fewer(more, max(0, self.config.budget - len(self.splats)))
                 reach = reach_of(more, path, self.motion.rig).to(self.device)
                 self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
 

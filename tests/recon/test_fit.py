@@ -151,6 +151,7 @@ def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive,
     assert [row["frames"] for row in made.meta["held_out"] if row["which"] == "all"] == [[0, 4]]
     assert made.ego.covers(int(times[-1])) and made.ego.times_us[-1] < log.ego.times_us[-1] and len(made.actors) == 1
     assert isinstance(load(tmp_path / "scene"), Scene)
+    assert made.meta["fit"]["splats"] <= 3000 and len(made.actors[0].asset.gaussians) > 0, "a small budget is one, too"
 
 
 def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, monkeypatch):
