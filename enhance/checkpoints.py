@@ -141,10 +141,18 @@ def is_torchscript(path: Path) -> bool:
 
 
 def _script(path: Path) -> torch.jit.ScriptModule:
+    """A TorchScript that makes a picture of a picture, as far as what it declares tells; ValueError for any other."""
     try:
-        return torch.jit.load(str(path), map_location="cpu")
+        module = torch.jit.load(str(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is no whole TorchScript ({str(error).strip().splitlines()[0]}); fetch it again") from error
+    schema = module.forward.schema if hasattr(module, "forward") else None
+    takes = [str(a.type) for a in schema.arguments[1:] if not a.has_default_value()] if schema else []
+    gives = [str(r.type) for r in schema.returns] if schema else []
+    if takes != ["Tensor"] or gives != ["Tensor"]:
+        what = f"takes {', '.join(takes) or 'nothing'} and gives {', '.join(gives) or 'nothing'}"
+        raise ValueError(f"{path} is a TorchScript that {what}, where an enhancer takes one tensor and gives one; give {KNOWN}")
+    return module
 
 
 def read_state(path: Path) -> dict:

@@ -89,11 +89,11 @@ def enhance_video(
     are, and how many of them were changed.
 
     A video becomes H.264 with the source's times and shape of pixels, without its sound; a side that is odd gains one repeated row or
-    column, which H.264's 4:2:0 needs. A folder becomes a folder of PNG by the same names. `progress` is called with frames done and frames
-    in all, where the file says. rendered: whether the clip shows renders, which our own network repairs. instances: a folder that tells
-    where objects were put in (`ObjectIds`), whose colours and shadows are set right. like: photos of the place, in whose colours the whole
-    clip is graded before (`Grade.read`). Without any of them our own network leaves a clip as it is; it warns where no frame was changed.
-    Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
+    column, which H.264's 4:2:0 needs. A folder becomes a folder of 8-bit RGB PNG by the same names. `progress` is called with frames done
+    and frames in all, where the file says. rendered: whether the clip shows renders, which our own network repairs. instances: a folder
+    that tells where objects were put in (`ObjectIds`), whose colours and shadows are set right. like: photos of the place, in whose colours
+    the whole clip is graded before (`Grade.read`). Without any of them our own network leaves a clip as it is; it warns where no frame was
+    changed. Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     if Path(source).is_file() and Path(source).suffix.lower() in PHOTOS:
         raise ValueError(f"{source} is one picture; put it into a folder, and give that")
@@ -120,6 +120,8 @@ def enhance_video(
             done += 1
             if progress is not None:
                 progress(done, clip.count)
+    if isinstance(clip, Pictures) and clip.dropped:
+        warn([f"{out} is without what pictures of {source} had: {clip.dropped}"])
     if isinstance(clip, Video):
         warn(odd_warning(out, clip.width, clip.height))
     if isinstance(clip, Video) and clip.sound:

@@ -25,7 +25,7 @@ from recon.early import SHORT as EARLY
 from recon.egomask import with_ego_masks
 from recon.log import Log, LogCamera
 from render.references import References
-from scenes.atomic import atomic_file
+from scenes.atomic import atomic_file, made_folder
 from scenes.databank import Databank
 from scenes.files import kind_of, load
 from scenes.hdr import load_hdr
@@ -252,7 +252,7 @@ def claim_pairs(out: str | Path, scene: Scene, log: Log, seed: int, config: Pair
 
 def claim(out: Path, settings: dict, made_of: dict) -> None:
     """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
-    note, before = out / NOTE, {}
+    note, before = made_folder(out) / NOTE, {}
     if note.exists():
         try:
             before = dict(json.loads(note.read_text()))
@@ -265,7 +265,6 @@ def claim(out: Path, settings: dict, made_of: dict) -> None:
                 raise ValueError(f"{out} holds pairs of another {name}, or of this one before it was changed; choose another folder")
         if made_of.keys() <= before.keys():
             return
-    out.mkdir(parents=True, exist_ok=True)
     with atomic_file(note) as half:
         Path(half).write_text(json.dumps(before | settings | made_of))
 

@@ -12,12 +12,14 @@ from recon.readers.order import recorded
 from recon.readers.photos import PHOTOS
 from render.video import CONTAINERS, read_image, write_image
 from scenes.atomic import atomic_folder
+from scenes.pictures import dropped_of, opened
 
 
 class Pictures:
     """The pictures of a folder, in the order of the numbers in their names; iterate over `timed` for rgb `[H, W, 3]` float32 0..1.
 
-    width, height: pixels; count: how many there are. ValueError where there are none, or one is of another size.
+    width, height: pixels; count: how many there are; dropped: what is not read of which picture, in words, or ''.
+    ValueError where there are none, or one is of another size.
     """
 
     def __init__(self, folder: str | Path):
@@ -27,6 +29,7 @@ class Pictures:
             raise ValueError(f"{folder} holds no pictures ({', '.join(PHOTOS)}), and is no video")
         self.count = len(self.files)
         self.height, self.width = read_image(self.files[0]).shape[:2]
+        self.dropped = next((f"of {file.name} {what}" for file in self.files if (what := _dropped(file))), "")
 
     def timed(self) -> Iterator[tuple[int, torch.Tensor]]:
         """The pictures, each after its number."""
@@ -62,6 +65,11 @@ class PictureWriter:
 
     def __exit__(self, *problem) -> None:
         self._stack.__exit__(*problem)
+
+
+def _dropped(file: Path) -> str:
+    with opened(file, str(file), "fetch or export it again") as picture:
+        return dropped_of(picture)
 
 
 def in_order(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from scenes.atomic import atomic_file
+from scenes.atomic import atomic_file, made_folder
 from scenes.checks import check_tensor
 
 KINDS = ("underfit", "isp", "clean", "sparse", "cycle", "crossref", "relight", "shadow", "reinsert", "isp_frame")
@@ -148,7 +148,7 @@ def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> Non
     stored = STORED | (REFERENCES if "trust" in tensors else {})
     for name, dtype in stored.items():
         check_tensor(name, tensors[name], ("T", "H", "W", {"flow": 2}.get(name, 3)) if tensors[name].ndim == 4 else ("T", "H", "W"), dtype)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder(path.parent)
     t, h, w = tensors["region"].shape
     with atomic_file(path) as half:
         half.write_bytes(save({name: tensors[name].contiguous() for name in stored}))

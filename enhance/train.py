@@ -36,6 +36,7 @@ from enhance.shade import optical_depth, shaded
 from enhance.shade_samples import Grounds
 from enhance.shards import RENDERED, PairSet
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
+from scenes.atomic import made_folder
 from scenes.names import unknown
 from scenes.stops import Stops
 
@@ -129,7 +130,7 @@ def train(
     if resume and checkpoint.exists():
         run.load(checkpoint)
     perceptual = PatchPerceptual(run.net.encoder, vgg).to(run.device)  # now, or a wrong file would be found after the other stages
-    out.mkdir(parents=True, exist_ok=True)
+    made_folder(out)
     report = _Reporter(run, progress)
     with Stops() as stops:
         go = partial(_stage, run, checkpoint, save_every, report, stops)

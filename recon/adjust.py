@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,5 +59,4 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
         return log
     print(f"{log.path}: its pictures meet within {before:.2f} pixels by its recorded poses, and {after:.2f} corrected", file=sys.stderr)
     path = {"times_us": camera.times_us[[chosen[k] for k in known]].tolist(), "poses": torch.from_numpy(moves).flatten(1).tolist()}
-    log = replace(log, meta={**log.meta, MOVED: path})
-    return as_aligned(log, log.meta)
+    return as_aligned(log, {MOVED: path})

@@ -110,8 +110,7 @@ def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lamb
     print(f"{log.path}: its sweeps lie up to {_unlike(found):.2f} m apart by its recorded poses, which are corrected", file=sys.stderr)
     poses = about(np.stack([cloud.centre for cloud in surfaces(turns)]), found)
     path = {"times_us": [turn[0].time_us for turn in turns], "poses": poses.flatten(1).tolist()}
-    log = replace(log, meta={**log.meta, MOVED: path})
-    return as_aligned(log, log.meta)
+    return as_aligned(log, {MOVED: path})
 
 
 def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
@@ -122,12 +121,12 @@ def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
 
 
 def as_aligned(log: Log, meta: dict) -> Log:
-    """A log as recorded, moved as the `meta` of a log or scene says that was `aligned`; as it is where nothing was."""
+    """A log as recorded, moved as the `meta` of a log or scene says that was `aligned`, and saying so too; as it is where nothing was."""
     path = meta.get(MOVED)
     if path is None:
         return log
     poses = torch.tensor(path["poses"], dtype=torch.float64).view(-1, 4, 4)
-    return moved(log, Trajectory(torch.tensor(path["times_us"]), poses))
+    return moved(replace(log, meta={**log.meta, MOVED: path}), Trajectory(torch.tensor(path["times_us"]), poses))
 
 
 def _turns(sweeps: Sequence[Sweep]) -> list[list[Sweep]]:

@@ -13,7 +13,7 @@ import torch
 
 from recon.adjust import adjusted
 from recon.album import keep_album
-from recon.align import aligned
+from recon.align import MOVED, aligned, as_aligned
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
 from recon.exposed import exposed_by
 from recon.fit.clear import Clear
@@ -115,7 +115,7 @@ def reconstruct(
     within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     for sweep in () if saved else within:
         sweep.read()  # they are used after the fit: a damaged one is told before it
-    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size)
+    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size, saved[1].get("path") if saved else None)
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])
@@ -126,7 +126,8 @@ def reconstruct(
         return spent_before + time.monotonic() - began
 
     def keep() -> None:
-        save_checkpoint(checkpoint, options, start, fit.tensors() | {"seconds": seconds(), "live": live.curve})
+        so_far = {"seconds": seconds(), "live": live.curve, "path": {MOVED: log.meta.get(MOVED)}}
+        save_checkpoint(checkpoint, options, start, fit.tensors() | so_far)
 
     with Progress("fit", total=config.steps) as steps:
         steps.resume(fit.step_count)
@@ -174,11 +175,19 @@ def fitted(log: Log, held_out: int) -> Log:
 
 
 def readied(
-    log: Log, sweeps: Sequence[Sweep], config: FitConfig, names: Sequence[str], span: tuple[int, int], size: tuple[int, int]
+    log: Log,
+    sweeps: Sequence[Sweep],
+    config: FitConfig,
+    names: Sequence[str],
+    span: tuple[int, int],
+    size: tuple[int, int],
+    known: dict | None = None,
 ) -> Log:
-    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and the movers that sweeps show
-    where it has no boxes."""
-    if "path" in config.refine and sweeps:
+    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, or as is `known` from before
+    (`as_aligned`); and with the movers that sweeps show where it has no boxes."""
+    if known is not None:
+        log = as_aligned(log, known)
+    elif "path" in config.refine and sweeps:
         with Progress("sweeps") as steps:
             log = aligned(log, sweeps, steps.step)
     elif "path" in config.refine and log.points is None:  # else the poses come from the pictures

@@ -87,7 +87,7 @@ class Extract:
         from recon import extract_assets
 
         ids = extract_assets(self.scene, self.databank)
-        print(f"{len(ids)} assets added to {self.databank}: {', '.join(ids)}")
+        print(f"{len(ids)} assets of {self.scene} are in {self.databank}: {', '.join(ids)}")
 
 
 @dataclass

@@ -21,7 +21,7 @@ from recon.seeds.carpet import carpet
 from recon.seeds.dense import cloud_from_pictures
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
-from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, splats_from, thin
+from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
 from recon.seeds.standing import by_all_sweeps
 from recon.skies import SkyPicture, like_sky
 from recon.view import View
@@ -40,6 +40,9 @@ BEYOND_PART = 0.06
 
 ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
+
+FILLED_PART = 0.8
+"""Of the splat budget that all of these may take at most, with the ground that nobody saw and what fills holes."""
 
 SKY_HEIGHT = 256
 
@@ -122,7 +125,7 @@ def prepare(
             tracks.append(track)
             middle = track.world_from_box[:, :3, 3].numpy()
             near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)
-            reaches.append(torch.full((len(made),), spanned(rig.values()) * near))
+            reaches.append(spanned(rig.values()) * near)
 
     standing = [t for t in log.tracks if not t.moving]
     swept = Swept.by([*split.tracks, *standing], span_us, ground, split.static, taken)
@@ -132,7 +135,10 @@ def prepare(
     if exposures is None:
         exposures = torch.zeros(len(frames.names), 3, 4)
         exposures[:, :, :3] = torch.diag_embed(torch.from_numpy(gains).float())
-    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *reaches])
+    share = FILLED_PART * budget / max(1, sum(map(len, (filled, *groups))))
+    filled, *groups = (fewer(group, max(1, share * len(group))) for group in (filled, *groups))
+    of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
+    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
     told_gains = tuple(v.gain for v in frames.views)
     return Start(splats, tracks, sky, exposures, ego, ground, rig, tuple(measured), swept, told_gains)
 

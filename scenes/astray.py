@@ -30,15 +30,10 @@ def meeting(edit: Edit, scene: Scene) -> list[str]:
     after, said = replace(scene, actors=left), []
     for before in (a for a in scene.actors if a.track in changed and a.track not in edit.remove):
         actor, known = changed[before.track], collisions(scene, before)
-        said += [f"{actor.track} {line}" for line in collisions(after, actor) if not any(_alike(line, old) for old in known)]
+        said += [f"{actor.track} {line}" for what, line in collisions(after, actor).items() if what not in known]
         if before.track in edit.replace:
             said += unseen_warning(actor, seeing(actor, [scene.camera(n, int(t)) for n in scene.rig for t in scene.frame_times(n)]))
     return said
-
-
-def _alike(a: str, b: str) -> bool:
-    """Whether two sentences tell of one thing, at whatever time."""
-    return a.split()[:3] == b.split()[:3]
 
 
 def _beyond(scene: Scene, path: Trajectory) -> float:

@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 
 
@@ -29,6 +30,12 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
             error.filename = str(path)  # a full disk is told with the name that the user knows
         raise
     finally:
+        partial.unlink(missing_ok=True)
+
+
+def clear_partials(path: Path) -> None:
+    """Take away what `atomic_file` left behind where it was killed, of a file that nobody else writes now."""
+    for partial in path.parent.glob(f".{escape(path.stem)}.????????{escape(path.suffix)}"):
         partial.unlink(missing_ok=True)
 
 
@@ -67,8 +74,20 @@ def need_folder(path: Path) -> None:
     """Raise FileNotFoundError unless the folder that `path` would stand in exists, PermissionError unless it takes files."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"cannot write {path}: {path.parent.resolve()} takes no files of yours; give a folder of your own")
+    _need_access(path.parent, path)
+
+
+def made_folder(path: Path) -> Path:
+    """The folder `path`, made with those that it stands in where they are missing. PermissionError where it, or the one that it would be
+    made in, takes no files."""
+    _need_access(next(folder for folder in (path, *path.absolute().parents) if folder.is_dir()), path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _need_access(folder: Path, path: Path) -> None:
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write {path}: {folder.resolve()} takes no files of yours; give a folder of your own")
 
 
 def _umask() -> int:

@@ -29,24 +29,25 @@ FEWEST = 12
 """Splats that make something: floaters come alone."""
 
 
-def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> list[str]:
-    """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment; []
-    where its way is free."""
+def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> dict[str, str]:
+    """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment, by
+    what that is: "actor <track>", "ego", "background"; {} where its way is free."""
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     begin, end = during or (first, last)
     times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
-    found = [
-        f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment"
+    found = {
+        f"actor {other.track}": f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment"
         for other, hit in met(scene, actor, times)
-    ]
+    }
     hit = next((t for t in times if scene.ego.covers(t) and _holds(actor, scene.ego.at(t), t)), None)
     if hit is not None:
-        found.append(f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment")
+        found["ego"] = f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment"
     still = len(actor.trajectory) == 1
     if struck := into(scene, actor, times[:1] if still else times):
         hit, count = struck
         when = "" if still else f" {(hit - first) / 1e6:.1f}s after the drive's first moment"
-        found.append(f"stands in something of the background{when}: {count} solid splats lie in its box; a parked car, a wall, a tree")
+        what = f"{count} solid splats lie in its box; a parked car, a wall, a tree"
+        found["background"] = f"stands in something of the background{when}: {what}"
     return found
 
 

@@ -115,7 +115,7 @@ class Edit:
         from scenes.usd_edit import undone
 
         with ExitStack() as stack:
-            gone = stack.enter_context(undone(self.scene, self.undo)) if self.undo else []
+            gone = stack.enter_context(undone(self.scene, self.undo))
             warnings, said = self._changed() if asked else ([], [])
         for line in (*(_without(self.scene, edit) for edit in gone), *said):
             print(line)

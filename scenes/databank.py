@@ -16,6 +16,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
+import torch
+
 from scenes.asset import Asset
 from scenes.atomic import atomic_file, atomic_folder
 from scenes.gaussians import Gaussians
@@ -127,6 +129,12 @@ class Databank:
         with atomic_file(self.path / "index.json") as partial:
             partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
+
+    def same(self, asset: Asset) -> str | None:
+        """The id of an asset of the same label, source and splats, None where there is none: that which was cut out of a scene before."""
+        told = asset.label, str(asset.meta.get("source", "")), len(asset.gaussians)
+        alike = (e.id for e in self.ready() if (e.label, e.source, e.splats) == told)
+        return next((id for id in alike if torch.equal(self.load(id).gaussians.means, asset.gaussians.means)), None)
 
     def ready(self) -> list[Entry]:
         """The entries that a further one will stand beside: those that assets hold themselves, of a databank whose index was lost; none

@@ -6,9 +6,32 @@ import torch
 
 from scenes.gaussians import Gaussians
 from scenes.poses import matrix_from_quat, quat_from_matrix
+from scenes.scene import Scene
+from scenes.trajectory import Trajectory
 
 DENSEST = 0.995
 """Opacity of a merged splat at most."""
+
+ASIDE = 5.0
+"""Metres off the recorded path from which an asset is still drawn in full: half of itself, and a shift to the next lane."""
+
+NEAREST = 1.0
+"""Metres from which it is, wherever it stands."""
+
+
+def as_seen(splats: Gaussians, scene: Scene, path: Trajectory) -> Gaussians:
+    """Splats that go along a path, without what the drive's cameras cannot tell apart: that which half a pixel holds."""
+    return coarser(splats, finest_pixel(scene, path) / 2)
+
+
+def finest_pixel(scene: Scene, path: Trajectory) -> float:
+    """Metres that a pixel of the sharpest camera spans at the nearest that a body's path comes to the drive, seen from `ASIDE` nearer."""
+    if not scene.rig:
+        return 1e-3
+    focal = max(max(camera.lens.focal()) for camera in scene.rig.values())
+    moments = scene.ego.times_us[[path.covers(int(t)) for t in scene.ego.times_us]] if len(path) > 1 else scene.ego.times_us
+    gaps = [float((scene.ego.at(int(t))[:3, 3] - path.at(int(t))[:3, 3]).norm()) for t in moments]
+    return max(min(gaps, default=0.0) - ASIDE, NEAREST) / focal
 
 
 def coarser(splats: Gaussians, cell: float) -> Gaussians:

@@ -9,7 +9,7 @@ import torch
 
 from scenes.asset import Actor, Asset
 from scenes.gaussians import Gaussians
-from scenes.match import matched
+from scenes.match import at_place
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -54,7 +54,7 @@ class Edit:
 
     def apply(self, actor: Actor, scene: Scene) -> Actor:
         """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were; another asset
-        in the light of where it is at the drive's first moment, or nearest to that."""
+        as it looks where it is at the drive's first moment, or nearest to that."""
         asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
         if actor.track in self.shift:
             path = shifted(path, self.shift[actor.track], scene)
@@ -63,8 +63,7 @@ class Edit:
             deformation = deformation and deformation.later(self.retime[actor.track])
         if actor.track in self.replace:
             deformation = None  # another body bends elsewhere
-            first = int((path.times_us - scene.ego.times_us[0]).abs().argmin())
-            asset = matched(asset, scene, path.world_from_body[first, :2, 3])
+            asset = at_place(asset, scene, path, int(scene.ego.times_us[0]))
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 
 

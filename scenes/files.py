@@ -10,6 +10,7 @@ from scenes.asset import Asset
 from scenes.databank import Databank
 from scenes.formats import SUFFIXES, USD, found, named
 from scenes.gaussians import Gaussians, SplatModel
+from scenes.names import absent
 from scenes.scene import Scene
 
 KINDS = ("scene", "databank", "asset", "splats")
@@ -79,10 +80,7 @@ def kind_of(path: str | os.PathLike) -> str:
     """Which of KINDS a path is, by its name and what lies in it. FileNotFoundError or ValueError where it is none."""
     path = Path(path)
     if not path.exists():
-        from scenes.names import nearest
-
-        beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise FileNotFoundError(f"{path} does not exist.{nearest(path.name, beside)}")
+        raise FileNotFoundError(absent(path))
     if path.is_dir():
         for name, kind in (("scene.usda", "scene"), ("metadata.json", "scene"), ("index.json", "databank"), ("asset.usdc", "asset")):
             if (path / name).exists():

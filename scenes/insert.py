@@ -11,10 +11,9 @@ import torch
 
 from scenes.asset import Actor, Asset
 from scenes.collide import collisions
-from scenes.detail import coarser
 from scenes.edit import named
 from scenes.lane import Lane
-from scenes.match import matched, other_model
+from scenes.match import at_place, other_model
 from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
@@ -23,9 +22,7 @@ from scenes.trajectory import Trajectory
 
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
 LONGEST_US = 3_600_000_000  # from the clip's first frame: no drive lasts longer, and each pose takes a look at the ground
-ASIDE = 5.0  # metres off the recorded path from which an asset is still drawn in full: half of itself, and a shift to the next lane
 SIDEWAYS = 30  # degrees from its way by which what goes may be turned: beyond, no wheel drives so
-NEAREST = 1.0  # metres from which it is, wherever it stands
 
 
 @dataclass(frozen=True)
@@ -78,23 +75,12 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     elif beyond > 0:
         warnings.append(f"{placement.asset} goes {beyond:.1f} m beyond the known ground and keeps the height of its edge there")
     warnings += other_model(placement.asset, asset, scene)
-    lit = matched(asset, scene, xy[int((times - start_us).abs().argmin())])
     path = Trajectory(times, torch.stack(poses))
-    splats = coarser(lit.gaussians, finest_pixel(scene, path) / 2)  # what half a pixel holds cannot be told apart
-    marked = replace(lit, gaussians=splats, meta={**lit.meta, "inserted": True})
+    there = at_place(asset, scene, path, start_us)
+    marked = replace(there, meta={**there.meta, "inserted": True})
     actor = Actor(marked, path, _track(scene, placement.asset))
-    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us))]
+    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us)).values()]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
-
-
-def finest_pixel(scene: Scene, path: Trajectory) -> float:
-    """Metres that a pixel of the sharpest camera spans at the nearest that a body's path comes to the drive, seen from `ASIDE` nearer."""
-    if not scene.rig:
-        return 1e-3
-    focal = max(max(camera.lens.focal()) for camera in scene.rig.values())
-    moments = scene.ego.times_us[[path.covers(int(t)) for t in scene.ego.times_us]] if len(path) > 1 else scene.ego.times_us
-    gaps = [float((scene.ego.at(int(t))[:3, 3] - path.at(int(t))[:3, 3]).norm()) for t in moments]
-    return max(min(gaps, default=0.0) - ASIDE, NEAREST) / focal
 
 
 def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:

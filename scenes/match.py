@@ -12,10 +12,12 @@ from dataclasses import replace
 import torch
 
 from scenes.asset import Asset
+from scenes.detail import as_seen
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.scene import Scene
 from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.trajectory import Trajectory
 
 ASPHALT = 0.13
 """Albedo of worn asphalt: 0.1 to 0.15."""
@@ -46,6 +48,14 @@ def ground_linear(scene: Scene, xy: torch.Tensor) -> torch.Tensor | None:
         return None
     colours = rgb_from_sh(placed.gaussians.sh[near, 0][low]).clamp(0, 1)
     return linear_from_srgb(colours).median(0).values
+
+
+def at_place(asset: Asset, scene: Scene, path: Trajectory, moment_us: int) -> Asset:
+    """The asset as it looks on its path: in the light of where that is at a moment, or nearest to it, and without detail that
+    no recorded camera could show."""
+    first = int((path.times_us - moment_us).abs().argmin())
+    lit = matched(asset, scene, path.world_from_body[first, :2, 3])
+    return replace(lit, gaussians=as_seen(lit.gaussians, scene, path))
 
 
 def matched(asset: Asset, scene: Scene, xy: torch.Tensor) -> Asset:

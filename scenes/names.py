@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Iterable
+from pathlib import Path
 
 
 def nearest(name: str, options: Iterable[str]) -> str:
@@ -22,6 +23,12 @@ def unknown(kind: str, name: str, where: str, options: Iterable[str]) -> str:
     options = list(options)
     have = ", ".join(options) or "nothing"
     return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'
+
+
+def absent(path: Path) -> str:
+    """The same of a path, with the nearest that stands beside where it would be."""
+    beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    return f"{path} does not exist.{nearest(path.name, beside)}"
 
 
 def slug(label: str) -> str:

@@ -19,6 +19,7 @@ from scenes.lenses import Lens
 from scenes.scene import Scene
 
 LONGEST = 300  # letters of a list or dict on a line with others
+FIRST = "name", "licence", "attribution", "source", "clock"  # of a scene's meta, what is shown first
 SCALE_RANGE = 1e-6, 1e4  # metres: beyond, a splat is an accident of training or of units
 
 
@@ -119,7 +120,7 @@ def _about_scene(scene: Scene) -> dict:
     ]
     edits, ground = scene.meta.get("edits", []), scene.ground
     return {
-        **{key: scene.meta[key] for key in ("name", "licence", "attribution", "source") if key in scene.meta},
+        **{key: scene.meta[key] for key in FIRST if key in scene.meta},
         **_about_splats(scene.background.gaussians),
         "model": asdict(scene.model),
         "ego": {
@@ -134,7 +135,7 @@ def _about_scene(scene: Scene) -> dict:
         "ground": None if ground is None else f"{ground.heights.shape[1]}x{ground.heights.shape[0]} cells of {ground.cell:g} m",
         "edits": [{"name": e["name"], **e} for e in edits],
         "warnings": [f"edit {e['name']} is missing: its file was deleted" for e in edits if e.get("missing")],
-        "meta": {k: v for k, v in scene.meta.items() if k not in ("name", "licence", "attribution", "source", "edits")},
+        "meta": {k: v for k, v in scene.meta.items() if k not in (*FIRST, "edits")},
     }
 
 

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.asset import Actor
-from scenes.atomic import atomic_file, atomic_folder
+from scenes.atomic import atomic_file, atomic_folder, need_folder
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
@@ -35,6 +35,9 @@ BUILDERS = {
 }
 """What edits an array of a type."""
 
+ASIDE = ".undone."
+"""How a folder's name begins in which the files of edits lie that are being undone."""
+
 
 def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, half: bool = False) -> None:
     """Add actors to a scene folder as the layer edits/<name>.usda; `meta` says what the edit is, as {"kind": "insert", ...}.
@@ -45,6 +48,7 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     """
     scene = Path(scene)
     origin = int(read_metadata(scene)["origin_us"])
+    _sweep(scene)
     standing, taken = _prims(scene)
     for actor in actors:
         if actor.track in standing:
@@ -137,7 +141,9 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
     read_metadata(scene)
     root, out = scene / "scene.usda", list[Undone]()
     before = root.read_bytes()
-    with TemporaryDirectory(prefix=".undone.", dir=scene) as aside:
+    need_folder(root)
+    _sweep(scene)
+    with TemporaryDirectory(prefix=ASIDE, dir=scene) as aside:
         try:
             gone: set[str] = set()
             for name in names:
@@ -164,8 +170,15 @@ def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
     for each in (*gone.idle, name):
         drop_sublayer(scene, f"./edits/{each}.usda")
         for path in (p for p in (edits / f"{each}.usda", edits / each) if p.exists()):
+            need_folder(path)
             path.rename(aside / path.name)
     return gone
+
+
+def _sweep(scene: Path) -> None:
+    """Take away what an undoing that was killed had put aside: whatever the scene shows by then, it shows without these files."""
+    for aside in scene.glob(f"{ASIDE}*"):
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def free_name(scene: Path, wish: str) -> str:

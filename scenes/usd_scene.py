@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, Vt
 
 from scenes.asset import Actor
 from scenes.atomic import atomic_folder
@@ -33,6 +33,7 @@ from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.hdr import load_hdr, save_hdr
 from scenes.lenses import LENSES, Orthographic
+from scenes.names import absent
 from scenes.scene import Scene
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory
@@ -143,6 +144,8 @@ def is_scene(path: Path) -> bool:
 def read_metadata(path: Path) -> dict:
     """metadata.json of a scene folder. FileNotFoundError or ValueError saying what is wrong with it."""
     file = path / "metadata.json"
+    if not path.exists():
+        raise FileNotFoundError(absent(path))
     if not file.is_file():
         raise FileNotFoundError(f"{path} is not a Sidestep scene: it has no metadata.json")
     try:
@@ -168,15 +171,24 @@ def read_edits(stage: Usd.Stage) -> list[dict]:
 
 
 def _check_edits(stage: Usd.Stage, path: Path) -> None:
-    """ValueError where an edit's layer is there, and USD left it or one below it out, or it ends with its header and says nothing."""
+    """ValueError where an edit's layer is there, and it or a file that it refers to is missing, damaged, or ends with its header."""
     root = stage.GetRootLayer()
     for sub in (s for s in root.subLayerPaths if s != RECORDED and (path / s).exists()):
         layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
-        below = {path / "edits" / s: Sdf.Layer.Find(layer.ComputeAbsolutePath(s)) for s in layer.subLayerPaths} if layer else {}
-        for file in (file for file, found in {path / sub: layer, **below}.items() if not found or not found.GetPrimAtPath("/World")):
+        below = layer.GetCompositionAssetDependencies() if layer else ()
+        for file in (f for f in (path / sub, *(path / "edits" / s for s in below)) if not _says_something(f)):
             how, name = "damaged" if file.exists() else "missing", Path(sub).stem
             fix = f"restore it, or undo the edit: sidestep edit {path} --undo {name}"
             raise ValueError(f"{file} is {how}, so the edit {name} cannot be applied; {fix}")
+
+
+def _says_something(file: Path) -> bool:
+    """Whether a layer is there, can be read, and has a prim."""
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(file))
+    except Tf.ErrorException:
+        return False
+    return bool(layer and layer.rootPrims)
 
 
 def defines(layers: Iterable[Sdf.Layer], prim: Usd.Prim) -> bool:

@@ -77,10 +77,11 @@ class Candidate:
 
 def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]:
     """Cut movers and parked vehicles out of a scene, store those that are good enough, and return their ids, best first: those of which
-    the fewest sides are unseen, and of these those of the most splats. A scene folder's are cut out as recorded, whatever was edited
-    since; where it keeps its photos, each asset keeps those that show it, and one that is half hidden in all of them is not good enough.
+    the fewest sides are unseen, and of these those of the most splats. What was cut out of this scene before keeps its id. A scene folder's
+    are cut out as recorded, whatever was edited since; where it keeps its photos, each asset keeps those that show it, and one that is half
+    hidden in all of them is not good enough.
 
-    What is left out is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
+    What is left out, or kept, is said on stderr with its reason. Raises ValueError where `scene` is no scene, or nothing in it is usable.
     """
     bank = Databank(databank)
     bank.ready()  # before the scene is looked through, which takes long
@@ -104,7 +105,9 @@ def extract_assets(scene: Scene | str | Path, databank: str | Path) -> list[str]
             print(f"left out {candidate.track} ({candidate.asset.label}): {flaw}", file=sys.stderr)
         else:
             asset = closed(replace(candidate.evenly_lit(), photos=photos))
-            ids.append(bank.add(asset, thumbnail(asset)))
+            if known := bank.same(asset):
+                print(f"kept {known} as it is: {candidate.track} was cut out of this scene before", file=sys.stderr)
+            ids.append(known or bank.add(asset, thumbnail(asset)))
     if not ids:
         raise ValueError(f"no object of {scene.meta.get('name', 'the scene')} is good enough for an asset; {len(found)} were looked at")
     return ids

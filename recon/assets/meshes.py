@@ -11,6 +11,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from recon.assets.gltf_mesh import SUFFIXES as GLTF
+from recon.assets.gltf_mesh import load_gltf
 from recon.assets.looking import looking_at
 from render import Frame, rasterize
 from render.compare import decibels
@@ -24,7 +26,6 @@ from scenes.match import ASPHALT
 from scenes.poses import matrix_from_quat, quat_from_matrix
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
-GLTF = (".glb", ".gltf")
 SUFFIXES = (*GLTF, ".obj", ".ply", ".stl", ".off")
 MODEL = SplatModel(projection="ewa")
 
@@ -58,7 +59,7 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
-        loaded = trimesh.load(path, process=False)
+        loaded = load_gltf(path) if path.suffix.lower() in GLTF else trimesh.load(path, process=False)
     except Exception as problem:  # trimesh's readers raise whatever their formats' libraries do
         why = f"{type(problem).__name__}: {problem}"
         raise ValueError(f"{path} does not read as a mesh ({why}); .glb with its textures inside is best") from None
@@ -75,7 +76,7 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     starts = np.cumsum([0, *(len(v) for v in vertices)])
     # copies, as dump makes them, have lost the vertex colours that come on top of a material
     visuals = [loaded.geometry[p.metadata["name"]].visual if isinstance(loaded, trimesh.Scene) else p.visual for p in parts]
-    looks = [_look(v, p.faces, path.suffix.lower() in GLTF) for v, p in zip(visuals, parts, strict=True)]
+    looks = [_look(v, p.faces) for v, p in zip(visuals, parts, strict=True)]
     mesh = Mesh(
         vertices=(np.concatenate(vertices) - base).astype(np.float32),
         faces=np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=False)]).astype(np.int32),
@@ -108,7 +109,7 @@ def turn_to_asset(up: str, forward: str) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _look(visual, faces: np.ndarray, gltf: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _look(visual, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of what trimesh says how faces `[F, 3]` look: texture coordinates `[F, 3, 2]` of their corners, v down, tints `[F, 3, 4]` there, and
     the texture uint8 `[H, W, 4]`; one texel where they have one colour."""
     middle, plain = np.full((len(faces), 3, 2), 0.5), np.ones((len(faces), 3, 4))
@@ -119,11 +120,10 @@ def _look(visual, faces: np.ndarray, gltf: bool) -> tuple[np.ndarray, np.ndarray
         tints = plain if colours is None else _tints(np.asarray(colours)[faces], linear=True, opaque=_is_opaque(visual.material))
         return np.stack([uv[..., 0], 1 - uv[..., 1]], -1), tints, _texture(visual.material)
     if visual.kind == "vertex":
-        # what has no material has glTF's default one, which is opaque
-        return middle, _tints(np.asarray(visual.vertex_colors)[faces], linear=gltf, opaque=gltf), white
+        return middle, _tints(np.asarray(visual.vertex_colors)[faces], linear=False, opaque=False), white
     if visual.kind == "face":
         return middle, _tints(np.repeat(np.asarray(visual.face_colors)[:, None], 3, 1), linear=False, opaque=False), white
-    return middle, plain, white if gltf else np.array([[[180, 180, 180, 255]]], np.uint8)
+    return middle, plain, np.array([[[180, 180, 180, 255]]], np.uint8)
 
 
 def _tints(colours: np.ndarray, linear: bool, opaque: bool) -> np.ndarray:

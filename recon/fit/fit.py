@@ -26,12 +26,13 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at
 from recon.fit.turns import Turns
-from recon.fit.unseen import LOW, above, as_neighbours, curtains, footprint, shown_parts
+from recon.fit.unseen import LOW, above, as_neighbours, curtains, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
+from recon.seeds.points import fewer
 from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
@@ -274,8 +275,9 @@ class Fit:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
             which = self._in_sight(view, camera, [], None)
             placed = self._placed(self.splats.select(which, 1), view, camera)
-            part[which] = torch.maximum(part[which], torch.cat(shown_parts(placed, camera)))
-            inside[which] |= torch.cat([footprint(p, camera) > 0 for p in placed])
+            shown, within = shown_parts(placed, camera)
+            part[which] = torch.maximum(part[which], shown)
+            inside[which] |= within
         stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         part = part[stays]
@@ -340,6 +342,7 @@ class Fit:
             cameras = [self.motion.camera(v) for v in views]
             search = Search(views, cameras, gain, self.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
+                more = fewer(more, max(0, self.config.budget - len(self.splats)))
                 reach = reach_of(more, path, self.motion.rig).to(self.device)
                 self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
 

@@ -31,17 +31,18 @@ NEIGHBOURS = 16
 """Splats of known colour beside one of unknown, whose mean it is given."""
 
 
-def shown_parts(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
-    """Of each group's splats `[N]`, the part of its weight that a picture shows, what stands before it taken off; 0 where its middle is
-    out of the picture. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture (`footprint`)."""
+def shown_parts(placed: Sequence[Placed], camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of all groups' splats `[N]`, the part of its weight that a picture shows, what stands before it taken off, and whether its middle is
+    in the picture, without which that part is 0. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture
+    (`footprint`)."""
     groups = [p.gaussians.detach() for p in placed]
     blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
     drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
     with torch.enable_grad():
         (rgb,) = draw(drawn, camera, "rgb")
         weights = torch.autograd.grad(rgb[..., 0].sum() / C0, blank)
-    wholes = [footprint(p, camera) for p in placed]
-    return [torch.where(whole > 0, w[:, 0, 0] / whole, 0.0) for w, whole in zip(weights, wholes, strict=True)]
+    whole = torch.cat([footprint(p, camera) for p in placed])
+    return torch.where(whole > 0, torch.cat(weights)[:, 0, 0] / whole, 0.0), whole > 0
 
 
 def footprint(placed: Placed, camera: Camera) -> torch.Tensor:

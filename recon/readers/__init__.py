@@ -12,7 +12,7 @@ from recon.readers.kitti import is_kitti_odometry, is_kitti_raw, lacks_oxts, rea
 from recon.readers.ncore import is_ncore, read_ncore
 from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
-from recon.readers.photos import is_photos, is_video, read_photos
+from recon.readers.photos import check_enough, is_photos, is_video, read_photos
 from recon.readers.waymo import is_waymo, read_waymo
 from recon.recorder import without_recorder
 from recon.sound import sound
@@ -42,6 +42,7 @@ def open_log(
     if is_video(path):
         return sound(read_photos(path, camera_height, metres_per_unit, angle_of_view))
     if not path.is_dir():
+        check_enough(path)
         raise FileNotFoundError(f"{path} is neither a folder nor a video; give the folder of one drive, as pandaset/002")
     if find_model(path) is not None:
         _knows_its_lenses(path, angle_of_view)
@@ -51,6 +52,8 @@ def open_log(
     if lacks_oxts(path):
         raise FileNotFoundError(f"{path / 'oxts'} is missing; it says where a KITTI drive's car was: fetch it too")
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
+    if not inside:
+        check_enough(path)
     hint = f" Did you mean {inside[0]}?" if inside else ""
     raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")
 

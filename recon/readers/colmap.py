@@ -6,7 +6,6 @@ left, z up.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ import torch
 from recon.log import Log, LogCamera, SparsePoints, image_size
 from recon.readers.gauge import find_gauge
 from recon.readers.moments import moments_of
+from recon.readers.order import names_apart
 from recon.readers.sfm import Model, ModelCamera, is_model, read_model
 from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
@@ -51,7 +51,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     model = read_model(where)
     names = camera_names(model)
     lead = _lead(model)
-    moments = moments_of(where, model, lead)
+    moments, clock = moments_of(where, model, lead)
     poses = np.stack([np.linalg.inv(i.cam_from_world) for i in model.images])
     gauge = find_gauge(poses[[i.camera == lead for i in model.images]], model.xyz, camera_height, metres_per_unit)
     placed = gauge.poses(poses)
@@ -90,6 +90,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         "source": f"COLMAP model of {len(model.images)} pictures in {about.name}",
         "body": f"camera {names[lead]}, turned to x forward, y left, z up",
         "metric": gauge.metric,
+        "clock": clock,
         "world_from_model": {"rotation": gauge.rotation.tolist(), "origin": gauge.origin.tolist(), "scale": gauge.scale},
     }
     observed = any(len(shown) for frames in seen.values() for shown in frames)
@@ -134,7 +135,8 @@ def colmap_lens(lens: Lens, where: Path) -> tuple[str, tuple[float, ...]]:
 
 
 def camera_names(model: Model) -> dict[int, str]:
-    """A name for every camera that took a picture: "camera" for the only one, else its pictures' folder, else camera_<id>.
+    """A name for every camera that took a picture: "camera" for the only one, else what its pictures' names call it (`names_apart`), else
+    camera_<id>.
 
     ValueError where nearly every picture has a camera of its own: one lens a picture is no rig.
     """
@@ -144,11 +146,7 @@ def camera_names(model: Model) -> dict[int, str]:
     if len(model.images) < 2 * len(taken):
         fix = "let COLMAP share one: colmap feature_extractor --ImageReader.single_camera 1"
         raise ValueError(f"the model has {len(taken)} cameras for {len(model.images)} pictures; {fix}")
-    folders = {key: {str(Path(n).parent) for n in some} for key, some in taken.items()}
-    flat = [next(iter(f)) for f in folders.values() if len(f) == 1]
-    if len(set(flat)) == len(taken) and "." not in flat:
-        return {key: re.sub(r"\W", "_", next(iter(f))) for key, f in folders.items()}
-    return {key: f"camera_{key}" for key in taken}
+    return names_apart(taken) or {key: f"camera_{key}" for key in taken}
 
 
 def _lead(model: Model) -> int:

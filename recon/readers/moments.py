@@ -15,6 +15,9 @@ from recon.readers.sfm import Model
 STEP_US = 500_000
 """From one picture to the next, where nobody says."""
 
+MADE_UP = f"made up, {STEP_US / 1e6:g} s from one picture to the next; a times.json beside the model would tell it"
+"""The clock then, in words."""
+
 FASTEST_US = 100
 """Microseconds between a picture and the next, below which a clock counts seconds or milliseconds."""
 
@@ -24,9 +27,10 @@ SINCE, UNTIL, DAY_S = 900_000_000, 4_100_000_000, 86_400
 Name = tuple[Decimal | str, ...]
 
 
-def moments_of(where: Path, model: Model, lead: int) -> list[int]:
-    """Microseconds of every picture of the model in the folder `where`: as its times.json says, or as their names, where these are times
-    since 1970 (in seconds, or thousandths, millionths or billionths), else half a second apart in the order of the numbers in their names.
+def moments_of(where: Path, model: Model, lead: int) -> tuple[list[int], str]:
+    """Microseconds of every picture of the model in the folder `where`, and who says so: its times.json, or their names, where these are
+    times since 1970 (in seconds, or thousandths, millionths or billionths), else half a second apart in the order of the numbers in their
+    names, by nobody.
 
     Those of one frame of a rig share a moment, as do those of several cameras whose names differ in what all of one camera's have alone
     (front_001.png, 001/left.png). Where what differs else is one number, and cameras do not share them, pictures of other cameras were
@@ -34,15 +38,15 @@ def moments_of(where: Path, model: Model, lead: int) -> list[int]:
     """
     clock = where / "times.json"
     if clock.is_file():
-        moments, fix = _by_clock(clock, model), f"give them different times in {clock}"
+        moments, told, fix = _by_clock(clock, model), clock.name, f"give them different times in {clock}"
     else:
-        moments, fix = _by_name(model, lead), f"give microseconds by picture name in {clock}"
+        (moments, told), fix = _by_name(model, lead), f"give microseconds by picture name in {clock}"
     taken: dict[tuple[int, int], str] = {}
     for image, moment in zip(model.images, moments, strict=True):
         other = taken.setdefault((image.camera, moment), image.name)
         if other != image.name:
             raise ValueError(f"{where} has one camera take {other} and {image.name} at one moment; {fix}")
-    return moments
+    return moments, told
 
 
 def _by_clock(clock: Path, model: Model) -> list[int]:
@@ -58,22 +62,22 @@ def _by_clock(clock: Path, model: Model) -> list[int]:
     return moments
 
 
-def _by_name(model: Model, lead: int) -> list[int]:
+def _by_name(model: Model, lead: int) -> tuple[list[int], str]:
     names = _without_cameras(model)
     numbers = [name[0] for name in names if len(name) == 1 and isinstance(name[0], Decimal)]
     told = not model.rigid and len(numbers) == len(names)
     if told and (unit := _unit(numbers)) is not None:
-        return [round((number - min(numbers)) * unit) for number in numbers]
+        return [round((number - min(numbers)) * unit) for number in numbers], "times in the pictures' names"
     others = [name for name, i in zip(names, model.images, strict=True) if i.camera != lead]
     leading = {name for name, i in zip(names, model.images, strict=True) if i.camera == lead}
     if told and others and 2 * sum(name in leading for name in others) < len(others):
-        return _between(numbers, sorted(name[0] for name in leading if isinstance(name[0], Decimal)))
+        return _between(numbers, sorted(name[0] for name in leading if isinstance(name[0], Decimal))), MADE_UP
     keys: list[Hashable] = [i.frame for i in model.images] if model.rigid else list(names)
     first: dict[Hashable, Name] = {}
     for key, name in zip(keys, names, strict=True):
         first.setdefault(key, name)
     order = {key: i for i, key in enumerate(sorted(first, key=lambda k: _sorting(first[k])))}
-    return [order[key] * STEP_US for key in keys]
+    return [order[key] * STEP_US for key in keys], MADE_UP
 
 
 def _without_cameras(model: Model) -> list[Name]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.readers.order import names_apart
 from render.progress import Progress
 
 WORSE = 2.0, 1.0
@@ -21,12 +22,20 @@ WORSE = 2.0, 1.0
 FIX = "Let COLMAP find one for those of one lens: colmap feature_extractor --ImageReader.single_camera_per_folder 1"
 
 
+FEW = 5
+"""Pictures to a camera, below which they are no rig's unless their names tell its cameras apart."""
+
+
 def is_one_a_picture(found) -> bool:
-    """Whether nearly every registered picture of a COLMAP reconstruction has a camera of its own, and they are no rig."""
-    pictures = [image for image in found.images.values() if image.has_pose]
-    cameras = {image.camera_id for image in pictures}
-    rigid = any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values())
-    return len(cameras) > 1 and len(pictures) < 2 * len(cameras) and not rigid
+    """Whether nearly every registered picture of a COLMAP reconstruction, or every `FEW`, has a camera of its own, and they are no rig."""
+    taken: dict[int, list[str]] = defaultdict(list)
+    for image in found.images.values():
+        if image.has_pose:
+            taken[image.camera_id].append(image.name)
+    pictures, rigid = sum(map(len, taken.values())), any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values())
+    if len(taken) < 2 or rigid:
+        return False
+    return pictures < 2 * len(taken) or (pictures < FEW * len(taken) and names_apart(taken) is None)
 
 
 def share_lenses(colmap, found, folder: Path):
@@ -36,7 +45,7 @@ def share_lenses(colmap, found, folder: Path):
     if all(np.allclose(found.cameras[key].params, shared.cameras[lens].params, rtol=1e-6) for key, lens in lens_of.items()):
         return shared
     if not shared.points3D:
-        raise ValueError(f"{folder} has a camera for each picture and no points by which they could share one; {FIX}")
+        raise ValueError(f"{folder} has a camera for each picture or few and no points by which they could share one; {FIX}")
     found.update_point_3d_errors()
     before = found.compute_mean_reprojection_error()
     with Progress("one lens") as steps:
@@ -53,7 +62,7 @@ def share_lenses(colmap, found, folder: Path):
         steps.step(note=f"points are {before:.2f} pixels off with one each, {after:.2f} with one for all")
     if not after < max(WORSE[0] * before, before + WORSE[1]):
         what = f"its points are {before:.3g} pixels off, with one for all {after:.3g}"
-        raise ValueError(f"{folder} has a lens for each picture, {what}: they are of several lenses, or zoomed. {FIX}")
+        raise ValueError(f"{folder} has a lens for each picture or few, {what}: they are of several lenses, or zoomed. {FIX}")
     return shared
 
 

@@ -41,6 +41,14 @@ def is_photos(path: Path) -> bool:
     return path.is_dir() and len(_photos(path)) >= FEWEST
 
 
+def check_enough(path: Path) -> None:
+    """ValueError where a path is a photo, or holds photos, but fewer than a world can be made of."""
+    count = len(_photos(path)) if path.is_dir() else int(path.is_file() and path.suffix.lower() in PHOTOS)
+    if 0 < count < FEWEST:
+        what = f"{'holds' if path.is_dir() else 'is'} {count} photo{'s' * (count > 1)}"
+        raise ValueError(f"{path} {what}, and a world is made of at least {FEWEST} of one place; give a folder of as many")
+
+
 def _photos(path: Path) -> list[Path]:
     """A folder's photos in the order they were taken in; what a Mac leaves on a foreign disk (._01.jpg) is none."""
     found = [p for p in path.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith(".")]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -156,6 +157,15 @@ def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray
     cell = np.floor(xyz / side[:, None]).astype(np.int64) + (1 << 17)
     key = (level << 54) | (cell[:, 0] << 36) | (cell[:, 1] << 18) | cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1]), side
+
+
+def fewer(splats: Gaussians, count: float) -> Gaussians:
+    """At most so many of the splats, evenly taken, and as much wider as they are fewer."""
+    if len(splats) <= count:
+        return splats
+    chosen = torch.linspace(0, len(splats) - 1, int(count)).round().long()
+    some = splats.select(chosen)
+    return replace(some, log_scales=some.log_scales + math.log(len(splats) / max(len(some), 1)) / 2)
 
 
 def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndarray | float) -> Gaussians:

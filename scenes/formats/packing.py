@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +12,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from scenes.gaussians import Gaussians
+from scenes.gaussians import SH_COUNTS, Gaussians
+from scenes.opening import warn
 
 LOGIT_LIMIT = 15.0  # opacities of 0 and 1 have no finite logit; here they are this far from it
 FLAT = -13.8  # log scale of an axis along which a splat has no extent at all: a micrometre
 MOST_BYTES = 1024  # unpacked bytes for each byte of a compressed file: more is a lie of the header, or a bomb
+
+
+def kept_harmonics(count: int, path: str | os.PathLike) -> int:
+    """How many of a splat's `count` harmonics are kept, those of degree 3 at most; a warning where a file has more."""
+    if count > SH_COUNTS[-1]:
+        warn([f"{path} has harmonics of degree {math.isqrt(count) - 1}; those beyond degree {len(SH_COUNTS) - 1} are left out"])
+    return min(count, SH_COUNTS[-1])
 
 
 def opacities_from(logits: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from scenes.atomic import atomic_file
-from scenes.formats.packing import FLAT, LOGIT_LIMIT, logits_from, opacities_from
+from scenes.formats.packing import FLAT, LOGIT_LIMIT, kept_harmonics, logits_from, opacities_from
 from scenes.gaussians import SH_COUNTS, Gaussians
 from scenes.harmonics import sh_from_rgb
 
@@ -61,7 +61,7 @@ def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     order, elements, offset = read_header(path)
     fields, rest = _check_splats(path, elements)
     vertices = _read_vertices(path, order, elements, offset)
-    n, k = len(vertices), min(SH_COUNTS[-1], 1 + rest // 3)
+    n, k = len(vertices), kept_harmonics(1 + rest // 3, path)
     values = {name: np.empty((n, len(names)), np.float32) for name, names in fields.items() if name not in ("dc", "rgb")}
     sh, higher = np.empty((n, k, 3), np.float32), [f"f_rest_{i}" for i in range(rest)]
     for start in range(0, n, _ROWS):  # one pass over the file, in parts that stay in the processor's cache

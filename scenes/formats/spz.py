@@ -17,7 +17,18 @@ from pathlib import Path
 import numpy as np
 
 from scenes.atomic import atomic_file
-from scenes.formats.packing import BYTE_LOGITS, MOST_BYTES, assembled, drop_largest, levels, opacities_from, restore_largest, stored, unit
+from scenes.formats.packing import (
+    BYTE_LOGITS,
+    MOST_BYTES,
+    assembled,
+    drop_largest,
+    kept_harmonics,
+    levels,
+    opacities_from,
+    restore_largest,
+    stored,
+    unit,
+)
 from scenes.gaussians import SH_COUNTS, Gaussians
 
 _MAGIC = b"NGSP"
@@ -50,7 +61,7 @@ def unpacked(data: bytes, path: str) -> Gaussians:
     fixed = np.zeros((n * 3, 4), np.uint8)
     fixed[:, 1:] = positions.reshape(n * 3, 3)  # in the upper bytes of an int32, so that the sign is where it belongs
     means = fixed.view("<i4").reshape(n, 3).astype(np.float32) * np.float32(2.0 ** -(8 + fraction))
-    kept = min(k, SH_COUNTS[-1])
+    kept = kept_harmonics(k, path)
     sh = np.empty((n, kept, 3), np.float32)
     sh[:, 0] = ((np.arange(256) / 255 - 0.5) / _COLOUR).astype(np.float32)[colours].reshape(n, 3)
     sh[:, 1:] = ((np.arange(256) - 128) / 128).astype(np.float32)[harmonics.reshape(n, k - 1, 3)[:, : kept - 1]]

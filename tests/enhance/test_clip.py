@@ -147,6 +147,21 @@ def test_a_folder_of_pictures_becomes_one(tmp_path, pictures, capsys):
         enhance_video(tmp_path / "empty", tmp_path / "other", Marking())
 
 
+@pytest.mark.parametrize(
+    ("picture", "said"),
+    [
+        (np.full((34, 50, 4), 90, np.uint8), "of f8.png its alpha channel\n"),
+        (np.full((34, 50), 3000, np.uint16), "of f8.png all beyond 8 bits of its values\n"),
+        (np.full((34, 50, 3), 90, np.uint8), ""),
+    ],
+)
+def test_what_a_pictures_enhanced_one_lacks_is_said(tmp_path, pictures, capsys, picture, said):
+    Image.fromarray(picture).save(pictures / "f8.png")
+    enhance_video(pictures, tmp_path / "out", Marking())
+    errors = capsys.readouterr().err
+    assert said in errors and ("is without what" in errors) == bool(said)
+
+
 def ids(kind: str, number: int) -> np.ndarray | Image.Image:
     """Object 7 in the columns from `number` on."""
     array = np.zeros((34, 50), np.int32)

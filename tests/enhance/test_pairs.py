@@ -1,8 +1,10 @@
 """Pairs of a made-up street: its "recording" is rendered from it."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -367,6 +369,12 @@ def test_a_clip_that_is_there_is_not_made_again_of_other_things(street, recordin
     claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of shadow": "['a.hdr']"})
     with pytest.raises(ValueError, match="holds pairs of another skies of relight"):
         claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "['a.hdr']"})
+
+
+def test_pairs_in_a_folder_that_takes_no_files_are_refused_before_anything_is_made(tmp_path, street, recording, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)  # root may write anywhere
+    with pytest.raises(PermissionError, match="cannot write .*/new/pairs: .* takes no files of yours; give a folder of your own"):
+        claim_pairs(tmp_path / "new" / "pairs", street, recording, 0, CONFIG)
 
 
 def test_photos_become_pairs_that_are_held_out_and_told_their_region(tmp_path):

@@ -358,6 +358,23 @@ def test_torchscript_that_does_not_run_or_is_cut_off_is_refused(tmp_path):
         open_public(path)
 
 
+def test_torchscript_of_something_else_is_refused_before_its_first_frame(tmp_path):
+    class Pair(torch.nn.Module):
+        def forward(self, x, y):
+            return x, y
+
+    class Mute(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.ones(1))
+
+    path = tmp_path / "other.pt"
+    for module, said in ((Pair(), r"takes Tensor, Tensor and gives Tuple\[Tensor, Tensor\]"), (Mute(), "takes nothing and gives nothing")):
+        torch.jit.save(torch.jit.script(module), path)
+        with pytest.raises(ValueError, match=f"other.pt is a TorchScript that {said}, where an enhancer takes one tensor and gives one"):
+            open_public(path)
+
+
 class Ladder(Model):
     """Leaves pictures as they are; notes the sizes that it saw."""
 

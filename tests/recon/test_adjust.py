@@ -7,6 +7,8 @@ from painted import SIZE, drive
 
 from recon.adjust import adjusted
 from recon.align import MOVED, about, as_aligned, moved
+from recon.build import readied
+from recon.fit.config import FitConfig
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -34,7 +36,7 @@ def steps_off(log, truth) -> tuple[float, float]:
     return float(off[:, :3, 3].norm(dim=1).mean()), float(torch.rad2deg(angle).mean())
 
 
-def test_poses_that_jitter_are_put_where_pictures_meet(bare, jittered, capsys):
+def test_poses_that_jitter_are_put_where_pictures_meet(bare, jittered, capsys, monkeypatch):
     name = next(iter(bare.cameras))
     better = adjusted(jittered, name, ALL, SIZE)
     assert "its pictures meet within" in capsys.readouterr().err
@@ -43,7 +45,11 @@ def test_poses_that_jitter_are_put_where_pictures_meet(bare, jittered, capsys):
     there, was = (log.ego.world_from_body[:, :3, 3] for log in (better, jittered))
     assert (there - was).mean(0).norm() < 0.01, "the world stays where it is"
     again = as_aligned(jittered, {MOVED: better.meta[MOVED]})
-    assert torch.equal(again.ego.world_from_body, better.ego.world_from_body)
+    assert torch.equal(again.ego.world_from_body, better.ego.world_from_body) and again.meta[MOVED] == better.meta[MOVED]
+    monkeypatch.setattr("recon.build.adjusted", lambda *_: pytest.fail("sought where pictures meet again"))
+    resumed = readied(jittered, (), FitConfig(), [name], ALL, SIZE, {MOVED: better.meta[MOVED]})
+    assert torch.equal(resumed.ego.world_from_body, better.ego.world_from_body)
+    assert readied(jittered, (), FitConfig(), [name], ALL, SIZE, {MOVED: None}) is jittered
 
 
 def test_poses_by_which_pictures_meet_stay_as_they_are(bare, jittered):

@@ -126,6 +126,17 @@ def test_parked_cars_and_movers_become_assets_and_the_rest_is_said(parked_street
     assert "left out veh_8: no camera saw it from within 20 m" in capsys.readouterr().err
 
 
+def test_what_was_extracted_before_is_kept_and_not_doubled(parked_street, tmp_path, capsys):
+    ids = extract_assets(parked_street, tmp_path / "bank")
+    capsys.readouterr()
+    assert extract_assets(parked_street, tmp_path / "bank") == ids
+    assert [e.id for e in Databank(tmp_path / "bank").entries()] == sorted(ids)
+    assert f"kept {ids[0]} as it is" in capsys.readouterr().err
+    other = replace(parked_street.background.gaussians, means=parked_street.background.gaussians.means + 1e-3)
+    anew = extract_assets(replace(parked_street, background=replace(parked_street.background, gaussians=other)), tmp_path / "bank")
+    assert set(anew) - set(ids), "a car of another fit is another one"
+
+
 def _shots(scene):
     """What the scene's cameras see, twice as bright as it is: its photos, in other light."""
 

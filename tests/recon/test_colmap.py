@@ -50,6 +50,7 @@ def test_a_workspace_reads_as_its_pictures_were_taken(workspace, street):
     torch.testing.assert_close(relative(camera.world_from_cam), relative(truth), atol=1e-6, rtol=0)
     assert [f.name for f in camera.files] == [f"{i:03d}.png" for i in range(12)] and camera.image(3).shape == (54, 96, 3)
     assert log.sweeps == () and log.meta["metric"] is True and camera.times_us.diff().unique().tolist() == [500_000]
+    assert log.meta["clock"].startswith("made up, 0.5 s from one picture to the next")
 
 
 def test_z_is_up_and_the_body_looks_ahead_whatever_way_the_model_lies(workspace):
@@ -176,7 +177,7 @@ def test_two_cameras_in_two_parts_of_a_drive_share_moments_part_by_part(street, 
     pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
     names = [layout.format(camera=c, part="ab"[i // 2], i=i % 2) for c in pair for i in range(4)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert [len(camera) for camera in log.cameras.values()] == [4, 4]
+    assert {name: len(camera) for name, camera in log.cameras.items()} == {"front": 4, "left": 4}
     for camera in log.cameras.values():
         assert camera.times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
         assert [f.parts[-3:] for f in camera.files] == sorted(f.parts[-3:] for f in camera.files)
@@ -209,7 +210,8 @@ def test_pictures_of_another_size_than_the_models_are_named_with_the_fix(own):
 def test_a_clock_beside_the_model_is_read(own):
     names = sorted(p.name for p in (own / "images").iterdir())
     (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * i for i, n in enumerate(names)}))
-    assert open_log(own).camera("camera").times_us.diff().unique().tolist() == [40_000]
+    log = open_log(own)
+    assert log.camera("camera").times_us.diff().unique().tolist() == [40_000] and log.meta["clock"] == "times.json"
     (own / "sparse/0/times.json").write_text(json.dumps({names[0]: 0}))
     with pytest.raises(ValueError, match="times.json must give whole microseconds"):
         open_log(own)
@@ -258,14 +260,14 @@ def test_a_lens_that_is_not_read_is_named_with_the_fix(own):
 
 
 def lens_each(folder, focals):
-    """A text model of one lens, given a lens for each picture with these focal lengths in its place."""
+    """A text model of one lens, given lenses with these focal lengths in its place, which its pictures have by turns."""
     model = folder / "sparse/0"
     _, kind, width, height, _, _, cx, cy = (model / "cameras.txt").read_text().splitlines()[0].split()
     (model / "cameras.txt").write_text("".join(f"{k} {kind} {width} {height} {f} {f} {cx} {cy}\n" for k, f in enumerate(focals, 1)))
     lines = (model / "images.txt").read_text().splitlines()
-    for k in range(len(focals)):
+    for k in range(len(lines) // 2):
         words = lines[2 * k].split()
-        lines[2 * k] = " ".join([*words[:8], str(k + 1), words[9]])
+        lines[2 * k] = " ".join([*words[:8], str(k % len(focals) + 1), words[9]])
     (model / "images.txt").write_text("\n".join(lines) + "\n")
 
 
@@ -280,6 +282,16 @@ def test_photos_that_have_a_lens_each_share_one(own, workspace):
     torch.testing.assert_close(relative(camera.world_from_cam)[:, :3, :3], relative(as_one.world_from_cam)[:, :3, :3], atol=2e-3, rtol=0)
     before, after = (sum(map(len, one.points.seen["camera"])) for one in (open_log(workspace), log))
     assert 0.95 * before < after <= before  # points that one picture shows are held by nothing
+
+
+def test_photos_of_which_a_few_have_a_lens_each_are_no_rig(own):
+    lens_each(own, [57.6] * 4)
+    log = open_log(own, metres_per_unit=1.0)
+    assert list(log.cameras) == ["camera"] and len(log.camera("camera")) == 12
+    (own / "sparse/0/images.txt").write_text(re.sub(r"([1-4]) (\d+.png)", r"\1 c\1_\2", (own / "sparse/0/images.txt").read_text()))
+    for file in (own / "images").iterdir():
+        file.rename(file.with_name(f"c{int(file.stem) % 4 + 1}_{file.name}"))
+    assert list(open_log(own, metres_per_unit=1.0).cameras) == ["c1", "c2", "c3", "c4"], "by their names they are one"
 
 
 def test_lenses_that_are_alike_are_one_without_points_too(own):
@@ -336,7 +348,7 @@ def test_photos_through_several_lenses_are_refused(own):
         seen = np.array(lines[k].split(), dtype=float).reshape(-1, 3)
         lines[k] = " ".join(f"{2 * u - 48} {2 * v - 27} {int(p)}" for u, v, p in seen)
     images.write_text("\n".join(lines) + "\n")
-    with pytest.raises(ValueError, match=r"a lens for each picture, its points are .* pixels off.*zoomed"):
+    with pytest.raises(ValueError, match=r"a lens for each picture or few, its points are .* pixels off.*zoomed"):
         open_log(own)
 
 
@@ -415,6 +427,7 @@ def test_pictures_of_one_moment_are_known_by_what_differs_in_a_cameras_names(str
     names = [layout.format(camera=c, number=k + 1, i=i) for k, c in enumerate(pair) for i in range(4)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names), metres_per_unit=1 / UNIT)
     assert [c.times_us.tolist() for c in log.cameras.values()] == [[0, 500_000, 1_000_000, 1_500_000]] * 2
+    assert list(log.cameras) == (["cam1", "cam2"] if "{number}" in layout else ["front", "left"])
     front, left = log.cameras
     rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
     apart = inverse(rig[front].body_from_cam) @ rig[left].body_from_cam
@@ -431,14 +444,15 @@ def test_names_that_are_times_are_a_clock(street, tmp_path, name, capsys):
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
     assert log.cameras["front"].times_us.tolist() == [0, 100_000, 200_000, 300_000]
     assert log.cameras["left"].times_us.tolist() == [20_000, 120_000, 220_000, 320_000] and not capsys.readouterr().err
+    assert log.meta["clock"] == "times in the pictures' names"
 
 
 def test_pictures_that_another_camera_took_before_or_after_the_first_are_named(street, tmp_path, capsys):
     pair = {"front": pictures_along(street, count=5), "left": pictures_along(street, "left_camera", count=5)}
     names = [f"{c}_{i + 2 * k:03d}.png" for k, c in enumerate(pair) for i in range(5)]
     log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["camera_2"]) == 3
-    assert "2 of 5 pictures of camera_2 are left out, the first of them" in capsys.readouterr().err
+    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["left"]) == 3
+    assert "2 of 5 pictures of left are left out, the first of them" in capsys.readouterr().err
 
 
 def test_names_that_are_numbers_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):

@@ -122,6 +122,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
         late.setattr("recon.build.keep_album", lambda *_: os.kill(os.getpid(), signal.SIGINT) or time.sleep(9))
         reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     assert checkpoint_path(out).is_file() and [p.name for p in tmp_path.iterdir()] == ["scene.fit"]
+    monkeypatch.setattr("recon.build.aligned", lambda *_: pytest.fail("sought how sweeps meet again"))
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     for name, tensor in resumed.background.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
@@ -150,6 +151,7 @@ def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive,
     assert [row["frames"] for row in made.meta["held_out"] if row["which"] == "all"] == [[0, 4]]
     assert made.ego.covers(int(times[-1])) and made.ego.times_us[-1] < log.ego.times_us[-1] and len(made.actors) == 1
     assert isinstance(load(tmp_path / "scene"), Scene)
+    assert made.meta["fit"]["splats"] <= 3000 and len(made.actors[0].asset.gaussians) > 0, "a small budget is one, too"
 
 
 def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, monkeypatch):

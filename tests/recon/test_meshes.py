@@ -1,11 +1,13 @@
 """Meshes become assets: axes and scale, the tracer against what is known of a box, and the fit against the tracer."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from made_glb import rewritten
 
 from recon.assets.looking import looking_at
 from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, read_mesh, splats_of_mesh, turn_to_asset, views_around
@@ -243,6 +245,30 @@ def gltf_box(path: Path, material=None, colours=None) -> Path:
 def test_what_gltf_leaves_out_is_white_and_vertex_colours_are_factors_in_linear_light(tmp_path, material, colours, seen):
     material = None if material is None else PBR(**{"name": "paint", **material})
     assert np.abs(_textures(gltf_box(tmp_path / "box.glb", material, colours)) - seen).max() <= 2
+
+
+def test_vertex_colours_of_16_bits_are_no_bytes_without_a_material(tmp_path):
+    path = gltf_box(tmp_path / "box.glb", None, [128, 26, 255, 255])
+    body = path.read_bytes()[28 + struct.unpack_from("<I", path.read_bytes(), 12)[0] :]
+    wide = np.tile(np.array([32896, 6656, 65535, 65535], "<u2"), (8, 1)).tobytes()
+
+    def widen(tree):
+        (primitive,) = tree["meshes"][0]["primitives"]
+        assert "material" not in primitive
+        tree["accessors"][primitive["attributes"]["COLOR_0"]] |= {"componentType": 5123, "bufferView": len(tree["bufferViews"])}
+        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": len(wide)})
+        tree["buffers"][0]["byteLength"] = len(body + wide)
+
+    rewritten(path, widen, body + wide)
+    assert np.abs(_textures(path) - [188, 90, 255, 255]).max() <= 2
+
+
+def test_a_gltf_file_with_its_buffer_beside_it_is_read_too(tmp_path):
+    box = trimesh.creation.box((4, 1.8, 1.5))
+    box.visual.vertex_colors = np.tile(np.array([128, 26, 255, 255], np.uint8), (len(box.vertices), 1))
+    for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene([box])).items():
+        (tmp_path / name).write_bytes(data)
+    assert np.abs(_textures(tmp_path / "model.gltf") - [188, 90, 255, 255]).max() <= 2
 
 
 def test_a_tinted_mesh_is_traced_and_sampled_in_its_tint(tmp_path):

@@ -181,6 +181,19 @@ def test_a_video_keeps_its_clock(solved, tmp_path):
     assert camera.times_us.diff().unique().tolist() == [80_000] and camera.image(1).shape == (54, 96, 3)
 
 
+def test_too_few_photos_are_told_from_no_drive_at_all(walk, tmp_path):
+    folder = tmp_path / "few"
+    folder.mkdir()
+    with pytest.raises(ValueError, match="few is not a known layout of a drive"):
+        open_log(folder)
+    for i, said in enumerate(("holds 1 photo,", "holds 2 photos,")):
+        shutil.copy(walk / "images" / f"{i:03d}.png", folder)
+        with pytest.raises(ValueError, match=f"few {said} and a world is made of at least 3 of one place; give a folder of as many"):
+            open_log(folder)
+    with pytest.raises(ValueError, match="001.png is 1 photo, and a world is made of at least 3"):
+        open_log(folder / "001.png")
+
+
 def test_what_cannot_be_placed_leaves_nothing_behind(walk, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ValueError("only 2 of 6 pictures could be placed")

@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from randomized import gaussians
 
 from recon import open_log
 from recon.frames import load_frames
 from recon.seeds.carpet import carpet
-from recon.seeds.points import Cloud, colours, first_exposures, merged_colours, nearest_box, splats_from, thin
+from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, nearest_box, splats_from, thin
 from recon.start import even_limit
 from scenes.ground import Ground
 from scenes.harmonics import rgb_from_sh
@@ -84,6 +85,15 @@ def test_thinning_meets_its_budget_and_keeps_more_near_the_path():
     assert 3500 < len(chosen.xyz) <= 5500 and len(sides) == len(chosen.xyz)
     near = np.linalg.norm(chosen.xyz, axis=1) < 10
     assert near.mean() > 3 * (distance < 10).mean()
+
+
+def test_fewer_splats_are_as_much_wider_and_enough_are_left_as_they_are():
+    splats = gaussians(40)
+    some = fewer(splats, 10.9)
+    assert len(some) == 10 and torch.equal(some.means[[0, -1]], splats.means[[0, -1]])
+    chosen = [i for mean in some.means for i in (splats.means == mean).all(1).nonzero()[:, 0].tolist()]
+    torch.testing.assert_close(some.log_scales.exp(), 2 * splats.log_scales[chosen].exp())
+    assert fewer(splats, 40) is splats and len(fewer(splats, 0)) == 0
 
 
 def test_seeds_of_a_plane_lie_flat_in_it():

@@ -1,10 +1,13 @@
 import errno
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from scenes.atomic import atomic_file, atomic_folder
+from scenes.atomic import atomic_file, atomic_folder, made_folder
+from scenes.state import save_state
 
 
 def listing(folder):
@@ -77,3 +80,23 @@ def test_writing_into_a_missing_folder_names_it(tmp_path):
         pass
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"), atomic_folder(tmp_path / "nowhere" / "s1"):
         pass
+
+
+def test_half_of_a_state_that_a_killed_run_left_goes_with_the_next(tmp_path):
+    kill = "import os, sys; from scenes.atomic import atomic_file\nwith atomic_file(sys.argv[1]): os.kill(os.getpid(), 9)"
+    for name in ("checkpoint.pt", "s[1].fit", "checkpoint_2.pt"):
+        subprocess.run([sys.executable, "-c", kill, str(tmp_path / name)], check=False)
+    assert len(listing(tmp_path)) == 3
+    save_state(tmp_path / "checkpoint.pt", {})
+    save_state(tmp_path / "s[1].fit", {})
+    (other,) = {path for path in listing(tmp_path) if path.startswith(".")}
+    assert other.startswith(".checkpoint_2."), "what is another's stays"
+
+
+def test_a_folder_is_made_with_those_above_it_and_refused_where_none_takes_files(tmp_path, monkeypatch):
+    assert made_folder(tmp_path / "a" / "b").is_dir() and made_folder(tmp_path / "a") == tmp_path / "a"
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "a")  # root may write anywhere
+    for folder in (tmp_path / "a", tmp_path / "a" / "c" / "d"):
+        with pytest.raises(PermissionError, match=rf"cannot write {folder}: .*/a takes no files of yours; give a folder of your own"):
+            made_folder(folder)
+    assert listing(tmp_path / "a") == ["b"]

@@ -9,6 +9,7 @@ from render import rasterize
 from render.compare import psnr
 from scenes import Camera, Gaussians, Pinhole, Placed
 from scenes.detail import coarser
+from scenes.edit import Edit, edited
 from scenes.insert import insert
 from scenes.placement import Placement
 
@@ -51,3 +52,10 @@ def test_an_asset_is_put_far_away_with_fewer_splats_than_near():
     asset, scene = replace(car(), gaussians=fine_car()), street()
     near, far = (insert(scene, asset, Placement("car/0001", x, -3.5)).actor.asset.gaussians for x in (8.0, 120.0))
     assert len(far) < 0.5 * len(near) and len(near) > 0.9 * len(asset.gaussians)
+
+
+def test_an_asset_in_an_actors_place_has_as_many_splats_as_one_put_there():
+    asset, scene = replace(car(), gaussians=fine_car()), street()
+    put = insert(scene, asset, Placement("car/0001", 120.0, -3.5))
+    other = edited(put.scene, Edit(replace={put.actor.track: asset})).actors[-1]
+    assert len(other.asset.gaussians) == len(put.actor.asset.gaussians) < 0.5 * len(asset.gaussians)

@@ -2,7 +2,10 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -236,6 +239,27 @@ def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
     assert {p.name for p in saved.iterdir()} == {p.relative_to(saved).parts[0] for p in before}
 
 
+def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_next_edit(saved):
+    add_change(saved, "mine", load(saved), ALL, {})
+    kill = "import os, sys; from scenes.usd_edit import undone\nwith undone(sys.argv[1], ['mine']): os.kill(os.getpid(), 9)"
+    for next_edit in (lambda: put_in(saved), lambda: undo(saved, "new")):
+        subprocess.run([sys.executable, "-c", kill, str(saved)], check=False)
+        (aside,) = saved.glob(".undone.*")
+        assert (aside / "mine.usda").exists() and validate(saved) == []
+        next_edit()
+        assert not aside.exists()
+        add_change(saved, "mine", load(saved), ALL, {})
+
+
+def test_undoing_in_a_folder_that_takes_no_files_says_so_and_leaves_all(saved, monkeypatch):
+    put_in(saved)
+    for folder in (saved, saved / "edits"):
+        with monkeypatch.context() as context, pytest.raises(PermissionError, match=f"{folder} takes no files of yours"):
+            context.setattr(os, "access", lambda path, mode, folder=folder: Path(path) != folder)  # root may write anywhere
+            undo(saved, "new")
+    assert load(saved).actors[-1].track == "new"
+
+
 def shown(scene: Scene) -> torch.Tensor:
     return scene.background.gaussians.logit_opacities > HIDDEN + 1e-3
 
@@ -308,6 +332,8 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
         ("mine/hidden.usda", b"over", "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
         ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
+        ("mine/veh_3.usdc", None, "mine/veh_3.usdc is missing"),
+        ("mine/veh_3.usdc", 300, "mine/veh_3.usdc is damaged"),
     ],
 )
 def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, left, said):
@@ -429,6 +455,16 @@ def test_an_edit_says_what_it_brings_an_actor_into_and_not_what_it_was_in_before
     into = meeting(Edit(shift={"veh_3": (-13.0, -5.0)}), scene)
     assert not clear and any(line.startswith("veh_3 ") for line in into)
     assert not meeting(Edit(shift={"veh_3": (-13.0, -5.0)}, remove=("veh_3",)), scene)
+
+
+def test_another_actor_of_much_the_same_name_is_told_though_one_was_in_the_way_before():
+    scene, still = busy(), Trajectory(torch.tensor([START_US]), translation(15.0, 5.0, 0.0)[None])
+    beside = Trajectory(torch.tensor([START_US]), translation(15.0, 15.0, 0.0)[None])
+    scene = replace(scene, actors=(*scene.actors, Actor(car(), still, "car 1"), Actor(car(), beside, "car 2")))
+    told = meeting(Edit(shift={"veh_3": (0.0, 10.0)}), scene)
+    assert any(line.startswith("veh_3 runs into car 2") for line in told)
+    told = meeting(Edit(shift={"car 2": (0.0, -10.0)}), scene)
+    assert {line.split(" (")[0] for line in told if "runs into" in line} == {"car 2 runs into veh_3", "car 2 runs into car 1"}
 
 
 def test_a_replaced_actor_whose_unseen_side_recorded_cameras_see_is_said():

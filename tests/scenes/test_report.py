@@ -44,6 +44,13 @@ def test_a_scene_is_described(saved):
     assert describe(saved / "scene.usda") == told
 
 
+def test_who_tells_a_drives_times_is_said_before_its_cameras(tmp_path):
+    save(replace(scene(), meta={**scene().meta, "clock": "made up, 0.5 s from one picture to the next"}), tmp_path / "s1")
+    lines = text(tmp_path / "s1").splitlines()
+    (clock,) = [i for i, line in enumerate(lines) if "made up, 0.5 s" in line]
+    assert lines[clock].startswith("clock  ") and clock < next(i for i, line in enumerate(lines) if line.startswith("cameras"))
+
+
 def test_a_databank_an_asset_and_splats_are_described(bank, tmp_path):
     assert [e["id"] for e in describe(bank)["entries"]] == ["bus/0001", "car/0001"]
     assert "car/0001" in text(bank) and "6 splats" in text(bank) and "7 views" in text(bank)

@@ -66,11 +66,12 @@ def test_infinite_logits_are_opacities_of_0_and_1_and_an_infinitely_small_scale_
     assert g.logit_opacities[2:].numpy() == approx(columns["opacity"][2:])
 
 
-def test_of_degree_4_those_of_degree_3_are_kept_channel_by_channel(tmp_path):
+def test_of_degree_4_those_of_degree_3_are_kept_channel_by_channel_and_the_rest_is_told(tmp_path, capsys):
     rest = [f"f_rest_{i}" for i in range(72)]
     columns = table("scale_2", "opacity", *DC, *rest)
     g = load(write(tmp_path / "a.ply", columns, comments=["Exported from Brush", "Vertical axis: y"]))
     assert g.sh_degree == 3
+    assert "warning: " in (told := capsys.readouterr().err) and "a.ply has harmonics of degree 4; those beyond degree 3 are left" in told
     for channel in range(3):
         for i in range(15):
             assert (g.sh[:, 1 + i, channel].numpy() == columns[f"f_rest_{24 * channel + i}"]).all()

@@ -111,6 +111,14 @@ def test_an_spz_file_is_what_niantics_page_says(tmp_path):
         assert (g.quats[0] - wanted).abs().max() < (0.01 if version == 2 else 0.002)
 
 
+def test_harmonics_of_degree_4_in_an_spz_file_are_left_out_and_told(tmp_path, capsys):
+    rest = b"".join(bytes([i] * 3) for i in range(24))
+    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0) + bytes(20) + rest))
+    g = load(tmp_path / "a.spz")
+    assert g.sh[0, 1:, 0].tolist() == [(i - 128) / 128 for i in range(15)]
+    assert "a.spz has harmonics of degree 4; those beyond degree 3 are left out" in capsys.readouterr().err
+
+
 def test_spz_versions_hold_the_same_splats(tmp_path):
     g = gaussians(500, 9)
     found = []
