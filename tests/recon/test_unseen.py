@@ -140,7 +140,7 @@ def test_a_fit_keeps_them_to_its_end(drive):
         fit.step()
     assert fit.progress == pytest.approx(GUESSED_FROM, abs=1.5 / CONFIG.steps)
     some = fit.guessed
-    assert 0 < some.float().mean() < 0.5
+    assert 0 < some.float().mean() < 0.7  # half of so small a scene is street that no picture shows
     before = {name: field.clone() for name, field in fit.splats.fields.items()}
     while fit.step_count < CONFIG.steps:
         fit.step()
