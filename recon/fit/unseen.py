@@ -7,7 +7,7 @@ and is seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -84,20 +84,23 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
     in any picture, the colours of their group's nearest others, in place. Returns which these are, bool `[N]`; of groups without any other
     none.
 
-    What is hidden of the street, pulled at or not, takes the street's: beside a parked car the nearest are the car's.
+    What is hidden of the street, pulled at or not, takes the middle one of the street's, channel by channel: beside a parked car the
+    nearest are the car's, and one glint of it would shine all over the road.
     """
     hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
     high = above(splats, ground)
-    asked = [(hidden & (high < LOW), known & (high < ON))]
-    asked += [(pulled & hidden & (group == i), known & (group == i)) for i in range(len(splats.sizes))]
-    unknown = torch.zeros_like(hidden)
-    for which, beside in asked:
-        unknown |= _coloured(splats, which & ~unknown, beside)
+    unknown = _coloured(splats, hidden & (high < LOW), known & (high < ON), lambda found, share: found.median(1).values)
+    for i in range(len(splats.sizes)):
+        mine = group == i
+        unknown |= _coloured(splats, pulled & hidden & mine & ~unknown, known & mine, lambda found, share: (found * share).sum(1))
     return unknown
 
 
-def _coloured(splats: Splats, which: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """Give some of the splats the colours of the nearest known, both bool `[N]`. Returns which those are; none where too few are known."""
+def _coloured(
+    splats: Splats, which: torch.Tensor, known: torch.Tensor, mix: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+) -> torch.Tensor:
+    """Give some of the splats a mix of the colours of the nearest known, both bool `[N]`. Returns which those are; none where too few are
+    known. mix: of `[M, NEIGHBOURS, K, 3]`, and of how near they are, `[M, NEIGHBOURS, 1, 1]`, 1 in all."""
     known = known.nonzero()[:, 0]
     if len(known) < NEIGHBOURS or not which.any():
         return torch.zeros_like(which)
@@ -106,5 +109,5 @@ def _coloured(splats: Splats, which: torch.Tensor, known: torch.Tensor) -> torch
     wide = splats.fields["log_scales"][which].exp().mean(1)
     share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
     found = sh[known[torch.from_numpy(nearest).to(known)]]
-    sh[which] = (found * (share / share.sum(1, keepdim=True))[:, :, None, None]).sum(1)
+    sh[which] = mix(found, (share / share.sum(1, keepdim=True))[:, :, None, None])
     return which
