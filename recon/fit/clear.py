@@ -48,8 +48,11 @@ class Clear:
         through, there = torch.zeros(2, len(asked), dtype=torch.int64)
         for image in self.images:
             near = ((means[asked] - torch.from_numpy(image.middle)).norm(dim=1) < FAR).nonzero()[:, 0]
-            beyond, struck = image.votes(means[asked[near]].numpy())
-            through[near] += torch.from_numpy(beyond | image.silent(means[asked[near]].numpy()))
+            places = means[asked[near]].numpy()
+            beyond, struck = image.votes(places)
+            through[near] += torch.from_numpy(beyond | image.silent(places))
             there[near] += torch.from_numpy(struck)
+            left = there <= THERE * len(self.images)  # others have been struck too often, whatever is still to come
+            asked, through, there = asked[left], through[left], there[left]
         mask[asked[(through >= THROUGH) & (there <= THERE * through)].to(mask.device)] = True
         return mask
