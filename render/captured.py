@@ -58,7 +58,7 @@ class Captured:
             height=camera.height,
             model=model,
             config=config,
-            wanted=Wanted("depth" in outputs, "median_depth" in outputs, "instance" in outputs),
+            wanted=Wanted("depth" in self.outputs, "median_depth" in self.outputs, "instance" in self.outputs),
             instances=tuple(p.instance for p in self.placed),
             lens=type(camera.lens),
             shutter=camera.shutter,

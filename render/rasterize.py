@@ -88,11 +88,12 @@ def rasterize(
     a tensor of splats is kept until it is written to; torch does not count writes through numpy or `.data`, so make a new one for these.
     ValueError for what cannot be drawn.
     """
-    if not isinstance(camera, Camera):
-        return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
     outputs = check_outputs(outputs)
     placed = as_placed(splats)
+    features = features if features is None or isinstance(features, torch.Tensor) else list(features)
     flow_to = {way: (as_placed(there), other) for way, (there, other) in (flow_to or {}).items()}
+    if not isinstance(camera, Camera):
+        return [rasterize(placed, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
     _check(placed, camera, outputs, flow_to, model)
     background = None if background is None else torch.as_tensor(background)
     _check_part(camera, background, crop, mask)

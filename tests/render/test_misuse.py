@@ -66,3 +66,13 @@ def test_where_flow_goes_is_checked_as_the_view_itself():
     lost = replace(CAMERA, world_from_cam=torch.full((4, 4), torch.nan, dtype=torch.float64))
     with pytest.raises(ValueError, match="pose of camera is not finite"):
         rasterize(splats, CAMERA, ("flow_next",), flow_to={"next": (splats, lost)})
+
+
+def test_what_can_be_gone_through_once_only_is_drawn_as_a_list_is():
+    still = torch.eye(4, dtype=torch.float64)
+    placed, fields = [Placed(ahead(), still), Placed(ahead(), still, instance=1)], [torch.ones(40, 2), torch.zeros(40, 2)]
+    outputs = ("rgb", "depth", "features")
+    twice = rasterize((p for p in placed), (c for c in [CAMERA, CAMERA]), (o for o in outputs), features=(f for f in fields))
+    assert list(twice[0].outputs()) == list(outputs)
+    for frame in twice:
+        assert torch.equal(frame.features, rasterize(placed, CAMERA, outputs, features=fields).features)
