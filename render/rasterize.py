@@ -31,6 +31,8 @@ from scenes.poses import inverse, unturned
 STRETCHED = 0.01
 """What R R^T of a pose's turn is off the unit matrix, summed, from which on it is none; poses that are optimised drift by less."""
 
+_BOTTOM = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+
 
 @overload
 def rasterize(
@@ -94,9 +96,9 @@ def rasterize(
     flow_to = {way: (as_placed(there), other) for way, (there, other) in (flow_to or {}).items()}
     if not isinstance(camera, Camera):
         return [rasterize(placed, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
-    _check(placed, camera, outputs, flow_to, model)
+    check(placed, camera, outputs, flow_to, model)
     background = None if background is None else torch.as_tensor(background)
-    _check_part(camera, background, crop, mask)
+    check_part(camera, background, crop, mask)
     with stage(placed[0].gaussians.device):
         return _draw(placed, camera, outputs, background, flow_to, model, config, features, crop, mask, room)
 
@@ -188,7 +190,8 @@ def as_placed(splats) -> list[Placed]:
     return placed or [Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64))]
 
 
-def _check_part(camera: Camera, background, crop, mask) -> None:
+def check_part(camera: Camera, background, crop, mask) -> None:
+    """ValueError for a background, crop or mask that does not fit the camera."""
     if background is not None:
         check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
     if mask is not None:
@@ -202,37 +205,45 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
             raise ValueError(f"crop must be x, y, width, height of a part of the image, which has {size} pixels, got {crop}")
 
 
-def _check(placed, camera, outputs, flow_to, model) -> None:
+def check(placed, camera, outputs, flow_to, model) -> None:
+    """ValueError for what cannot be drawn, or has no such outputs."""
     if "need" in outputs:
         raise ValueError('output "need" depends on where a scene\'s photos were taken; ask render_frame for it')
     for name in outputs:
         what, _, way = name.partition("_")
         if what in ("flow", "visible") and way not in flow_to:
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
+    check_poses(placed, camera)
     check_projection(camera, placed, model)
     for there, other in flow_to.values():
+        check_poses(there, other)
         check_ends(other, there)
         _check_shared(placed, there)
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")
-    _check_poses(placed, camera)
-    for there, other in flow_to.values():
-        _check_poses(there, other)
     if max(p.instance for p in placed) >= 2**24 or min(p.instance for p in placed) < 0:
         raise ValueError("instance ids must lie between 0 and 2^24 - 1")
 
 
-def _check_poses(placed: list[Placed], camera: Camera) -> None:
-    given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
-    stacked = torch.stack(given).detach()
+def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
+    """ValueError for poses that are not finite, or do more than move and turn."""
+    given = [("pose of camera", camera.world_from_cam), ("end pose of camera", camera.world_from_cam_end)]
+    for p in placed:
+        given += [(f"pose of instance {p.instance}", p.world_from_local), (f"end pose of instance {p.instance}", p.world_from_local_end)]
+    named = [(name, pose) for name, pose in given if pose is not None]
+    stacked = torch.stack([pose for _, pose in named]).detach()
     off = unturned(stacked).abs().sum((1, 2))
-    if not (off + 0 * stacked.sum((1, 2)) < STRETCHED).all():  # one value that is not finite makes the sum so
-        for name, pose, bent in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, off.tolist(), strict=True):
+    sunk = (stacked[:, 3] - _BOTTOM.to(stacked.device)).abs().sum(1)
+    # one value that is not finite makes the sum so
+    if not ((off + 0 * stacked.sum((1, 2)) < STRETCHED) & (sunk < 1e-6)).all():
+        for (name, pose), bent, below in zip(named, off.tolist(), sunk.tolist(), strict=True):
             if not torch.isfinite(pose).all():
-                raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
+                raise ValueError(f"the {name} is not finite: {pose.tolist()}")
+            if below >= 1e-6:
+                raise ValueError(f"the {name} has a bottom row other than 0 0 0 1; transpose it if it is by columns: {pose.tolist()}")
             if bent >= STRETCHED:
-                raise ValueError(f"the pose of {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
+                raise ValueError(f"the {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
 
 
 def _check_shared(placed: list[Placed], there: list[Placed]) -> None:

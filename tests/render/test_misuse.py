@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from render import rasterize
+from render.captured import Captured
 from scenes import Camera, Gaussians, Pinhole, Placed
 from scenes.poses import translation
 from tests.bench.presets import random_splats
@@ -76,3 +77,32 @@ def test_what_can_be_gone_through_once_only_is_drawn_as_a_list_is():
     assert list(twice[0].outputs()) == list(outputs)
     for frame in twice:
         assert torch.equal(frame.features, rasterize(placed, CAMERA, outputs, features=fields).features)
+
+
+def test_a_pose_that_is_by_columns_is_refused_and_not_drawn_from_the_origin():
+    by_columns = translation(1.0, 0.0, 0.0).T
+    with pytest.raises(ValueError, match="pose of camera has a bottom row other than 0 0 0 1; transpose it"):
+        rasterize(ahead(), replace(CAMERA, world_from_cam=by_columns))
+    with pytest.raises(ValueError, match="pose of instance 3 has a bottom row"):
+        rasterize(Placed(ahead(), by_columns, instance=3), CAMERA)
+
+
+def test_end_poses_that_scale_are_refused_as_poses_are():
+    rows = replace(CAMERA, shutter="rows")
+    twice = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="end pose of camera scales or shears"):
+        rasterize(ahead(), replace(rows, world_from_cam_end=twice))
+    with pytest.raises(ValueError, match="end pose of instance 2 scales or shears"):
+        rasterize(Placed(ahead(), torch.eye(4, dtype=torch.float64), twice, instance=2), rows)
+
+
+def test_a_recording_refuses_what_rasterize_refuses():
+    splats, twice = ahead(), torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
+    with pytest.raises(ValueError, match="instance ids must lie between"):
+        Captured(Placed(splats, torch.eye(4, dtype=torch.float64), instance=-5), CAMERA)
+    with pytest.raises(ValueError, match="background must have shape"):
+        Captured(splats, CAMERA, background=torch.ones(4, 4))
+    with pytest.raises(ValueError, match="pose of camera scales"):
+        list(Captured(splats, CAMERA).frames([replace(CAMERA, world_from_cam=twice)]))
+    (frame,) = Captured(splats, CAMERA, background=[1.0, 0.0, 0.0]).frames([CAMERA])
+    assert torch.equal(frame.rgb, rasterize(splats, CAMERA, background=[1.0, 0.0, 0.0]).rgb)
