@@ -153,9 +153,10 @@ def _draw(
         same = correspond(placed, camera, frame["depth"].detach(), frame["instance"], there, other, settings.part[:2])
         frame[f"flow_{way}"] = same.flow
         if f"visible_{way}" in outputs:
-            shown = _draw(there, other, ("depth",), None, {}, model, config, room=room).depth
-            assert shown is not None
-            frame[f"visible_{way}"] = same.visible(shown.detach())
+            shown = _draw(there, other, ("depth", "alpha"), None, {}, model, config, room=room)
+            assert shown.depth is not None and shown.alpha is not None
+            # sky there is what would be sky here, as `instance` says
+            frame[f"visible_{way}"] = same.visible(shown.depth.detach().where(shown.alpha >= 0.5, torch.inf))
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
