@@ -17,7 +17,7 @@ SHUTTERS = ("global", "rows", "columns")
 
 def neutral_exposure() -> torch.Tensor:
     """The affine colour `[3, 4]` that changes nothing."""
-    return torch.eye(3, 4)
+    return torch.eye(3, 4, dtype=torch.float32)
 
 
 def check_shutter(shutter: str, readout_us: int) -> None:

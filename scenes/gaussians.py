@@ -131,7 +131,7 @@ class Gaussians:
 
     @staticmethod
     def empty(sh_count: int = 1, device="cpu") -> Gaussians:
-        z = lambda *s: torch.zeros(*s, device=device)  # noqa: E731
+        z = lambda *s: torch.zeros(*s, dtype=torch.float32, device=device)  # noqa: E731
         return Gaussians(z(0, 3), z(0, 4), z(0, 3), z(0), z(0, sh_count, 3))
 
     @staticmethod

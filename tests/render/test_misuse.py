@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from render import rasterize
+from render import RenderConfig, rasterize
 from render.captured import Captured
 from scenes import Camera, Gaussians, Pinhole, Placed
+from scenes.camera import neutral_exposure
 from scenes.poses import translation
 from tests.bench.presets import random_splats
 
@@ -106,3 +107,32 @@ def test_a_recording_refuses_what_rasterize_refuses():
         list(Captured(splats, CAMERA).frames([replace(CAMERA, world_from_cam=twice)]))
     (frame,) = Captured(splats, CAMERA, background=[1.0, 0.0, 0.0]).frames([CAMERA])
     assert torch.equal(frame.rgb, rasterize(splats, CAMERA, background=[1.0, 0.0, 0.0]).rgb)
+
+
+@pytest.fixture
+def doubles():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+EVERYTHING = ("rgb", "alpha", "depth", "median_depth", "normal", "features", "flow_next", "visible_next", "instance", "instance_alpha")
+
+
+@pytest.mark.parametrize("order", ["tile", "pixel"])
+def test_what_torch_makes_by_default_changes_nothing(order, request):
+    made = ahead()
+
+    def drawn() -> list[torch.Tensor]:
+        splats = made.map(lambda t: t.clone().requires_grad_())
+        flow_to = {"next": (splats, replace(CAMERA, world_from_cam=translation(0.1, 0.0, 0.0)))}
+        features = torch.ones(40, 2, dtype=torch.float32)
+        frame = rasterize(splats, CAMERA, EVERYTHING, flow_to=flow_to, features=features, config=RenderConfig(order=order))
+        frame.rgb.sum().backward()
+        return [*frame.outputs().values(), *(t.grad for t in splats.tensors().values())]
+
+    expected = drawn()
+    request.getfixturevalue("doubles")
+    for mine, same in zip(drawn(), expected, strict=True):
+        assert mine.dtype == same.dtype and torch.equal(mine, same)
+    assert len(rasterize([], CAMERA, ("rgb",)).rgb) == CAMERA.height and neutral_exposure().dtype == torch.float32
