@@ -55,7 +55,7 @@ def draw_blocks_backward(
     filled = [view(slots, float), view(channel_slots, float), view(frame_slots, float), view(_or_none(g_rays, 4), wp.float64)]
     if _ordered(settings):
         blocks = min(BLOCKS, w.tiles_x * w.tiles_y)
-        pushes = torch.empty(blocks, SEGMENT, tile * tile, 2, device=device)
+        pushes = torch.empty(blocks, SEGMENT, tile * tile, 2, dtype=torch.float32, device=device)
         told = [view(part.ends[0], int), view(part.ends[1], wp.int64), blocks, view(pushes, wp.vec2)]
         run_blocks(order_blocks_gradient(*_way(settings, tile)), blocks, tile * tile, [*args, *told, *filled], device)
     else:

@@ -54,7 +54,7 @@ def prepare(settings: Settings, seen, poses: torch.Tensor, lens: torch.Tensor, f
 def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, features, frames, rays) -> tuple[Projected, Picture]:
     """Project and composite. With a room and without gradients nothing in here waits for the device, so a graph can record it."""
     ways, device = projection(settings.lens, settings.rolling), rows.device
-    records = torch.empty(todo.records, RECORD, device=device)
+    records = torch.empty(todo.records, RECORD, dtype=torch.float32, device=device)
     reach = torch.empty(todo.records, REACH_INTS, dtype=torch.int32, device=device)
     keys, counts = (torch.empty(todo.records, dtype=torch.int32, device=device) for _ in range(2))
     out = [view(records, float), view(reach, int), view(keys, int), view(counts, int)]
@@ -119,7 +119,7 @@ class Rasterize(torch.autograd.Function):
             ways = projection(settings.lens, settings.rolling)
             for g in groups:
                 outs.append([torch.empty_like(f) for f in g.fields])
-                shared.append(torch.empty(len(g.items) * threads, ways.uniforms, device=device))
+                shared.append(torch.empty(len(g.items) * threads, ways.uniforms, dtype=torch.float32, device=device))
                 summed = [view(slots.counts, int), view(slots.starts, int), view(slots.values, float)]
                 args = [*_arrays(g.fields), *_told(ctx.told, ctx.rows, g.items), *summed, *_arrays(outs[-1]), view(shared[-1], float)]
                 jobs.append((len(shared[-1]), args))

@@ -17,7 +17,7 @@ from render.kernels.types import Wanted
 from render.launch import stage, upload
 from render.outputs import check_outputs
 from render.projection import check_projection, moves, poses
-from render.rasterize import as_placed, picture_of
+from render.rasterize import as_placed, check, check_part, check_poses, picture_of
 from render.room import Room, one_ahead
 from render.settings import Settings
 from scenes.camera import Camera
@@ -50,15 +50,16 @@ class Captured:
                 raise ValueError(f'output "{name}" cannot be recorded, only {", ".join(OUTPUTS)}; ask rasterize for it')
         self.placed, self.camera = as_placed(splats), camera
         self._device = self.placed[0].gaussians.device
-        self.background = None if background is None else background.to(self._device)
+        self.background = None if background is None else torch.as_tensor(background).to(self._device)
         self.room = room or Room()
-        check_projection(camera, self.placed, model)
+        check(self.placed, camera, self.outputs, {}, model)
+        check_part(camera, self.background, None, None)
         self._settings = Settings(
             width=camera.width,
             height=camera.height,
             model=model,
             config=config,
-            wanted=Wanted("depth" in outputs, "median_depth" in outputs, "instance" in outputs),
+            wanted=Wanted("depth" in self.outputs, "median_depth" in self.outputs, "instance" in self.outputs),
             instances=tuple(p.instance for p in self.placed),
             lens=type(camera.lens),
             shutter=camera.shutter,
@@ -87,6 +88,8 @@ class Captured:
         same = (camera.lens.key(), camera.width, camera.height, camera.shutter, moves(camera, self.placed))
         if same != (self.camera.lens.key(), self.camera.width, self.camera.height, self.camera.shutter, self._settings.rolling):
             raise ValueError("all cameras of a recording must share lens, size and shutter; record another for this one")
+        check_poses([], camera)
+        check_projection(camera, self.placed, self._settings.model)
         self._rows.copy_(upload(self._prepared(camera)[2], self._device))
         if self._device.type != "cuda":
             with stage(self._device):

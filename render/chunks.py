@@ -52,7 +52,7 @@ class Sums:
     def __init__(self, counts: torch.Tensor):
         self.counts = (counts > 0).to(torch.int32)
         self.starts = torch.arange(len(counts), dtype=torch.int32, device=counts.device)
-        self.slots = torch.zeros(len(counts), GRADIENTS, device=counts.device)
+        self.slots = torch.zeros(len(counts), GRADIENTS, dtype=torch.float32, device=counts.device)
 
     def add(self, counts: torch.Tensor, lists: TileLists, slots: torch.Tensor) -> None:
         add_to(self.slots, counts, lists, slots)

@@ -90,8 +90,8 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
         lists, counts = part.lists, part.counts
         if lists is None or counts is None:
             lists, counts = _lists(settings, scene, part.window, alone=False)
-        slots = torch.empty(lists.ids.shape[0], GRADIENTS, device=device)
-        channel_slots = torch.empty(lists.ids.shape[0], scene.channels, device=device)
+        slots = torch.empty(lists.ids.shape[0], GRADIENTS, dtype=torch.float32, device=device)
+        channel_slots = torch.empty(lists.ids.shape[0], scene.channels, dtype=torch.float32, device=device)
         grads = _of_part(settings, part, wanted)
         frame_slots = None
         if by_blocks(device):
@@ -128,7 +128,7 @@ def _planes(w: Window, count: int, device) -> torch.Tensor:
 
     A stored row has an odd number of tiles, so that the 16 rows of a tile do not fall into one cache set on wide images.
     """
-    return torch.empty(count, w.tiles_y * TILE, (w.tiles_x | 1) * TILE, device=device)
+    return torch.empty(count, w.tiles_y * TILE, (w.tiles_x | 1) * TILE, dtype=torch.float32, device=device)
 
 
 def _inside(planes: torch.Tensor, w: Window, whole: Window) -> torch.Tensor:
@@ -181,7 +181,7 @@ def _by_tile(settings: Settings, w: Window, lists: TileLists, scene: Projected, 
     lists_of = [view(lists.starts, int), view(lists.ids, int)]
     limits = [settings.alpha_max, settings.termination]
     ends = planes.shape[1:] if settings.gradients else (0, 0)
-    last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends)
+    last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends, dtype=torch.float32)
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
     out = [lanes_of(planes), lanes_of(picks), view(last, int), lanes_of(dark_at)]
     run(composite(settings.wanted, settings.squarings, settings.gradients), BANDS, [*args, *out], device)
@@ -193,14 +193,14 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene:
     w = part.window
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int)]
     args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
-    terms = torch.empty(BANDS * int(3 * BATCH + SUMS), TILE)
+    terms = torch.empty(BANDS * int(3 * BATCH + SUMS), TILE, dtype=torch.float32)
     args += [
         view(terms, lanes),
         view(terms.view(-1), float),
         view(terms.view(-1, 4), wp.vec4),
         view(torch.empty(BANDS * int(BATCH), dtype=torch.int32), int),
     ]
-    sums = view(torch.zeros(BANDS, max(scene.channels, 1), TILE), lanes)
+    sums = view(torch.zeros(BANDS, max(scene.channels, 1), TILE, dtype=torch.float32), lanes)
     ends = [view(part.ends[0], int), lanes_of(part.ends[1])]
     out = [view(slots, float), view(channel_slots, float)]
     kernel = composite_gradient(settings.wanted, settings.squarings)
@@ -211,11 +211,14 @@ def _working(channels: int) -> list:
     """0 to 15 and their powers of two, and working rows of the tile at hand for each band; 17 where 16 are used, so that those of its
     fields do not fall on one another in the store buffer, which tells addresses apart by their last 12 bits."""
     ramp = torch.arange(TILE, dtype=torch.float32)
-    return [view(torch.stack([ramp, ramp.exp2()]), lanes), view(torch.empty(BANDS, int(HELD) + channels, TILE + 1, TILE), lanes)]
+    return [
+        view(torch.stack([ramp, ramp.exp2()]), lanes),
+        view(torch.empty(BANDS, int(HELD) + channels, TILE + 1, TILE, dtype=torch.float32), lanes),
+    ]
 
 
 def _batches() -> list:
     """Where forward keeps the entries of the batch at hand for each band."""
     entries = BANDS * int(BATCH)
-    terms = torch.empty(2 * entries, TILE)
-    return [view(torch.empty(entries, TILE), lanes), view(terms, lanes), view(terms.view(-1), float)]
+    terms = torch.empty(2 * entries, TILE, dtype=torch.float32)
+    return [view(torch.empty(entries, TILE, dtype=torch.float32), lanes), view(terms, lanes), view(terms.view(-1), float)]

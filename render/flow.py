@@ -63,7 +63,8 @@ def correspond(
     rays = camera_rays(camera)
     bends = _bends(placed, camera, depth, instance, there, rays[part], origins if origins.ndim == 1 else origins[part])
     pixels = torch.empty(height, width, 2, dtype=torch.float64, device=device)
-    found = Correspondence(torch.empty(height, width, 2, device=device), pixels, torch.empty(height, width, device=device))
+    flow, far = (torch.empty(height, width, *more, dtype=torch.float32, device=device) for more in ((2,), ()))
+    found = Correspondence(flow, pixels, far)
     tensors = [
         (on_device(rays, device), wp.vec3), (origins if origins.ndim == 3 else origins[None, None], wp.vec3), *corner, (bends, wp.vec3),
         (depth.detach(), float), (instance.to(torch.int32), int), (_places(placed, device), int), (ways, wp.mat44d),
@@ -118,8 +119,8 @@ def _bends(
     moved = {p.instance: p.lattice for p in there}
     bent = [(p, moved[p.instance]) for p in placed if p.instance in moved and not (p.lattice is None and moved[p.instance] is None)]
     if not bent:
-        return torch.zeros(1, 1, 3)
-    out = torch.zeros(*depth.shape, 3, device=depth.device)
+        return torch.zeros(1, 1, 3, dtype=torch.float32)
+    out = torch.zeros(*depth.shape, 3, dtype=torch.float32, device=depth.device)
     for p, then in bent:
         mine = (instance == p.instance) & torch.isfinite(depth)
         here = mine.to(rays.device)

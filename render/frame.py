@@ -15,7 +15,7 @@ from render.rasterize import rasterize
 from render.room import Room
 from render.shadow import cast, caster_fields, shadow_casters
 from render.sky import over_sky
-from scenes.camera import Camera
+from scenes.camera import Camera, neutral_exposure
 from scenes.gaussians import Placed
 from scenes.scene import Scene
 
@@ -95,7 +95,7 @@ def by_instance(each: torch.Tensor, placed: Sequence[Placed], actors: int) -> to
 
 def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
     """rgb' = E[:, :3] rgb + E[:, 3] for an affine colour `[3, 4]`."""
-    if not exposure.requires_grad and torch.equal(exposure, torch.eye(3, 4).to(exposure)):
+    if not exposure.requires_grad and torch.equal(exposure, neutral_exposure().to(exposure)):
         return rgb
     exposure = upload(exposure, rgb.device).to(rgb.dtype)
     return rgb @ exposure[:, :3].T + exposure[:, 3]

@@ -134,22 +134,48 @@ def stage(device: torch.device):
     if _cores.staged:  # the outer stage has taken the cores
         yield
         return
-    threads = torch.get_num_threads()
-    _cores.threads, _cores.staged = threads, True
+    with _stages.lock:
+        if not _stages.open:
+            _stages.threads = _threads()
+        _stages.open += 1
+    _cores.threads, _cores.staged, _cores.known = _stages.threads, True, True
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(_cores.threads)
         _cores.staged = False
+        with _stages.lock:
+            _stages.open -= 1
 
 
 class _Cores(threading.local):
+    """What a thread has of the cores, and whether it had a stage before."""
+
     threads = 1
     staged = False
+    known = False
 
 
-_cores = _Cores()
+class _Stages:
+    """All threads' open stages, and torch's threads before them. A thread that first uses torch during another's stage finds but one
+    there, and would otherwise take that for its own and hand it on."""
+
+    lock = threading.Lock()
+    open = 0
+    threads = 1
+
+
+_cores, _stages = _Cores(), _Stages()
+
+
+def _threads() -> int:
+    """Torch's threads, while no stage is open."""
+    own = torch.get_num_threads()
+    if own > 1 or _cores.known:
+        return own
+    with ThreadPoolExecutor(1) as new:  # which is given what the process has, whatever this one found during another's stage
+        return new.submit(torch.get_num_threads).result()
 
 
 _WARP_TYPES = {float: wp.float32, int: wp.int32}

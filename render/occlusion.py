@@ -67,7 +67,7 @@ def shadow_box(size: torch.Tensor, directions: torch.Tensor) -> Box:
     high = torch.maximum(reach.quantile(0.97, 0) + half, half + BESIDE)
     fade = FADE * _cell(high - low)  # beyond the tip of the shadow, not over it
     low, high = low - fade, high + fade
-    return Box(torch.cat([low, torch.zeros(1)]), torch.cat([high, torch.tensor([height])]))
+    return Box(torch.cat([low, torch.zeros(1, dtype=torch.float32)]), torch.cat([high, torch.tensor([height], dtype=torch.float32)]))
 
 
 def trace_field(splats: Gaussians, box: Box, directions: torch.Tensor, weights: torch.Tensor) -> Field:
@@ -75,18 +75,20 @@ def trace_field(splats: Gaussians, box: Box, directions: torch.Tensor, weights: 
     blockers = Blockers(squares(splats))
     extent = (box.high - box.low)[:2]
     counts = [max(2, round(float(e) / _cell(extent)) + 1) for e in extent]
-    axes = [torch.linspace(float(a), float(b), n) for a, b, n in zip(box.low, box.high, [*counts, LEVELS], strict=True)]
+    axes = [
+        torch.linspace(float(a), float(b), n, dtype=torch.float32) for a, b, n in zip(box.low, box.high, [*counts, LEVELS], strict=True)
+    ]
     axes[2][0] = 0.02  # above what is left of the road in an asset
     z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     points = torch.stack([x, y, z], -1).reshape(-1, 3)
     blocked = _smooth((1 - blockers.open_share(points, directions, weights, FARTHEST)).reshape(z.shape))
-    fade = [(torch.minimum(torch.arange(n), torch.arange(n).flip(0)) / FADE).clamp_max(1) for n in counts]
+    fade = [(torch.minimum(torch.arange(n), torch.arange(n).flip(0)).float() / FADE).clamp_max(1) for n in counts]
     return Field(blocked * fade[1][:, None] * fade[0], box)
 
 
 def _smooth(blocked: torch.Tensor) -> torch.Tensor:
     """Levels `[Z, Y, X]` without the stairs that the grid's cells leave along a shadow's slanted edges."""
-    near = torch.tensor([0.25, 0.5, 0.25])
+    near = torch.tensor([0.25, 0.5, 0.25], dtype=torch.float32)
     padded = torch.nn.functional.pad(blocked[:, None], (1, 1, 1, 1), mode="replicate")
     return torch.nn.functional.conv2d(padded, (near[:, None] * near)[None, None])[:, 0]
 

@@ -25,10 +25,11 @@ def check_outputs(outputs: Iterable[str], known: tuple[str, ...] = OUTPUTS) -> t
     """`outputs` as a tuple of known names; ValueError naming the nearest otherwise."""
     if isinstance(outputs, str):
         raise ValueError(f'outputs must be a tuple of names, got the string "{outputs}"; write ("{outputs}",)')
+    outputs = tuple(outputs)
     for name in outputs:
         if name not in known:
             raise ValueError(f'output "{name}" does not exist; there are {", ".join(known)}.{nearest(name, known)}')
-    return tuple(outputs)
+    return outputs
 
 
 def check_scene_outputs(outputs: Iterable[str]) -> tuple[str, ...]:

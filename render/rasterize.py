@@ -31,6 +31,8 @@ from scenes.poses import inverse, unturned
 STRETCHED = 0.01
 """What R R^T of a pose's turn is off the unit matrix, summed, from which on it is none; poses that are optimised drift by less."""
 
+_BOTTOM = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+
 
 @overload
 def rasterize(
@@ -81,21 +83,26 @@ def rasterize(
     needs an instance id of its own. features: a further
     field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
     the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
-    nothing stands. room: what earlier frames needed, so that the host does not wait for this one (`render/room.py`, `one_ahead`).
+    nothing stands. room: what earlier frames needed, so that the host does not wait for this one, without gradients; the frame may
+    lack splats until `room.held` has said otherwise, as `one_ahead` asks (`render/room.py`).
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
     instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. What is found out about
     a tensor of splats is kept until it is written to; torch does not count writes through numpy or `.data`, so make a new one for these.
     ValueError for what cannot be drawn.
     """
-    if not isinstance(camera, Camera):
-        return [rasterize(splats, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
     outputs = check_outputs(outputs)
     placed = as_placed(splats)
+    features = features if features is None or isinstance(features, torch.Tensor) else list(features)
     flow_to = {way: (as_placed(there), other) for way, (there, other) in (flow_to or {}).items()}
-    _check(placed, camera, outputs, flow_to, model)
+    if not isinstance(camera, Camera):
+        return [rasterize(placed, c, outputs, background, flow_to, model, config, features, crop, mask, room) for c in camera]
+    check(placed, camera, outputs, flow_to, model)
     background = None if background is None else torch.as_tensor(background)
-    _check_part(camera, background, crop, mask)
+    check_part(camera, background, crop, mask)
+    if crop is not None:
+        x, y, width, height = crop
+        crop = x, y, width, height  # a list would be no key of what is kept
     with stage(placed[0].gaussians.device):
         return _draw(placed, camera, outputs, background, flow_to, model, config, features, crop, mask, room)
 
@@ -104,7 +111,12 @@ def _draw(
     placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None, room=None
 ) -> Frame:
     seen = None
-    if not differentiated(placed, camera, features):
+    if differentiated(placed, camera, features):
+        if room is not None:
+            raise ValueError(
+                "a room is for frames without gradients, which may lack splats; leave room= out, or draw under torch.no_grad()"
+            )
+    else:
         placed = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
         seen = in_sight(placed, camera, model)
     cam_from_local = poses(camera, placed)
@@ -150,9 +162,10 @@ def _draw(
         same = correspond(placed, camera, frame["depth"].detach(), frame["instance"], there, other, settings.part[:2])
         frame[f"flow_{way}"] = same.flow
         if f"visible_{way}" in outputs:
-            shown = _draw(there, other, ("depth",), None, {}, model, config, room=room).depth
-            assert shown is not None
-            frame[f"visible_{way}"] = same.visible(shown.detach())
+            shown = _draw(there, other, ("depth", "alpha"), None, {}, model, config, room=room)
+            assert shown.depth is not None and shown.alpha is not None
+            # sky there is what would be sky here, as `instance` says
+            frame[f"visible_{way}"] = same.visible(shown.depth.detach().where(shown.alpha >= 0.5, torch.inf))
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
@@ -184,10 +197,14 @@ def as_placed(splats) -> list[Placed]:
     if isinstance(splats, Gaussians):
         splats = Placed(splats, torch.eye(4, dtype=torch.float64))
     placed = [splats] if isinstance(splats, Placed) else list(splats)
+    for p in placed:
+        if not isinstance(p, Placed):
+            raise ValueError(f"a sequence of splats must be of Placed, got {type(p).__name__}; write Placed(splats, pose, instance=...)")
     return placed or [Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64))]
 
 
-def _check_part(camera: Camera, background, crop, mask) -> None:
+def check_part(camera: Camera, background, crop, mask) -> None:
+    """ValueError for a background, crop or mask that does not fit the camera."""
     if background is not None:
         check_tensor("background", background, (3,) if background.ndim == 1 else (camera.height, camera.width, 3))
     if mask is not None:
@@ -201,37 +218,45 @@ def _check_part(camera: Camera, background, crop, mask) -> None:
             raise ValueError(f"crop must be x, y, width, height of a part of the image, which has {size} pixels, got {crop}")
 
 
-def _check(placed, camera, outputs, flow_to, model) -> None:
+def check(placed, camera, outputs, flow_to, model) -> None:
+    """ValueError for what cannot be drawn, or has no such outputs."""
     if "need" in outputs:
         raise ValueError('output "need" depends on where a scene\'s photos were taken; ask render_frame for it')
     for name in outputs:
         what, _, way = name.partition("_")
         if what in ("flow", "visible") and way not in flow_to:
             raise ValueError(f'output "{name}" needs flow_to={{"{way}": (placed, camera)}}')
+    check_poses(placed, camera)
     check_projection(camera, placed, model)
     for there, other in flow_to.values():
+        check_poses(there, other)
         check_ends(other, there)
         _check_shared(placed, there)
     devices = {p.gaussians.device for p in placed}
     if len(devices) > 1:
         raise ValueError(f"all splats must be on one device, got {', '.join(sorted(map(str, devices)))}")
-    _check_poses(placed, camera)
-    for there, other in flow_to.values():
-        _check_poses(there, other)
     if max(p.instance for p in placed) >= 2**24 or min(p.instance for p in placed) < 0:
         raise ValueError("instance ids must lie between 0 and 2^24 - 1")
 
 
-def _check_poses(placed: list[Placed], camera: Camera) -> None:
-    given = [camera.world_from_cam, *(p.world_from_local for p in placed)]
-    stacked = torch.stack(given).detach()
+def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
+    """ValueError for poses that are not finite, or do more than move and turn."""
+    given = [("pose of camera", camera.world_from_cam), ("end pose of camera", camera.world_from_cam_end)]
+    for p in placed:
+        given += [(f"pose of instance {p.instance}", p.world_from_local), (f"end pose of instance {p.instance}", p.world_from_local_end)]
+    named = [(name, pose) for name, pose in given if pose is not None]
+    stacked = torch.stack([pose for _, pose in named]).detach()
     off = unturned(stacked).abs().sum((1, 2))
-    if not (off + 0 * stacked.sum((1, 2)) < STRETCHED).all():  # one value that is not finite makes the sum so
-        for name, pose, bent in zip(["camera", *(f"instance {p.instance}" for p in placed)], given, off.tolist(), strict=True):
+    sunk = (stacked[:, 3] - _BOTTOM.to(stacked.device)).abs().sum(1)
+    # one value that is not finite makes the sum so
+    if not ((off + 0 * stacked.sum((1, 2)) < STRETCHED) & (sunk < 1e-6)).all():
+        for (name, pose), bent, below in zip(named, off.tolist(), sunk.tolist(), strict=True):
             if not torch.isfinite(pose).all():
-                raise ValueError(f"the pose of {name} is not finite: {pose.tolist()}")
+                raise ValueError(f"the {name} is not finite: {pose.tolist()}")
+            if below >= 1e-6:
+                raise ValueError(f"the {name} has a bottom row other than 0 0 0 1; transpose it if it is by columns: {pose.tolist()}")
             if bent >= STRETCHED:
-                raise ValueError(f"the pose of {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
+                raise ValueError(f"the {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
 
 
 def _check_shared(placed: list[Placed], there: list[Placed]) -> None:

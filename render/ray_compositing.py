@@ -112,7 +112,7 @@ def _working(lists: TileLists) -> tuple:
     longest = max(1, int(lists.starts.diff().max()))
     bands = max(1, min(BANDS, MOST_HELD // longest))
     column = view(torch.arange(TILE, dtype=torch.float32)[None], lanes)
-    held = torch.empty(bands, LISTS, longest, TILE)
+    held = torch.empty(bands, LISTS, longest, TILE, dtype=torch.float32)
     keys, reach = torch.empty(bands * longest, TILE, dtype=torch.float64), torch.empty(bands, 3, longest, dtype=torch.int32)
     memory = [view(held, lanes), view(held, float), view(keys, lanes64), view(keys.view(-1), wp.float64), view(reach, int)]
     return bands, longest, [1 << (longest - 1).bit_length(), column, *memory]

@@ -28,7 +28,7 @@ def camera_rays(camera: Camera) -> torch.Tensor:
 def camera_origins(camera: Camera) -> torch.Tensor:
     """float32 `[H, W, 3]` or, where all rays begin in the eye, `[3]`: where the rays begin, in the camera."""
     if not isinstance(camera.lens, Orthographic):
-        return torch.zeros(3)
+        return torch.zeros(3, dtype=torch.float32)
     return camera.lens.origins(camera.pixel_centres()).detach().to(torch.float32)
 
 

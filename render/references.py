@@ -146,7 +146,9 @@ class References:
         """float64 `[S]`: the share of a frame that each shot shows, as sharply, by how far off it was taken."""
         camera = frame.camera
         assert frame.depth is not None
-        y, x = ((torch.arange(n) + 0.5) * side / n for n, side in zip(GRID, (camera.height, camera.width), strict=True))
+        y, x = (
+            (torch.arange(n, dtype=torch.float32) + 0.5) * side / n for n, side in zip(GRID, (camera.height, camera.width), strict=True)
+        )
         at = y.long()[:, None], x.long()
         depth = frame.depth.cpu()[at].clamp_max(FARTHEST)
         rays = camera_rays(camera)[at]
@@ -202,7 +204,7 @@ def _gain(scene: Scene, frame: Frame) -> torch.Tensor:
     """How many times as bright as a scene's splats are they are shown, `[H, W, 3]` or `[3]`: what a photo adds is shown alike."""
     assert frame.rgb is not None and frame.instance is not None
     exposure, followed = frame.camera.exposure, scene.followed(frame.camera.time_us)
-    gain = torch.ones(3) if exposure is None else exposure[:, :3].diagonal().clamp_min(0.05)
+    gain = torch.ones(3, dtype=torch.float32) if exposure is None else exposure[:, :3].diagonal().clamp_min(0.05)
     if followed is None:
         return gain.to(frame.rgb)
     lit = torch.stack([gain, *(gain / followed if actor.recorded else gain for actor in scene.actors)])

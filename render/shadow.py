@@ -118,7 +118,7 @@ def _light(frame: Frame, caster: Caster, own: torch.Tensor) -> torch.Tensor:
     told.pose, told.instance = wp.mat44(*caster.asset_from_cam.flatten().tolist()), caster.instance
     told.half, told.ground, told.skirt = wp.vec2(*caster.half.tolist()), GROUND, SKIRT
     told.low, told.high = wp.vec3(*field.box.low.tolist()), wp.vec3(*field.box.high.tolist())
-    light = torch.empty(y1 - y0, x1 - x0, device=device)
+    light = torch.empty(y1 - y0, x1 - x0, dtype=torch.float32, device=device)
     blocked, rays = field.blocked.to(device).contiguous(), on_device(camera_rays(frame.camera), device)
     depth, instance = frame.depth.detach().contiguous(), frame.instance.contiguous()
     with stage(device):
@@ -178,9 +178,9 @@ class Shade:
         local_from_asset = inverse(background.world_from_local) @ pose
         points = points @ local_from_asset[:3, :3].T + local_from_asset[:3, 3]
         turned = self.light.directions @ inverse(background.world_from_local)[:3, :3].T
-        each = torch.eye(len(turned))
+        each = torch.eye(len(turned), dtype=torch.float32)
         passing = torch.stack([self._houses.open_share(points, turned, one, AROUND).mean() for one in each])
-        return passing if bool((passing > 0).any()) else torch.ones(len(turned))  # under a bridge any light will do
+        return passing if bool((passing > 0).any()) else torch.ones(len(turned), dtype=torch.float32)  # under a bridge any light will do
 
 
 def _on_slope(heading: float, forward: float, left: float) -> torch.Tensor:
@@ -212,7 +212,7 @@ def _window(asset_from_cam: torch.Tensor, box: Box, camera: Camera) -> tuple[int
         pixels = camera.lens.project(seen)
         low, high = pixels.amin(0).floor(), pixels.amax(0).ceil()
     else:  # it reaches past the camera plane, where projected corners bound nothing
-        low, high = torch.zeros(2), torch.tensor([camera.width, camera.height])
+        low, high = torch.zeros(2, dtype=torch.float32), torch.tensor([camera.width, camera.height])
     x0, y0 = (int(v) for v in low.clamp_min(0))
     x1, y1 = min(int(high[0]), camera.width), min(int(high[1]), camera.height)
     return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None

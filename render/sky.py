@@ -22,7 +22,7 @@ def over_sky(rgb: torch.Tensor, alpha: torch.Tensor, sky: Sky, camera: Camera) -
         return _differentiably(rgb, alpha, sky, camera)
     if rgb.device.type == "cpu" and not (alpha < 1 - SKY_SHOWS).any():  # to ask a GPU takes longer than to look
         return rgb
-    out = torch.empty(rgb.shape, device=rgb.device)
+    out = torch.empty(rgb.shape, dtype=torch.float32, device=rgb.device)
     ways = upload(turns(camera).to(rgb.dtype).contiguous(), rgb.device)
     with stage(rgb.device):
         args = [view(on_device(camera_rays(camera), rgb.device), wp.vec3), view(ways, wp.mat33), int(camera.shutter != "columns")]

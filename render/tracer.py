@@ -50,7 +50,7 @@ class Blockers:
 
     def open_share(self, points: torch.Tensor, directions: torch.Tensor, weights: torch.Tensor, reach: float) -> torch.Tensor:
         """The part `[N]` of light from unit `directions` `[K, 3]` with `weights` `[K]` that reaches points `[N, 3]`: 1 in the open."""
-        out = torch.zeros(len(points))
+        out = torch.zeros(len(points), dtype=torch.float32)
         points, directions, weights = (t.detach().float().contiguous() for t in (points, directions, weights))
         with stage(CPU):
             arrays = view(points, wp.vec3), view(directions, wp.vec3), reach, view(weights, float), view(out, float)
@@ -90,7 +90,7 @@ class TracedMesh:
         """Along rays `[N, 3]` of any length: albedo rgba `[N, 4]` (sRGB; alpha 1 or 0), normal towards the viewer `[N, 3]`, and distance
         `[N]` in metres, inf for a miss."""
         n = len(origins)
-        colours, normals, distances = torch.empty(n, 4), torch.empty(n, 3), torch.empty(n)
+        colours, normals, distances = (torch.empty(shape, dtype=torch.float32) for shape in ((n, 4), (n, 3), (n,)))
         rays = [t.detach().float().contiguous() for t in (origins, directions)]
         surface, _, mesh = self._kept
         with stage(CPU):

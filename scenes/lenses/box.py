@@ -33,7 +33,7 @@ def _box(key: tuple, width: int, height: int, margin: float) -> tuple[float, flo
     edges = [(x, x * 0 - margin), (x, x * 0 + height + margin), (y * 0 - margin, y), (y * 0 + width + margin, y)]
     pixels = torch.cat([torch.stack(edge, -1) for edge in edges])
     rays = lens.unproject(pixels)
-    outward = pixels - torch.tensor([float(lens.cx), float(lens.cy)])
+    outward = pixels - torch.tensor([float(lens.cx), float(lens.cy)], dtype=torch.float64)
     last = math.tan(lens.limit()) * outward / outward.norm(dim=-1, keepdim=True)
     n = torch.where(rays[:, 2:] > 0, rays[:, :2], last)
     (left, top), (right, bottom) = n.amin(0).tolist(), n.amax(0).tolist()

@@ -1,11 +1,16 @@
 """Launching: compiling is said aloud once, and only where it takes a while."""
 
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from render import launch
+
+CPU = torch.device("cpu")
 
 
 class Kernel:
@@ -38,3 +43,41 @@ def test_a_kernel_is_compiled_once():
 
     over_sky(*picture(CAMERAS["pinhole"]), CAMERAS["pinhole"])
     assert {block_size for _, block_size in lay_behind.module.execs} == {1}
+
+
+def in_stage() -> tuple[int, int]:
+    """Threads that bands have in a stage, and torch after it."""
+    with launch.stage(CPU):
+        bands = launch._cores.threads
+    return bands, torch.get_num_threads()
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_a_thread_that_begins_during_anothers_stage_has_all_threads(three_threads):
+    with ThreadPoolExecutor(1) as first, ThreadPoolExecutor(1) as second:
+        with launch.stage(CPU):
+            assert first.submit(in_stage).result() == (3, 3)
+            torch.set_num_threads(1)  # as if this stage had begun after that one
+            second.submit(torch.get_num_threads).result()  # which is told 1, and may believe it
+        assert second.submit(in_stage).result() == (3, 3)
+        assert first.submit(in_stage).result() == (3, 3)
+    assert torch.get_num_threads() == 3 and launch._stages.open == 0
+
+
+def test_a_thread_keeps_what_it_was_set_to(three_threads):
+    def alone() -> tuple[int, int]:
+        torch.set_num_threads(1)
+        return in_stage()
+
+    told = []
+    worker = threading.Thread(target=lambda: told.append(alone()))
+    worker.start()
+    worker.join()
+    assert told == [(1, 1)] and in_stage() == (3, 3)

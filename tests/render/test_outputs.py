@@ -163,6 +163,13 @@ def test_what_is_hidden_in_the_other_frame_is_not_visible_there():
     assert hidden[26:36].sum() >= 3 and not hidden[45:].any() and hidden[:4].all()  # the leftmost pixels leave the picture
 
 
+def test_where_nothing_moves_everything_is_visible_through_thin_splats_too():
+    placed = two_instances(7)
+    frame = rasterize(placed, CAMERA, ("alpha", "visible_next"), flow_to={"next": (placed, CAMERA)})
+    assert ((frame.alpha > 0.01) & (frame.alpha < 0.5)).sum() > 50
+    assert frame.visible_next.all()
+
+
 def test_outputs_do_not_change_one_another():
     placed = two_instances(7)
     features = torch.randn(170, 5, generator=torch.Generator().manual_seed(0))

@@ -216,7 +216,7 @@ def test_extreme_motion_leaves_image_and_gradients_finite():
         ({"shutter": "global"}, "the camera has an end pose, which a global shutter never sees"),
         ({"lens": Equirectangular.whole(WIDTH, HEIGHT), "shutter": "columns"}, "no time at its seam"),
         ({"world_from_cam_end": START @ turned(70)}, "the camera turns by 70 degrees"),
-        ({"world_from_cam_end": START * torch.nan}, "the end pose of the camera is not finite"),
+        ({"world_from_cam_end": START * torch.nan}, "the end pose of camera is not finite"),
     ],
     ids=["global", "seam", "turn", "nan"],
 )
