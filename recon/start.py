@@ -41,7 +41,7 @@ BEYOND_PART = 0.06
 ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
-FILLED_PART = 0.8
+FILLED_PART = 0.9
 """Of the splat budget that all of these may take at most, with the ground that nobody saw and what fills holes."""
 
 SKY_HEIGHT = 256
