@@ -20,7 +20,7 @@ PRESSED = 0.008
 """Of its extent across the ground, what a splat on it loses in a step that pulls at it. A picture taken from a car tells hardly how thick a
 road is; seen at a grazing angle the upper sides of thick splats hide what is behind, and depth is too near."""
 
-PULLED, SUNK = 0.01, 0.005
+PULLED, SUNK = 0.01, 0.012
 """Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays; and metres
 that its middle then lies lower, since of splats that overlap the nearer is drawn first. Pictures of a straight drive do not tell a line
 painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds."""

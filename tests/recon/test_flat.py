@@ -80,7 +80,7 @@ def test_what_is_pressed_for_long_lies_flat_along_the_slope():
     assert (matrix_from_quat(splats.fields["quats"])[:30].transpose(1, 2) @ UP).abs().amax(1).min() > 0.99
 
 
-@pytest.mark.parametrize(("height", "flat"), [(0.9 * ON, True), (-0.9 * ON, True), (1.1 * ON, False), (-1.1 * ON, False)])
+@pytest.mark.parametrize(("height", "flat"), [(0.8 * ON, True), (-0.8 * ON, True), (1.2 * ON, False), (-1.2 * ON, False)])
 def test_only_what_lies_on_the_ground_and_moved_is_pressed(height, flat):
     """On ground that is no plane."""
     bumpy = ground_of(lambda x, y: torch.sin(x) + torch.cos(0.7 * y) * x / 5)
