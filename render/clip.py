@@ -13,7 +13,7 @@ from render.room import Room, one_ahead
 from scenes.camera import Camera
 from scenes.metres import require_metres
 from scenes.scene import Scene
-from scenes.trajectory import Trajectory
+from scenes.trajectory import Trajectory, whole_times
 
 
 def render_clip(
@@ -57,7 +57,7 @@ def clip_cameras(
     if not isinstance(shift, Trajectory) and shift != 0:
         require_metres(scene, "a lateral shift")
     ego = shift if isinstance(shift, Trajectory) else scene.ego.shifted(lateral=shift)
-    times = scene.frame_times(camera) if times_us is None else torch.as_tensor(times_us, dtype=torch.int64)
+    times = scene.frame_times(camera) if times_us is None else whole_times(times_us)
     if len(times) == 0:
         raise ValueError(f"a clip of {camera} needs at least one frame, got no times")
     return [rig_camera.along(ego, int(t)) for t in times]

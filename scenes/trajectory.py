@@ -11,6 +11,20 @@ import torch
 from scenes.checks import check_tensor
 from scenes.poses import as_pose, interpolate, translation
 
+_SECONDS = "seconds times 1e6, rounded"
+
+
+def whole_times(times_us) -> torch.Tensor:
+    """Times as int64 `[T]` of whatever torch reads. ValueError where one is no whole number of microseconds."""
+    times = torch.as_tensor(times_us)
+    if not times.is_floating_point():
+        return times.to(torch.int64)
+    times = torch.as_tensor(times_us, dtype=torch.float64)  # of Python's floats, float32 would be too coarse
+    broken = times != times.round()  # nan is, too
+    if broken.any():
+        raise ValueError(f"times_us must be whole microseconds, got {float(times[broken][0])}; {_SECONDS}")
+    return times.to(torch.int64)
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -24,7 +38,7 @@ class Trajectory:
     world_from_body: torch.Tensor
 
     def __post_init__(self):
-        object.__setattr__(self, "times_us", torch.as_tensor(self.times_us, dtype=torch.int64))
+        object.__setattr__(self, "times_us", whole_times(self.times_us))
         object.__setattr__(self, "world_from_body", as_pose(self.world_from_body))
         check_tensor("times_us", self.times_us, ("T",), torch.int64)
         t = self.times_us.shape[0]
@@ -59,6 +73,8 @@ class Trajectory:
 
     def at(self, time_us: int) -> torch.Tensor:
         """`world_from_body` `[4, 4]` at a time: slerp and lerp between neighbours. ValueError where not covered."""
+        if int(time_us) != time_us:
+            raise ValueError(f"a time must be whole microseconds, got {time_us}; {_SECONDS}")
         if not self.covers(time_us):
             first, last = self.span_us()
             raise ValueError(f"time {int(time_us)} us is outside the trajectory, which covers {first} to {last} us")

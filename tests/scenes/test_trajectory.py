@@ -81,3 +81,13 @@ def test_one_pose_stands_still_for_ever():
 def test_impossible_trajectories_are_refused(times, count, said):
     with pytest.raises(ValueError, match=said):
         Trajectory(torch.tensor(times, dtype=torch.int64), poses(count))
+
+
+def test_times_that_are_no_whole_microseconds_are_refused_and_not_cut():
+    with pytest.raises(ValueError, match="times_us must be whole microseconds, got 0.6; seconds times 1e6"):
+        Trajectory([0.0, 0.6], poses(2))
+    path = Trajectory([0.0, 1.7e15 + 1], poses(2))
+    assert path.times_us.tolist() == [0, 1_700_000_000_000_001]
+    with pytest.raises(ValueError, match="a time must be whole microseconds, got 50.7"):
+        path.at(50.7)
+    assert torch.equal(path.at(50.0), path.at(50))
