@@ -23,7 +23,7 @@ from enhance.grain import Excess, Grain, without
 from enhance.objects import LUMA
 from enhance.past import LONG, alike
 from enhance.samples import PHOTO_SUFFIXES, frames_of, shrunk
-from enhance.step import Steps, checked
+from enhance.step import Steps, check_rgb, checked
 from render.frame_types import Frame
 
 GRID = (12, 20)
@@ -53,9 +53,10 @@ class Grade:
     """
 
     def __init__(self, photos: Iterable[torch.Tensor]):
-        """Of pictures `[H, W, 3]` in 0..1, best as wide as the frames. ValueError where there are none."""
+        """Of pictures `[H, W, 3]` in 0..1, best as wide as the frames. ValueError where there are none, or one is no such picture."""
         colours, ranks, self.grains = [], [], []
-        for photo in photos:
+        for i, photo in enumerate(photos):
+            check_rgb(f"photo {i}", photo)
             small = _small(photo)
             colours.append(Colours.of(small.flatten(0, 1)))
             ranks.append(_ranks(small))

@@ -9,7 +9,7 @@ import torch
 
 from render.frame_types import Frame
 from scenes.camera import Camera
-from scenes.checks import check_tensor
+from scenes.checks import check_floats, check_tensor
 from scenes.lenses import Pinhole
 
 BYTES = 2.0
@@ -51,15 +51,8 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         reference = None if frame.reference is None or frame.trust is None else (frame.reference, frame.trust)
     else:
         rgb, flow, instance, need, reference = frame, None, None, None, None
-    check_tensor("rgb", rgb, ("H", "W", 3))
+    check_rgb("rgb", rgb, rendered=isinstance(frame, Frame))
     height, width = rgb.shape[:2]
-    if height == 0 or width == 0:
-        raise ValueError(f"rgb must hold pixels, got {width}x{height}")
-    if not rgb.is_floating_point():
-        raise ValueError(f"rgb must be floats in 0..1, got {rgb.dtype}; divide bytes by 255")
-    _check_finite("rgb", rgb)
-    if not isinstance(frame, Frame) and (mean := float(rgb.mean(dtype=torch.float32))) > BYTES:  # a render may be that bright
-        raise ValueError(f"rgb must be floats in 0..1, but its mean is {mean:.4g}; divide bytes by 255")
     if flow is not None:
         check_tensor("flow_prev", flow, (height, width, 2))
     if instance is not None:
@@ -74,6 +67,18 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         _check_finite("trust", reference[1])
         reference = reference[0], reference[1].clamp(0, 1)
     return Given(rgb, flow, instance, need, reference)
+
+
+def check_rgb(name: str, rgb: torch.Tensor, rendered: bool = False) -> None:
+    """ValueError unless `[H, W, 3]` holds pixels, finite floats in 0..1, or about so: what is rendered may be as bright as bytes are."""
+    check_tensor(name, rgb, ("H", "W", 3))
+    height, width = rgb.shape[:2]
+    if height == 0 or width == 0:
+        raise ValueError(f"{name} must hold pixels, got {width}x{height}")
+    check_floats(name, rgb)
+    _check_finite(name, rgb)
+    if not rendered and (mean := float(rgb.mean(dtype=torch.float32))) > BYTES:
+        raise ValueError(f"{name} must be floats in 0..1, but its mean is {mean:.4g}; divide bytes by 255")
 
 
 def frame_of(rgb: torch.Tensor, instance: torch.Tensor | None) -> Frame:

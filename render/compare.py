@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from scenes.checks import check_tensor
+from scenes.checks import check_floats, check_tensor
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> float:
@@ -44,6 +44,8 @@ def ssim(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None = None) -> 
 def _check(a: torch.Tensor, b: torch.Tensor, mask: torch.Tensor | None) -> None:
     check_tensor("the first image", a, ("H", "W", 3))
     check_tensor("the second image", b, tuple(a.shape))
+    check_floats("the first image", a)
+    check_floats("the second image", b)
     if mask is not None:
         check_tensor("mask", mask, tuple(a.shape[:2]), torch.bool)
         if not mask.any():

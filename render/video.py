@@ -13,7 +13,7 @@ import torch
 
 from render.matroska import lacking
 from scenes.atomic import atomic_file
-from scenes.checks import check_tensor
+from scenes.checks import check_floats, check_tensor
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 TICK = Fraction(1, 90_000)
@@ -23,8 +23,11 @@ BT709 = 1  # the code point of ITU-R BT.709 in H.264, for primaries, transfer an
 
 
 def to_bytes(rgb: torch.Tensor) -> np.ndarray:
-    """uint8 `[H, W, 3]` of an image `[H, W, 3]`, clamped to 0..1 and rounded."""
+    """uint8 `[H, W, 3]` of an image `[H, W, 3]`, clamped to 0..1 and rounded. ValueError of bytes, and of nan."""
     check_tensor("an image", rgb, ("H", "W", 3))
+    check_floats("an image", rgb)
+    if torch.isnan(rgb.sum()) and (lost := int(rgb.isnan().any(-1).sum())):  # one nan makes the sum so
+        raise ValueError(f"an image holds nan in {lost} of its {rgb.shape[0] * rgb.shape[1]} pixels; look for where it was made")
     return (rgb.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 

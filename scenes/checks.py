@@ -3,6 +3,12 @@
 import torch
 
 
+def check_floats(name: str, image: torch.Tensor) -> None:
+    """ValueError unless a picture holds floats: bytes are 0..255, and would be taken as white."""
+    if not image.is_floating_point():
+        raise ValueError(f"{name} must be floats in 0..1, got {image.dtype}; divide bytes by 255")
+
+
 def check_tensor(name: str, value, shape: tuple, dtype: torch.dtype | None = None) -> None:
     """Raise ValueError unless `value` is a tensor of `shape`; a str in `shape` matches any size."""
     if isinstance(value, torch.Tensor) and value.ndim == len(shape) and (dtype is None or value.dtype == dtype):

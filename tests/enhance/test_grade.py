@@ -172,3 +172,17 @@ def test_photos_that_are_not_there_are_refused_before_anything_is_written(tmp_pa
     assert not (tmp_path / "out").exists()
     with pytest.raises(ValueError, match="no photos"):
         Grade([])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda p: (p * 255).to(torch.uint8), "photo 1 must be floats in 0..1, got torch.uint8; divide bytes by 255"),
+        (lambda p: p * 255, "photo 1 must be floats in 0..1, but its mean is"),
+        (lambda p: p.index_fill(0, torch.tensor(3), torch.nan), "photo 1 holds a value that is not finite at row 3, column 0"),
+    ],
+)
+def test_photos_that_are_no_pictures_in_0_to_1_are_refused_by_number(spoil, why):
+    first, second = photos(1, 2)
+    with pytest.raises(ValueError, match=why):
+        Grade([first, spoil(second)])

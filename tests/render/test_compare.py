@@ -48,3 +48,9 @@ def test_noise_lowers_ssim_more_than_a_shift_of_brightness():
     a = torch.rand(32, 32, 3, generator=generator) * 0.5 + 0.2
     noisy = a + 0.05 * torch.randn(32, 32, 3, generator=generator)
     assert ssim(a, noisy) < ssim(a, a + 0.05) < 1
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_bytes_are_refused_and_not_compared_as_if_they_were_white(metric):
+    with pytest.raises(ValueError, match="the second image must be floats in 0..1, got torch.uint8"):
+        metric(torch.zeros(12, 12, 3), torch.zeros(12, 12, 3, dtype=torch.uint8))

@@ -155,3 +155,11 @@ def test_a_file_that_is_no_image_is_named(tmp_path):
     (tmp_path / "a.png").write_text("not a picture")
     with pytest.raises(ValueError, match=r"a\.png does not decode"):
         read_image(tmp_path / "a.png")
+
+
+def test_bytes_and_nan_are_refused_and_not_written_as_white_or_black(tmp_path):
+    with pytest.raises(ValueError, match="got torch.uint8; divide bytes by 255"):
+        write_image(tmp_path / "a.png", torch.full((4, 4, 3), 128, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="nan in 1 of its 16 pixels"):
+        write_image(tmp_path / "a.png", torch.zeros(4, 4, 3).index_put((torch.tensor(1), torch.tensor(2)), torch.tensor(torch.nan)))
+    assert not list(tmp_path.iterdir())
