@@ -79,7 +79,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4, an
     fraction = next((bits for bits in range(_FRACTION, -1, -1) if largest * 2**bits <= 2**23 - 1), None)
     if fraction is None:
         raise ValueError(f"{path}: a splat is {largest:.6g} m from the origin; SPZ holds 8388607 m at most")
-    fixed = np.rint(g["means"].astype(np.float64) * 2**fraction).astype("<i4")
+    fixed = np.ascontiguousarray(np.rint(g["means"].astype(np.float64) * 2**fraction), "<i4")
     sh = np.rint(g["sh"][:, 1:].astype(np.float64) * 128) + 128
     steps = np.where(np.arange(1, k) < 4, _DEGREE_1_STEP, _HIGHER_STEP)[:, None]
     blocks = [
