@@ -84,14 +84,14 @@ class Lens:
         return type(self), *self.params().tolist()
 
 
-def first_fall(margin: Callable[[torch.Tensor], torch.Tensor], end: float) -> float:
-    """The largest x up to `end` such that margin `[n] -> [n]` is positive on all of (0, x), by a dense look and then bisection."""
-    x = torch.linspace(0, end, _STEPS + 1, dtype=torch.float64)[1:-1]
+def first_fall(margin: Callable[[torch.Tensor], torch.Tensor], end: float, steps: int = _STEPS) -> float:
+    """The largest x up to `end` such that margin `[n] -> [n]` is positive on all of (0, x), by a look at all steps and then bisection."""
+    x = torch.linspace(0, end, steps + 1, dtype=torch.float64)[1:-1]
     bad = ~(margin(x) > 0)
     if not bad.any():
         return end
     high = float(x[int(bad.nonzero()[0])])
-    low = high - end / _STEPS
+    low = high - end / steps
     for _ in range(50):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if bool((margin(torch.tensor([middle], dtype=torch.float64)) > 0).all()) else (low, middle)

@@ -10,6 +10,9 @@ import torch
 
 from scenes.lenses.lens import Lens, Number, first_fall, kept, solve_rising
 
+RING_STEPS = 256
+"""Angles at which the determinant is looked at in all directions, before the first where it falls is looked into."""
+
 
 @dataclass(frozen=True)
 class OpenCV(Lens):
@@ -80,7 +83,7 @@ class OpenCV(Lens):
         return factor + 2 * r * r * slope
 
     def _radial_limit(self) -> float:
-        return _radial_fold(self)
+        return math.tan(min(_radial_fold(self), math.radians(89.9)))
 
     def _distort(self, n: torch.Tensor) -> torch.Tensor:
         x, y = n.unbind(-1)
@@ -115,15 +118,17 @@ def _denominator(lens: OpenCV, q: torch.Tensor) -> torch.Tensor:
 
 @kept
 def _fold(lens: OpenCV) -> float:
+    radial = _radial_fold(lens)
+    if not any(float(v) for v in (lens.p1, lens.p2, lens.s1, lens.s2, lens.s3, lens.s4)):
+        return radial  # alike in all directions: as long as the radius rises, so does all else
     around = torch.linspace(0, 2 * math.pi, 73, dtype=torch.float64)[:-1]
     ring = torch.stack([around.cos(), around.sin()], -1)
 
-    def margin(angle: torch.Tensor) -> torch.Tensor:
-        r = angle.tan()
-        least = torch.linalg.det(lens._jacobian(r[:, None, None] * ring)).amin(-1)
-        return torch.minimum(torch.minimum(least, _denominator(lens, r * r)), lens._radial_slope(r))
+    def least(angle: torch.Tensor) -> torch.Tensor:
+        (a, b), (c, d) = (row.unbind(-1) for row in lens._jacobian(angle.tan()[:, None, None] * ring).unbind(-2))
+        return (a * d - b * c).amin(-1)
 
-    return first_fall(margin, math.pi / 2)
+    return min(radial, first_fall(least, math.pi / 2, RING_STEPS))
 
 
 @kept
@@ -132,4 +137,4 @@ def _radial_fold(lens: OpenCV) -> float:
         r = angle.tan()
         return torch.minimum(_denominator(lens, r * r), lens._radial_slope(r))
 
-    return math.tan(min(first_fall(margin, math.pi / 2), math.radians(89.9)))
+    return first_fall(margin, math.pi / 2)

@@ -168,3 +168,25 @@ def test_a_saved_scene_keeps_its_lenses_and_shutters(lens, tmp_path):
     save(replace(scene, rig={"left": camera}), tmp_path / "s")
     again = load(tmp_path / "s").rig["left"]
     assert again.lens == lens and (again.shutter, again.readout_us) == ("columns", 31_000)
+
+
+def test_where_a_bent_lens_ends_is_found_as_by_looking_at_every_angle_and_at_once(monkeypatch):
+    looked = []
+    jacobian = OpenCV._jacobian
+    monkeypatch.setattr(OpenCV, "_jacobian", lambda lens, n: looked.append(n.numel()) or jacobian(lens, n))
+    generator = torch.Generator().manual_seed(0)
+    around = torch.linspace(0, 2 * math.pi, 361, dtype=torch.float64)
+    for bent in (0.0, 0.02, 0.2):
+        for _ in range(4):
+            k = (torch.rand(12, generator=generator, dtype=torch.float64) - 0.5) * 0.4
+            k[2:4], k[8:] = k[2:4] * bent, k[8:] * bent
+            lens = OpenCV(60.0, 60.0, 32.0, 24.0, *k.tolist())
+            looked.clear()
+            limit = lens.limit()
+            assert sum(looked) < 60_000
+            # inside, every direction sees; just outside, some direction does not, or nothing is left to see
+            for angle, sees in ((limit - 1e-3, True), (limit + 1e-3, False)):
+                if angle < math.pi / 2 - 2e-3:
+                    ring = torch.stack([around.cos(), around.sin()], -1) * math.tan(angle)
+                    det = torch.linalg.det(jacobian(lens, ring))
+                    assert bool((det > 0).all()) == sees or bent == 0
