@@ -16,6 +16,7 @@ from enhance.step import Steps, checked
 from enhance.tiles import Tiles
 from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, is_net, load_net
 from render.frame_types import Frame
+from scenes.opening import check_device
 
 LONGEST = 4
 """Frames that needed nothing after which the past is given up: each that is followed blurs it."""
@@ -78,8 +79,9 @@ class Enhancer:
     def load(cls, weights: str | Path = "builtin", device: str | torch.device = "cpu", **how) -> Steps:
         """The shipped weights ("builtin"), a file that `sidestep train` wrote, or a public model's checkpoint, which `open_public` names.
 
-        FileNotFoundError where there is none, ValueError where it is not whole or not an enhancer's.
+        FileNotFoundError where there is none, ValueError where it is not whole or not an enhancer's, or there is no such device.
         """
+        check_device(device)
         if weights == "builtin" or is_net(weights):
             net, about = load_net(BUILTIN if weights == "builtin" else weights)
             return cls(net, about, device, **how)

@@ -40,7 +40,7 @@ from scenes.atomic import atomic_folder
 from scenes.camera import RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
-from scenes.opening import fresh
+from scenes.opening import check_device, fresh
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 from scenes.space_order import space_order
@@ -99,6 +99,7 @@ def reconstruct(
     Raises ValueError for data and options that do not fit, FileExistsError where `check_free` does, KeyboardInterrupt passed on.
     """
     output = check_free(output, resume, overwrite)
+    check_device(device)
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
     check_path(log, span)

@@ -28,18 +28,22 @@ class RenderConfig:
     termination: float = 1e-4
     faint: float = 0.0
     max_error: float | None = None
-    order: str = "tile"
+    order: str | None = None
     most_entries: int = 1 << 25
 
     def __post_init__(self):
+        if self.order not in (None, "tile", "pixel"):
+            raise ValueError(f'order must be "tile" or "pixel", got {self.order!r}')
         if self.max_error is not None:
+            if self.order == "tile":
+                raise ValueError('max_error is kept in order "pixel" only; leave order="tile" out, or max_error')
             for name, limit in split(self.max_error).items():
                 object.__setattr__(self, name, limit)
+        elif self.order is None:
+            object.__setattr__(self, "order", "tile")
         for name in ("alpha_cutoff", "termination", "faint"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
-        if self.order not in ("tile", "pixel"):
-            raise ValueError(f'order must be "tile" or "pixel", got {self.order!r}')
         if not 1 <= self.most_entries < 2**31:
             raise ValueError(f"most_entries must be at least 1 and below 2^31, got {self.most_entries}")
         if not 0 < self.alpha_max <= 1:

@@ -99,6 +99,9 @@ def rasterize(
     check(placed, camera, outputs, flow_to, model)
     background = None if background is None else torch.as_tensor(background)
     check_part(camera, background, crop, mask)
+    if crop is not None:
+        x, y, width, height = crop
+        crop = x, y, width, height  # a list would be no key of what is kept
     with stage(placed[0].gaussians.device):
         return _draw(placed, camera, outputs, background, flow_to, model, config, features, crop, mask, room)
 
@@ -188,6 +191,9 @@ def as_placed(splats) -> list[Placed]:
     if isinstance(splats, Gaussians):
         splats = Placed(splats, torch.eye(4, dtype=torch.float64))
     placed = [splats] if isinstance(splats, Placed) else list(splats)
+    for p in placed:
+        if not isinstance(p, Placed):
+            raise ValueError(f"a sequence of splats must be of Placed, got {type(p).__name__}; write Placed(splats, pose, instance=...)")
     return placed or [Placed(Gaussians.empty(), torch.eye(4, dtype=torch.float64))]
 
 

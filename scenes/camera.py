@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 
 import torch
 
@@ -28,8 +29,8 @@ def check_shutter(shutter: str, readout_us: int) -> None:
 
 
 def check_size(width: int, height: int) -> None:
-    if width < 1 or height < 1:
-        raise ValueError(f"a camera must be at least 1x1 pixels, got {width}x{height}")
+    if not (isinstance(width, Integral) and isinstance(height, Integral) and width >= 1 and height >= 1):
+        raise ValueError(f"a camera must have whole numbers of at least 1x1 pixels, got {width}x{height}")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
+from numbers import Integral
 
 import torch
 
@@ -33,8 +35,8 @@ class SplatModel:
             raise ValueError(f"projection must be one of {', '.join(PROJECTIONS)}, got {self.projection!r}")
         if self.response not in RESPONSES:
             raise ValueError(f"response must be one of {', '.join(RESPONSES)}, got {self.response!r}")
-        if not self.dilation >= 0:
-            raise ValueError(f"dilation must be at least 0 px^2, got {self.dilation}")
+        if not 0 <= self.dilation < math.inf:
+            raise ValueError(f"dilation must be at least 0 px^2 and finite, got {self.dilation}")
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,8 @@ class Placed:
     lattice: Lattice | None = None
 
     def __post_init__(self):
+        if not isinstance(self.instance, Integral):
+            raise ValueError(f"instance must be a whole number, got {self.instance!r}")
         for name in ("world_from_local", "world_from_local_end"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_pose(getattr(self, name)))

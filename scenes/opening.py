@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from scenes.atomic import need_folder
 
 if TYPE_CHECKING:
+    import torch
+
     from scenes import Asset, Gaussians, Scene
 
 
@@ -33,11 +35,11 @@ def scene_folder(path: str | Path) -> Path:
     return path.parent if path.name == "scene.usda" else path
 
 
-def check_device(device: str) -> None:
+def check_device(device: str | torch.device) -> None:
     """ValueError where the machine has no such device."""
     import torch
 
-    if device == "cuda" and not torch.cuda.is_available():
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
         raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
 
 

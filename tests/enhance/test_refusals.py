@@ -10,6 +10,7 @@ from small_net import stirred
 
 from enhance.clips import PairConfig
 from enhance.commands import Pairs, Train
+from enhance.enhancer import Enhancer
 from enhance.evaluate import main
 from enhance.pairs import make_pairs
 from enhance.photo_pairs import make_photo_pairs
@@ -18,6 +19,7 @@ from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.step import checked
 from enhance.train import train
 from enhance.weights_file import REPAIR_GAIN, load_net, save_net
+from recon.build import reconstruct
 from render.frame_types import Frame
 from render.video import write_image
 from scenes import save
@@ -238,3 +240,12 @@ def test_weights_are_never_trained_over(tmp_path):
         with pytest.raises(FileExistsError, match=r"enhancer.safetensors exists already.*choose another folder"):
             train(pairs, out, steps=4, config=QUICK, resume=resume)
     assert [p.read_bytes() for p in out.iterdir()] == [b"someone's weights"]
+
+
+def test_a_gpu_that_is_not_there_is_refused_before_anything_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for device in ("cuda", "cuda:0", torch.device("cuda")):
+        with pytest.raises(ValueError, match="no CUDA device that torch can use"):
+            Enhancer.load("nowhere", device=device)
+    with pytest.raises(ValueError, match="no CUDA device that torch can use"):
+        reconstruct(None, tmp_path / "scene", device="cuda")

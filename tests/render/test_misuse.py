@@ -7,7 +7,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from render.captured import Captured
-from scenes import Camera, Gaussians, Pinhole, Placed
+from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.camera import neutral_exposure
 from scenes.poses import translation
 from tests.bench.presets import random_splats
@@ -136,3 +136,26 @@ def test_what_torch_makes_by_default_changes_nothing(order, request):
     for mine, same in zip(drawn(), expected, strict=True):
         assert mine.dtype == same.dtype and torch.equal(mine, same)
     assert len(rasterize([], CAMERA, ("rgb",)).rgb) == CAMERA.height and neutral_exposure().dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (lambda: rasterize([ahead(), ahead()], CAMERA), "must be of Placed, got Gaussians"),
+        (lambda: RenderConfig(max_error=0.01, order="tile"), 'max_error is kept in order "pixel" only'),
+        (lambda: RenderConfig(order="depth"), 'order must be "tile" or "pixel"'),
+        (lambda: Placed(ahead(), torch.eye(4, dtype=torch.float64), instance=1.5), "instance must be a whole number, got 1.5"),
+        (lambda: replace(CAMERA, width=43.5), "whole numbers of at least 1x1 pixels, got 43.5x50"),
+        (lambda: SplatModel(dilation=float("inf")), "dilation must be at least 0 px.2 and finite"),
+        (
+            lambda: rasterize(ahead().map(lambda t: t.clone().requires_grad_()), CAMERA, room=Room()),
+        ),
+    ],
+)
+def test_what_would_be_drawn_otherwise_than_asked_for_is_refused(make, why):
+    with pytest.raises(ValueError, match=why):
+        make()
+
+
+def test_a_crop_may_be_a_list():
+    assert torch.equal(rasterize(ahead(), CAMERA, crop=[5, 6, 20, 10]).rgb, rasterize(ahead(), CAMERA).rgb[6:16, 5:25])
