@@ -11,6 +11,7 @@ from render.frame_types import Frame, RenderConfig
 from render.outputs import check_scene_outputs
 from render.room import Room, one_ahead
 from scenes.camera import Camera
+from scenes.files import splats_of
 from scenes.metres import require_metres
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory, whole_times
@@ -119,5 +120,7 @@ def _frames(scene: Scene, cameras: list[Camera], outputs: tuple[str, ...], shado
         following = cameras[i + 1] if i < last else None
         return render_frame(scene, cameras[i], wanted, previous, following, shadows, config, room)
 
-    room = Room() if scene.background.gaussians.device.type == "cuda" else None
+    splats = [g for _, g in splats_of(scene)]
+    gradients = torch.is_grad_enabled() and any(t.requires_grad for g in splats for t in g.tensors().values())
+    room = Room() if splats[0].device.type == "cuda" and not gradients else None
     yield from map(draw, range(len(cameras))) if room is None else one_ahead(draw, range(len(cameras)), room)

@@ -83,7 +83,8 @@ def rasterize(
     needs an instance id of its own. features: a further
     field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
     the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
-    nothing stands. room: what earlier frames needed, so that the host does not wait for this one (`render/room.py`, `one_ahead`).
+    nothing stands. room: what earlier frames needed, so that the host does not wait for this one, without gradients; the frame may
+    lack splats until `room.held` has said otherwise, as `one_ahead` asks (`render/room.py`).
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
     instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. What is found out about
@@ -110,7 +111,12 @@ def _draw(
     placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None, room=None
 ) -> Frame:
     seen = None
-    if not differentiated(placed, camera, features):
+    if differentiated(placed, camera, features):
+        if room is not None:
+            raise ValueError(
+                "a room is for frames without gradients, which may lack splats; leave room= out, or draw under torch.no_grad()"
+            )
+    else:
         placed = [replace(p, gaussians=without_zero_bands(p.gaussians)) for p in placed]
         seen = in_sight(placed, camera, model)
     cam_from_local = poses(camera, placed)

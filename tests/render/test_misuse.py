@@ -7,6 +7,7 @@ import torch
 
 from render import RenderConfig, rasterize
 from render.captured import Captured
+from render.room import Room
 from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.camera import neutral_exposure
 from scenes.poses import translation
@@ -149,6 +150,7 @@ def test_what_torch_makes_by_default_changes_nothing(order, request):
         (lambda: SplatModel(dilation=float("inf")), "dilation must be at least 0 px.2 and finite"),
         (
             lambda: rasterize(ahead().map(lambda t: t.clone().requires_grad_()), CAMERA, room=Room()),
+            "a room is for frames without gradients",
         ),
     ],
 )
