@@ -80,6 +80,8 @@ def test_wrong_arguments_are_refused_before_the_first_frame(street):
         render_clip(street, "front_camera", times_us=[])
     with pytest.raises(ValueError, match="outside the trajectory"):
         render_clip(street, "front_camera", times_us=[0])
+    with pytest.raises(ValueError, match="times_us must be whole microseconds, got 0.5; seconds times 1e6"):
+        render_clip(street, "front_camera", times_us=[0.5])
     with pytest.raises(ValueError, match="go together"):
         render_clip(street, "front_camera", width=64)
 
