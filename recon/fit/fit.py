@@ -164,7 +164,7 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            closing = shown.held(self.flat_ground.on(shown), ("means", "quats", "log_scales"))
+            closing = shown.held(self.flat_ground.on(shown), ("means", "quats"))
             haze = haze + self.openings.gaps(draw(self._placed(closing, view, aside), aside, "alpha")[0], aside)
         for weight, there in known:
             haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 import warp as wp
 from scipy import ndimage
 
-from recon.fit.descent import Descent
+from recon.fit.descent import COLOURS, Descent
 from recon.fit.model import Splats
 from recon.kernels.descent import Rates
 from recon.kernels.press import Grid, press
@@ -31,6 +31,10 @@ ON = 0.08
 NEAR = 0.3
 """Metres from the ground within which splats that no picture shows are the street's."""
 
+UNSEEN_PRESSED = 0.1
+"""The same of splats that no picture shows, however thick: where a picture from aside would see between them they may grow, but
+along the ground alone, not into fog over it."""
+
 THIN = 0.03
 """Metres of a splat's standard deviation across the ground at most, once it is laid there."""
 
@@ -51,8 +55,8 @@ class FlatGround:
         (self.grid.x, self.grid.y), self.grid.cell = ground.origin, ground.cell
 
     def on(self, splats: Splats) -> torch.Tensor:
-        """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground. To hide a gap there only opacity may be raised: it
-        pays, too, to swell into fog over the road that no recorded picture shows."""
+        """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground: to hide a gap there they stay where and as they
+        lie. It would pay, too, to rise and to turn up, as fog over the road that no recorded picture shows."""
         means = splats.fields["means"].detach()
         at = (means[:, :2] - means.new_tensor(self.ground.origin)) / self.ground.cell
         (rows, columns), (x, y) = self.heights.shape, at.round().long().T
@@ -87,4 +91,5 @@ class FlatGround:
             moved = [view(which, wp.int64), splats.sizes[0], view(descent.last, float), rates.now]
             ground = [self.grid, view(self.heights, float), view(self.slopes, wp.vec2), settle * PRESSED, ON]
             pull = [wp.vec3(*eye.tolist()), settle * PULLED]
-            run(press, len(which), [*moved, *ground, *pull, *fields], which.device)
+            unseen = [view(descent.moments, float), COLOURS, settle * UNSEEN_PRESSED]
+            run(press, len(which), [*moved, *ground, *pull, *unseen, *fields], which.device)

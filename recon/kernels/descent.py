@@ -130,7 +130,7 @@ def descend(
     if size > 0.0:
         pull[i] = pull[i] + size
         pulled[i] = pulled[i] + 1.0
-    if size > 0.0 or g_logits[k] != 0.0:  # what closes a gap on the ground is pulled at by its opacity alone
+    if size > 0.0 or g_logits[k] != 0.0:  # what closes a gap on the ground is not pulled from its place
         last[i] = rates.now
         move = wp.vec3()
         grow = wp.vec3()
