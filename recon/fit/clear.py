@@ -48,9 +48,8 @@ class Clear:
         through, there = torch.zeros(2, len(asked), dtype=torch.int64)
         for image in self.images:
             near = ((means[asked] - torch.from_numpy(image.middle)).norm(dim=1) < FAR).nonzero()[:, 0]
-            places = means[asked[near]].numpy()
-            beyond, struck = image.votes(places)
-            through[near] += torch.from_numpy(beyond | image.silent(places))
+            beyond, struck = image.votes_with_silence(means[asked[near]].numpy())
+            through[near] += torch.from_numpy(beyond)
             there[near] += torch.from_numpy(struck)
             left = there <= THERE * len(self.images)  # others have been struck too often, whatever is still to come
             asked, through, there = asked[left], through[left], there[left]

@@ -26,7 +26,7 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at
 from recon.fit.turns import Turns
-from recon.fit.unseen import LOW, above, as_neighbours, curtains, shown_parts
+from recon.fit.unseen import LOW, as_neighbours, curtains, off_ground, shown_parts
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -282,7 +282,7 @@ class Fit:
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         part = part[stays]
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
-        self.flat_ground.lay(self.splats, self.guessed & (above(self.splats, self.ground) < LOW))
+        self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
         self.descent.still_colours(self.guessed)
 
     def _settled(self) -> float:

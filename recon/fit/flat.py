@@ -29,11 +29,11 @@ ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
 
 NEAR = 0.3
-"""Metres from the ground within which splats that no picture shows are the street's."""
+"""Metres from the ground within which what hides a gap there is the street, and stays where and as it lies."""
 
 UNSEEN_PRESSED = 0.1
-"""The same of splats that no picture shows, however thick: where a picture from aside would see between them they may grow, but
-along the ground alone, not into fog over it."""
+"""What `PRESSED` is of the rest, of splats on the ground that no picture shows, however thick: where a picture from aside would see between
+them they may grow, but along the ground alone, not into fog over it."""
 
 THIN = 0.03
 """Metres of a splat's standard deviation across the ground at most, once it is laid there."""
@@ -55,33 +55,33 @@ class FlatGround:
         (self.grid.x, self.grid.y), self.grid.cell = ground.origin, ground.cell
 
     def on(self, splats: Splats) -> torch.Tensor:
-        """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground: to hide a gap there they stay where and as they
-        lie. It would pay, too, to rise and to turn up, as fog over the road that no recorded picture shows."""
+        """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground. To hide a gap there it would pay to rise and to
+        turn up, too, as fog over the road that no recorded picture shows."""
         means = splats.fields["means"].detach()
-        at = (means[:, :2] - means.new_tensor(self.ground.origin)) / self.ground.cell
-        (rows, columns), (x, y) = self.heights.shape, at.round().long().T
-        near = (means[:, 2] - self.heights[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]).abs() < NEAR
+        near = (means[:, 2] - self.heights[self._cells(means)]).abs() < NEAR
         near[splats.sizes[0] :] = False
         return near
 
     def lay(self, splats: Splats, which: torch.Tensor) -> None:
         """Put splats, bool `[N]`, onto the ground and flatten them, in place: such as no picture shows, of which nothing else is known."""
         means = splats.fields["means"][which]
-        at = means[:, :2].double().cpu()
-        z = self.ground.height(at).to(means)
-        row, column = ((at.flip(1) - at.new_tensor(self.ground.origin[::-1])) / self.ground.cell).round().long().T
-        rows, columns = self.ground.heights.shape
-        slope = self.slopes[row.clamp(0, rows - 1).to(z.device), column.clamp(0, columns - 1).to(z.device)]
-        up = F.normalize(torch.cat([-slope, torch.ones_like(z)[:, None]], 1))
+        z = self.ground.height(means[:, :2].cpu()).to(means)
+        up = F.normalize(torch.cat([-self.slopes[self._cells(means)], torch.ones_like(z)[:, None]], 1))
         axes = matrix_from_quat(splats.fields["quats"][which]) * splats.fields["log_scales"][which].exp()[:, None]
-        thick = (axes * up[:, :, None]).sum(1).norm(dim=1)
-        lost = (1 - THIN / thick).clamp_min(0)
-        axes = axes - lost[:, None, None] * up[:, :, None] * (axes * up[:, :, None]).sum(1, keepdim=True)
+        across = (axes * up[:, :, None]).sum(1, keepdim=True)
+        lost = (1 - THIN / across.norm(dim=2, keepdim=True)).clamp_min(0)
+        axes = axes - lost * up[:, :, None] * across
         turned, extents, _ = torch.linalg.svd(axes)
         turned[:, :, 2] *= torch.linalg.det(turned)[:, None]
         splats.fields["means"][which] = torch.cat([means[:, :2], z[:, None]], 1)
         splats.fields["quats"][which] = quat_from_matrix(turned)
         splats.fields["log_scales"][which] = extents.clamp_min(1e-6).log()
+
+    def _cells(self, means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Row and column `[N]` of the cells nearest to means `[N, 3]`, those at the edge of what is beyond."""
+        (rows, columns), at = self.heights.shape, (means[:, :2] - means.new_tensor(self.ground.origin)) / self.ground.cell
+        x, y = at.round().long().T
+        return y.clamp(0, rows - 1), x.clamp(0, columns - 1)
 
     def press(self, splats: Splats, which: torch.Tensor, descent: Descent, rates: Rates, settle: float, eye: torch.Tensor) -> None:
         """Flatten those of the splats at indices `which` `[M]` that are background, lie on the ground, and were moved in the step

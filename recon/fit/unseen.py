@@ -62,7 +62,7 @@ def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
     return 2 * torch.pi * float(fx) * float(fy) * across * torch.sigmoid(g.logit_opacities) * inside
 
 
-def above(splats: Splats, ground: Ground) -> torch.Tensor:
+def off_ground(splats: Splats, ground: Ground) -> torch.Tensor:
     """Metres `[N]` by which splats of the background are off the ground, up or down; infinite of others."""
     means = splats.fields["means"].detach().cpu()
     off = (means[:, 2] - ground.height(means[:, :2])).abs().to(splats.reach)
@@ -76,7 +76,7 @@ def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground:
     A rim is all that holds such a splat, so it grows as large and as dense as that likes, and from aside it hangs before the street as a
     curtain. What lies on the ground stays: it is the street beyond the border.
     """
-    return pulled & ~inside & (above(splats, ground) > LOW) & (splats.group_of() == 0)
+    return pulled & ~inside & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
 
 
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
@@ -88,8 +88,8 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
     nearest are the car's, and one glint of it would shine all over the road.
     """
     hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
-    high = above(splats, ground)
-    unknown = _coloured(splats, hidden & (high < LOW), known & (high < ON), lambda found, share: found.median(1).values)
+    off = off_ground(splats, ground)
+    unknown = _coloured(splats, hidden & (off < LOW), known & (off < ON), lambda found, share: found.median(1).values)
     for i in range(len(splats.sizes)):
         mine = group == i
         unknown |= _coloured(splats, pulled & hidden & mine & ~unknown, known & mine, lambda found, share: (found * share).sum(1))

@@ -48,18 +48,21 @@ class RangeImage:
 
     def votes(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether it saw through the world points `[N, 3]`, and whether it saw something where they are: bool `[N]` each."""
+        return self._votes(*self._where(xyz))
+
+    def votes_with_silence(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same, where it has also seen through what is no farther than `AUDIBLE` if it looked there and nothing at all came back."""
         away, row, column = self._where(xyz)
+        through, there = self._votes(away, row, column)
+        returned = np.isfinite(self.range_m)
+        looked = (returned.mean(1) > ROW)[row] & returned.any(0)[column]
+        return through | (looked & (self.told[row, column] == 0) & (away < AUDIBLE)), there
+
+    def _votes(self, away: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         margin = FARTHER[0] + FARTHER[1] * away
         clear = self.clear_m[row, column]
         through = (self.told[row, column] >= 2) & (clear > away + margin)
         return through, np.abs(self.range_m[row, column] - away) < margin
-
-    def silent(self, xyz: np.ndarray) -> np.ndarray:
-        """Whether it looked towards the world points `[N, 3]`, no farther than `AUDIBLE`, and nothing at all came back: bool `[N]`."""
-        away, row, column = self._where(xyz)
-        returned = np.isfinite(self.range_m)
-        looked = (returned.mean(1) > ROW)[row] & returned.any(0)[column]
-        return looked & (self.told[row, column] == 0) & (away < AUDIBLE)
 
     def _where(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How far world points `[N, 3]` were from it, and in which row and column of the image they are."""
