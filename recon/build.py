@@ -146,7 +146,7 @@ def reconstruct(
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(seconds(), 1), "live": live.curve}
     print(table_text(rows), file=sys.stderr)
     if within:
-        scene.meta["off_path"] = off_path_table(there, log, within)
+        scene.meta["off_path"] = off_path_table(there, log, within, fit.frames)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     with atomic_folder(output, overwrite) as whole, Progress("photos", total=len(fit.frames.training())) as steps:
         whole.rmdir()  # saving makes it; what is added is whole before anybody sees it

@@ -9,10 +9,14 @@ import torch
 from scipy import ndimage
 
 from recon.actors import split_points
+from recon.frames import Frames
 from recon.log import Log, Sweep
 from recon.project import project
+from recon.report import EQUAL_DB
+from recon.road import photo_at, road_errors, road_points
 from recon.skies import always_hidden, cells, looks_of
 from render import render_frame
+from render.compare import decibels
 from render.rays import world_directions
 from render.warp import warp
 from scenes.camera import Camera
@@ -43,7 +47,9 @@ def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
     return tuple(s for s in log.sweeps if every > 0 and s.index % every == every // 2)
 
 
-def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequence[float] = SHIFTS) -> list[dict]:
+def off_path_table(
+    scene: Scene, log: Log, sweeps: Sequence[Sweep], frames: Frames | None = None, shifts: Sequence[float] = SHIFTS
+) -> list[dict]:
     """A row for each of `shifts` metres, to the left and to the right by turns, over all cameras of the scene.
 
     depth_error: median of |d - lidar| / lidar over static lidar points of `sweeps` that the moved camera sees past these and what moves, d
@@ -51,15 +57,17 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
     half of their distance: walls and floaters where lidar looked through, of which a median says nothing. movers_error: as depth_error, of
     points in moving boxes, where these are at the picture's moment. holes: share of pixels below the horizon with alpha under 0.9;
     holes_above: the same above it, where from the recorded path no sky is ever seen (None where it is seen everywhere): between a tree and
-    the house behind it, and through windows. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit
+    the house behind it, and through windows. road: PSNR of the road's colours, at those of its points that both see, against the photo of
+    `frames` taken at that moment from the path (None without them): the one truth that there is of how it looks from beside it. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit
     levels, over pixels visible in both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
     splits = [(s, split_points(log, [s], movers)) for s in sweeps]
+    ways = [np.zeros((0, 3)) if scene.ground is None else road_points(split.static, scene.ground) for _, split in splits]
     hidden = always_hidden(looks_of(scene))
     rows = []
     for shift in shifts:
-        errors, moving, holes = [], [], {"holes": np.zeros(2), "holes_above": np.zeros(2)}
+        errors, moving, road, holes = [], [], [], {"holes": np.zeros(2), "holes_above": np.zeros(2)}
         paths = [scene.ego.shifted(lateral=side) for side in (shift, -shift)]
         for k, (sweep, split) in enumerate(splits):
             for name in scene.rig:
@@ -67,8 +75,8 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 time = int(times[(times - sweep.time_us).abs().argmin()])
                 camera = scene.camera(name, time, paths[k % 2])
                 with torch.no_grad():
-                    frame = render_frame(scene, camera, ("alpha", "depth"))
-                assert frame.alpha is not None and frame.depth is not None
+                    frame = render_frame(scene, camera, ("rgb", "alpha", "depth"))
+                assert frame.rgb is not None and frame.alpha is not None and frame.depth is not None
                 alpha, depth = frame.alpha.cpu(), frame.depth.cpu()
                 directions = world_directions(camera)
                 ground = directions[..., 2] < 0
@@ -78,9 +86,16 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
                 off = depth_errors(depth.numpy(), points, camera)
                 errors.append(off[: len(split.static)])
                 moving.append(off[len(split.static) :])
+                if frames is not None and len(ways[k]):
+                    recorded = scene.camera(name, time)
+                    both = unhidden(ways[k], points, camera) & unhidden(ways[k], points, recorded)
+                    view = photo_at(frames, name, time)
+                    road.append(road_errors(frame.rgb.cpu(), camera, view, recorded, ways[k][both]))
         still, going = _finite(errors), _finite(moving)
         row = {"shift_m": shift, "depth_error": _median(still), "movers_error": _median(going), "points": len(still)}
         row["in_the_way"] = float((still < -NEARER).mean()) if len(still) else None
+        wrong = np.concatenate([np.zeros(0), *road])
+        row["road"] = min(decibels(float(wrong.mean())), EQUAL_DB) if len(wrong) else None
         row |= {which: float(open_ / solid) if solid else None for which, (open_, solid) in holes.items()}
         rows.append(row | {"flicker": flicker_along(scene, shift)})
     return rows
@@ -89,13 +104,26 @@ def off_path_table(scene: Scene, log: Log, sweeps: Sequence[Sweep], shifts: Sequ
 def depth_errors(depth: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
     """Relative errors `[N]` of `depth` `[H, W]` at world points `[N, 3]`, below 0 where it is too near; NaN at those that `camera` does not
     see, 1 where nothing was drawn."""
-    row, column, z, seen = project(points, inverse(camera.world_from_cam).numpy(), camera)
-    nearest = np.full(depth.shape, np.inf)
-    np.minimum.at(nearest, (row[seen], column[seen]), z[seen])
-    nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
+    row, column, z, seen = _in_view(points, points, camera)
     drawn = depth[row, column]
     off = np.where(np.isfinite(drawn), (drawn - z) / np.where(seen, z, 1.0), 1.0)
-    return np.where(seen & (z <= HIDING * nearest[row, column]), off, np.nan)
+    return np.where(seen, off, np.nan)
+
+
+def unhidden(points: np.ndarray, others: np.ndarray, camera: Camera) -> np.ndarray:
+    """Which of world points `[N, 3]` a camera sees past `others` `[M, 3]`, bool `[N]`."""
+    return _in_view(points, others, camera)[3]
+
+
+def _in_view(points: np.ndarray, others: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """As `project`, and only those in view that no other much nearer hides."""
+    cam_from_world = inverse(camera.world_from_cam).numpy()
+    row, column, z, seen = project(others, cam_from_world, camera)
+    nearest = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(nearest, (row[seen], column[seen]), z[seen])
+    nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
+    row, column, z, seen = project(points, cam_from_world, camera)
+    return row, column, z, seen & (z <= HIDING * nearest[row, column])
 
 
 def _finite(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -137,12 +165,13 @@ def _planes(image: torch.Tensor | None) -> torch.Tensor:
 
 def off_path_text(rows: Sequence[dict]) -> str:
     """The rows for people."""
-    heads = ("lidar points", "depth error", "in the way", "movers'", "holes", "above", "flicker, levels")
+    heads = ("lidar points", "depth error", "in the way", "movers'", "holes", "above", "road, dB", "flicker, levels")
     lines = [f"{'off the path':<14}" + "".join(f" {head:>15}" for head in heads)]
     for r in rows:
         parts = (
             "-" if r[k] is None else f"{100 * r[k]:.2f} %" for k in ("depth_error", "in_the_way", "movers_error", "holes", "holes_above")
         )
         where = f"{r['shift_m']:g} m aside" if r["shift_m"] else "as recorded"
-        lines.append(f"{where:<14}" + "".join(f" {part:>15}" for part in (r["points"], *parts, f"{r['flicker']:.2f}")))
+        road = "-" if r["road"] is None else f"{r['road']:.2f}"
+        lines.append(f"{where:<14}" + "".join(f" {part:>15}" for part in (r["points"], *parts, road, f"{r['flicker']:.2f}")))
     return "\n".join(lines)

@@ -179,7 +179,7 @@ def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int])
 
 def depth_errors(scene: Scene, log: Log, sweeps: list[Sweep]) -> str:
     """In percent, as recorded and 2 m aside."""
-    rows = off_path_table(scene, log, sweeps, (0.0, 2.0)) if sweeps else []
+    rows = off_path_table(scene, log, sweeps, shifts=(0.0, 2.0)) if sweeps else []
     return " / ".join("-" if r["depth_error"] is None else f"{100 * r['depth_error']:.1f}" for r in rows) or "-"
 
 

@@ -5,7 +5,10 @@ import pytest
 import torch
 
 from recon import open_log
+from recon.build import choose
+from recon.frames import load_frames
 from recon.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
+from recon.road import photo_at, road_errors, road_points
 from scenes import Gaussians
 from tests.street import splats
 
@@ -26,7 +29,7 @@ def test_sweeps_are_held_out_between_the_held_out_pictures(log):
 
 
 def test_the_street_itself_is_near_its_lidar_on_and_off_the_path(street, log):
-    rows = off_path_table(street, log, held_out_sweeps(log, 4), (0.0, 2.0))
+    rows = off_path_table(street, log, held_out_sweeps(log, 4), shifts=(0.0, 2.0))
     assert [r["shift_m"] for r in rows] == [0.0, 2.0]
     for row in rows:
         assert row["depth_error"] < 0.1 and row["points"] > 200 and row["holes"] < 0.02
@@ -35,13 +38,13 @@ def test_the_street_itself_is_near_its_lidar_on_and_off_the_path(street, log):
 
 def test_what_moves_is_measured_where_it_is(street, log):
     sweeps = held_out_sweeps(log, 4)
-    right = off_path_table(street, log, sweeps, (0.0, 2.0))
+    right = off_path_table(street, log, sweeps, shifts=(0.0, 2.0))
     (actor,) = street.actors
     nearer = replace(actor, trajectory=actor.trajectory.shifted(forward=-4.0))
-    wrong = off_path_table(replace(street, actors=(nearer,)), log, sweeps, (0.0, 2.0))
+    wrong = off_path_table(replace(street, actors=(nearer,)), log, sweeps, shifts=(0.0, 2.0))
     assert all(row["movers_error"] < 0.1 for row in right) and all(row["movers_error"] > 0.18 for row in wrong)
     assert wrong[0]["depth_error"] == pytest.approx(right[0]["depth_error"], abs=0.01), "what stands still is another matter"
-    bare = off_path_table(street, replace(log, tracks=()), sweeps, (0.0,))
+    bare = off_path_table(street, replace(log, tracks=()), sweeps, shifts=(0.0,))
     assert bare[0]["movers_error"] is None and "-" in off_path_text(bare)
 
 
@@ -49,12 +52,12 @@ def test_a_torn_road_shows_as_holes_and_a_wrong_one_as_depth_error(street, log):
     sweeps = held_out_sweeps(log, 4)
     means = street.background.gaussians.means
     torn = without(street, (means[:, 2] < 0.1) & (means[:, 0] % 6 < 3))
-    right, holed = (off_path_table(s, log, sweeps, (0.0,))[0] for s in (street, torn))
+    right, holed = (off_path_table(s, log, sweeps, shifts=(0.0,))[0] for s in (street, torn))
     assert holed["holes"] > right["holes"] + 0.1
     pose = street.background.world_from_local.clone()
     pose[1, 3] = 4.0
     aside = replace(street, background=replace(street.background, world_from_local=pose))
-    assert off_path_table(aside, log, sweeps, (0.0,))[0]["depth_error"] > 2 * right["depth_error"]
+    assert off_path_table(aside, log, sweeps, shifts=(0.0,))[0]["depth_error"] > 2 * right["depth_error"]
 
 
 def board(x, width, height, hole=0.0):
@@ -72,7 +75,7 @@ def test_a_gap_before_the_sky_that_opens_only_beside_the_path_shows_as_a_hole_ab
         scene = replace(
             street, background=replace(street.background, gaussians=ahead), actors=(), rig={"front_camera": street.rig["front_camera"]}
         )
-        rows.append([r["holes_above"] for r in off_path_table(scene, log, held_out_sweeps(log, 4), (0.0, 2.0))])
+        rows.append([r["holes_above"] for r in off_path_table(scene, log, held_out_sweeps(log, 4), shifts=(0.0, 2.0))])
     (on_it, beside), closed = rows
     assert on_it == 0 and beside > 0.005 and closed == [0, 0]
 
@@ -80,7 +83,7 @@ def test_a_gap_before_the_sky_that_opens_only_beside_the_path_shows_as_a_hole_ab
 def test_a_wall_over_a_third_of_the_picture_stands_in_the_way_of_lidar_though_the_median_is_right(street, log):
     wall = splats(board(9.0, 5.0, 5.0).means + torch.tensor([0.0, -4.0, 0.0]), (0.1, 0.1, 0.1), (0.02, 0.2, 0.2))
     walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, wall])))
-    right, wrong = (off_path_table(s, log, held_out_sweeps(log, 4), (0.0,))[0] for s in (street, walled))
+    right, wrong = (off_path_table(s, log, held_out_sweeps(log, 4), shifts=(0.0,))[0] for s in (street, walled))
     assert right["in_the_way"] < 0.02 and wrong["in_the_way"] > 0.1
     assert wrong["depth_error"] < 2 * right["depth_error"] and "in the way" in off_path_text([wrong])
 
@@ -102,3 +105,32 @@ def test_a_street_that_does_not_change_hardly_flickers(street):
     shades[means[:, 2] < 0.1] += 2 * torch.rand(int((means[:, 2] < 0.1).sum()), 1, 3, generator=torch.Generator().manual_seed(0)) - 1
     noisy = replace(street, background=replace(street.background, gaussians=replace(street.background.gaussians, sh=shades)))
     assert 0 < calm < flicker_along(noisy, 1.0)
+
+
+@pytest.fixture(scope="module")
+def frames(log):
+    return load_frames(log, ["front_camera", "left_camera"], choose(log)[1], (96, 54), 4)
+
+
+def test_what_covers_the_road_only_beside_the_path_shows_in_its_colours(street, log, frames):
+    """A wall along the path, seen edge on from it."""
+    sweeps, street = held_out_sweeps(log, 4), replace(street, rig={"front_camera": street.rig["front_camera"]})
+    right = [r["road"] for r in off_path_table(street, log, sweeps, frames, (0.0, 2.0))]
+    edge = splats(board(0.0, 50.0, 0.9).means[:, [1, 0, 2]] + torch.tensor([20.0, 0.0, 0.0]), (0.9, 0.1, 0.1), (0.2, 0.005, 0.2))
+    walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, edge])))
+    wrong = [r["road"] for r in off_path_table(walled, log, sweeps, frames, (0.0, 2.0))]
+    assert min(right) > 25
+    assert wrong[0] > wrong[1] + 6
+
+
+def test_the_recording_car_and_what_lies_off_the_road_are_no_road(street, log, frames):
+    name, time = "front_camera", log.sweeps[2].time_us
+    view, camera = photo_at(frames, name, time), street.camera(name, time)
+    points = road_points(log.sweeps[2].read().xyz, street.ground)
+    assert len(points) > 100 and np.abs(points[:, 2] - street.ground.height(torch.from_numpy(points[:, :2])).numpy()).max() < 0.05
+    picture = view.image.float() / 255
+    right = road_errors(picture, camera, view, camera, points)
+    assert len(right) > 20 and right.max() == 0
+    assert road_errors(1 - picture, camera, view, camera, points).mean() > 0.01
+    assert not len(road_errors(picture, camera, replace(view, ego=torch.ones(54, 96, dtype=torch.bool)), camera, points))
+    assert not len(road_points(points + [0, 0, 1.0], street.ground))
