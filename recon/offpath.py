@@ -58,8 +58,8 @@ def off_path_table(
     points in moving boxes, where these are at the picture's moment. holes: share of pixels below the horizon with alpha under 0.9;
     holes_above: the same above it, where from the recorded path no sky is ever seen (None where it is seen everywhere): between a tree and
     the house behind it, and through windows. road: PSNR of the road's colours, at those of its points that both see, against the photo of
-    `frames` taken at that moment from the path (None without them): the one truth that there is of how it looks from beside it. flicker: mean absolute difference to the previous picture moved along exact flow, in 8-bit
-    levels, over pixels visible in both; first camera.
+    `frames` taken at that moment from the path (None without them): the one truth that there is of how it looks from beside it. flicker:
+    mean absolute difference to the previous picture moved along exact flow, in 8-bit levels, over pixels visible in both; first camera.
     """
     movers = [t for t in log.tracks if t.moving]
     splits = [(s, split_points(log, [s], movers)) for s in sweeps]

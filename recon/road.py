@@ -39,8 +39,8 @@ def photo_at(frames: Frames, name: str, time_us: int) -> View:
 
 
 def road_errors(shown: torch.Tensor, camera: Camera, view: View, recorded: Camera, points: np.ndarray) -> np.ndarray:
-    """Squared errors `[M]`, means of three channels, of a picture `[H, W, 3]` of `camera`'s at points `[N, 3]` of the road, against what the
-    photo of `view`, taken by `recorded`, has there; of those that lie within both, and in the photo not on the recording car."""
+    """Squared errors `[M]`, means of three channels, of a picture `[H, W, 3]` of `camera`'s at points `[N, 3]` of the road, against what
+    the photo of `view`, taken by `recorded`, has there; of those that lie within both, and in the photo not on the recording car."""
     colours, within = _looked_up(view.image.float() / 255, recorded, points)
     if view.ego is not None:
         on_car, _ = _looked_up(view.ego.float()[..., None], recorded, points)
