@@ -56,6 +56,14 @@ class Split:
         return np.concatenate(placed)
 
 
+def box_skin(size: np.ndarray, step: float) -> np.ndarray:
+    """Points on sides and top of a box `[length, width, height]` whose base centre is the origin."""
+    axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in size]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    on = np.abs(np.abs(grid) - size / 2) < 1e-9
+    return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
+
+
 def inside(local: np.ndarray, size: np.ndarray, margin: float, below: float = 0.0) -> np.ndarray:
     """Mask `[N]` of box-frame points within the box grown by `margin` metres; the floor by `below`."""
     half = size[:2] / 2 + margin

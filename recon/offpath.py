@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from recon.actors import split_points
 from recon.frames import Frames
 from recon.log import Log, Sweep
-from recon.project import project
+from recon.project import nearest_around, project
 from recon.report import EQUAL_DB
-from recon.road import photo_at, road_errors, road_points
+from recon.road import photo_at, road_errors, road_points, shown_road, standing
 from recon.skies import always_hidden, cells, looks_of
 from render import render_frame
 from render.compare import decibels
@@ -87,8 +86,9 @@ def off_path_table(
                 errors.append(off[: len(split.static)])
                 moving.append(off[len(split.static) :])
                 if frames is not None and len(ways[k]):
-                    recorded = scene.camera(name, time)
-                    both = unhidden(ways[k], points, camera) & unhidden(ways[k], points, recorded)
+                    assert scene.ground is not None
+                    recorded, others = scene.camera(name, time), standing(points, scene.ground, log.tracks, time)
+                    both = shown_road(ways[k], others, camera) & shown_road(ways[k], others, recorded)
                     view = photo_at(frames, name, time)
                     road.append(road_errors(frame.rgb.cpu(), camera, view, recorded, ways[k][both]))
         still, going = _finite(errors), _finite(moving)
@@ -104,26 +104,11 @@ def off_path_table(
 def depth_errors(depth: np.ndarray, points: np.ndarray, camera: Camera) -> np.ndarray:
     """Relative errors `[N]` of `depth` `[H, W]` at world points `[N, 3]`, below 0 where it is too near; NaN at those that `camera` does not
     see, 1 where nothing was drawn."""
-    row, column, z, seen = _in_view(points, points, camera)
+    row, column, z, seen = project(points, inverse(camera.world_from_cam).numpy(), camera)
+    seen &= z <= HIDING * nearest_around(points, camera, CELL)[row, column]
     drawn = depth[row, column]
     off = np.where(np.isfinite(drawn), (drawn - z) / np.where(seen, z, 1.0), 1.0)
     return np.where(seen, off, np.nan)
-
-
-def unhidden(points: np.ndarray, others: np.ndarray, camera: Camera) -> np.ndarray:
-    """Which of world points `[N, 3]` a camera sees past `others` `[M, 3]`, bool `[N]`."""
-    return _in_view(points, others, camera)[3]
-
-
-def _in_view(points: np.ndarray, others: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """As `project`, and only those in view that no other much nearer hides."""
-    cam_from_world = inverse(camera.world_from_cam).numpy()
-    row, column, z, seen = project(others, cam_from_world, camera)
-    nearest = np.full((camera.height, camera.width), np.inf)
-    np.minimum.at(nearest, (row[seen], column[seen]), z[seen])
-    nearest = ndimage.minimum_filter(nearest, 2 * CELL + 1, mode="nearest")
-    row, column, z, seen = project(points, cam_from_world, camera)
-    return row, column, z, seen & (z <= HIDING * nearest[row, column])
 
 
 def _finite(parts: Sequence[np.ndarray]) -> np.ndarray:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
+from recon.actors import box_skin
 from recon.frames import Frames
+from recon.log import Track
+from recon.project import nearest_around, project
 from recon.view import View
 from scenes.camera import Camera
 from scenes.ground import Ground
@@ -18,6 +24,12 @@ ON_ROAD = 0.1
 
 TOGETHER = 16
 """Points whose mean height one is given. Lidar's noise of 3 cm would move what lies 20 m ahead by a pixel, seen from 2 m aside."""
+
+SKIN = 0.25
+"""Metres between the points of a box's sides."""
+
+BESIDE = 1.5
+"""Degrees around what stands within which it hides the road behind: as far apart as beams lie, and more."""
 
 
 def road_points(points: np.ndarray, ground: Ground) -> np.ndarray:
@@ -30,6 +42,24 @@ def road_points(points: np.ndarray, ground: Ground) -> np.ndarray:
     points, height, off = points[lying], height[lying], off[lying]
     _, beside = cKDTree(points[:, :2]).query(points[:, :2], TOGETHER)
     return np.column_stack([points[:, :2], height + off[beside].mean(1)])
+
+
+def standing(points: np.ndarray, ground: Ground, tracks: Sequence[Track], time_us: int) -> np.ndarray:
+    """What may hide the road at a moment, `[M, 3]`: those of lidar's points `[N, 3]` that are off it, and the sides of all boxes, of whose
+    glass and dark paint no beam comes back."""
+    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    skins = [points[np.abs(off) >= ON_ROAD]]
+    for track in tracks:
+        pose = track.trajectory().near(time_us).numpy()
+        skins.append(box_skin(track.size, SKIN) @ pose[:3, :3].T + pose[:3, 3])
+    return np.concatenate(skins)
+
+
+def shown_road(road: np.ndarray, others: np.ndarray, camera: Camera) -> np.ndarray:
+    """Which points `[N, 3]` of the road a camera sees past what stands, `[M, 3]`; bool `[N]`."""
+    row, column, z, seen = project(road, inverse(camera.world_from_cam).numpy(), camera)
+    focal = max(float(f) for f in camera.lens.focal())
+    return seen & (z < nearest_around(others, camera, math.ceil(focal * math.radians(BESIDE)))[row, column])
 
 
 def photo_at(frames: Frames, name: str, time_us: int) -> View:

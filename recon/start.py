@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.actors import split_points
+from recon.actors import box_skin, split_points
 from recon.fit.model import Splats, draw
 from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
@@ -213,14 +213,6 @@ def _nearest(log: Log, track: Track, views: list[View]) -> int:
     times = torch.tensor([v.time_us for v in there])
     apart = (trajectory.at_each(times) - log.ego.at_each(times))[:, :3, 3].norm(dim=1)
     return there[int(apart.argmin())].time_us
-
-
-def box_skin(size: np.ndarray, step: float) -> np.ndarray:
-    """Points on sides and top of a box `[length, width, height]` whose base centre is the origin."""
-    axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in size]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    on = np.abs(np.abs(grid) - size / 2) < 1e-9
-    return (grid + [0, 0, size[2] / 2])[on[:, 0] | on[:, 1] | (on[:, 2] & (grid[:, 2] > 0))] * 0.95
 
 
 def _usual(frames: Frames, gains: np.ndarray) -> np.ndarray:
