@@ -30,6 +30,10 @@ LOW = 0.2
 NEIGHBOURS = 16
 """Splats of known colour beside one of unknown, whose mean it is given."""
 
+STREET_NEIGHBOURS = 64
+"""The same of what is hidden of the street, whose middle colour it is given. The nearest few are known by a picture's rim, black or
+pale."""
+
 
 def shown_parts(placed: Sequence[Placed], camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """Of all groups' splats `[N]`, the part of its weight that a picture shows, what stands before it taken off, and whether its middle is
@@ -89,23 +93,25 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
     """
     hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
     off = off_ground(splats, ground)
-    unknown = _coloured(splats, hidden & (off < LOW), known & (off < ON), lambda found, share: found.median(1).values)
+    unknown = _coloured(splats, hidden & (off < LOW), known & (off < ON), STREET_NEIGHBOURS, lambda found, _: found.median(1).values)
     for i in range(len(splats.sizes)):
         mine = group == i
-        unknown |= _coloured(splats, pulled & hidden & mine & ~unknown, known & mine, lambda found, share: (found * share).sum(1))
+        unknown |= _coloured(
+            splats, pulled & hidden & mine & ~unknown, known & mine, NEIGHBOURS, lambda found, share: (found * share).sum(1)
+        )
     return unknown
 
 
 def _coloured(
-    splats: Splats, which: torch.Tensor, known: torch.Tensor, mix: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+    splats: Splats, which: torch.Tensor, known: torch.Tensor, count: int, mix: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 ) -> torch.Tensor:
-    """Give some of the splats a mix of the colours of the nearest known, both bool `[N]`. Returns which those are; none where too few are
-    known. mix: of `[M, NEIGHBOURS, K, 3]`, and of how near they are, `[M, NEIGHBOURS, 1, 1]`, 1 in all."""
+    """Give some of the splats a mix of the colours of the `count` nearest known, both bool `[N]`. Returns which those are; none where too
+    few are known. mix: of `[M, count, K, 3]`, and of how near they are, `[M, count, 1, 1]`, 1 in all."""
     known = known.nonzero()[:, 0]
     if len(known) < NEIGHBOURS or not which.any():
         return torch.zeros_like(which)
     means, sh = splats.fields["means"], splats.fields["sh"]
-    away, nearest = cKDTree(means[known].cpu().numpy()).query(means[which].cpu().numpy(), NEIGHBOURS)
+    away, nearest = cKDTree(means[known].cpu().numpy()).query(means[which].cpu().numpy(), range(1, min(count, len(known)) + 1))
     wide = splats.fields["log_scales"][which].exp().mean(1)
     share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
     found = sh[known[torch.from_numpy(nearest).to(known)]]
