@@ -21,6 +21,9 @@ EXHAUSTIVE = 40
 FEATURES = 4096
 """Of a picture whose pose is known, at most: they only have to tell how far things are."""
 
+SEED = 0
+"""Of COLMAP's draws, all of them: by its default one set of photos has another lens and other poses each time."""
+
 FEWEST_PLACED = 3
 FIX = "COLMAP models, photos and drives without lidar need pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
 
@@ -59,7 +62,7 @@ class Model:
 
 
 def pycolmap():
-    """The module; ModuleNotFoundError's fix as ValueError where it is not installed."""
+    """The module, its draws begun anew; ModuleNotFoundError's fix as ValueError where it is not installed."""
     try:
         import zlib  # noqa: F401  # first: pycolmap 4.2 brings one of its own, and the interpreter's, loaded after it, crashes
 
@@ -67,6 +70,7 @@ def pycolmap():
     except ModuleNotFoundError:
         raise ValueError(FIX) from None
     module.logging.minloglevel = module.logging.Level.FATAL.value
+    module.set_random_seed(SEED)
     return module
 
 
@@ -126,16 +130,14 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
         if angle_of_view is not None:
             width, height = image_size(pictures / names[0])
             reader.camera_params = f"{width / 2 / math.tan(angle_of_view / 2)},{width / 2},{height / 2},0"
-        single, cpu = colmap.CameraMode.SINGLE, colmap.Device.cpu
-        colmap.extract_features(database, pictures, names, camera_mode=single, reader_options=reader, device=cpu)
+        _extract(colmap, database, pictures, names, reader, colmap.FeatureExtractionOptions())
         steps.step(note="matches")
         if ordered or len(names) > EXHAUSTIVE:
             _match_following(colmap, database, names)
         else:
-            colmap.match_exhaustive(database, device=cpu)
+            colmap.match_exhaustive(database, verification_options=_verification(colmap), device=colmap.Device.cpu)
         steps.step(note="poses")
-        options = colmap.IncrementalPipelineOptions()
-        options.random_seed = 0
+        options = _mapping(colmap)
         # two pictures of a drive lie one behind the other, which the defaults do not begin a world with
         options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = angle_of_view is None
@@ -207,6 +209,7 @@ def adjust(posed: Posed, spread: float) -> tuple[dict[str, np.ndarray], float, f
         options, config, priors = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig(), []
         options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
         options.refine_sensor_from_rig = options.print_summary = False
+        options.ceres.solver_options.num_threads = 1
         options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
         for image in found.images.values():
             config.add_image(image.image_id)
@@ -236,20 +239,41 @@ def _unturned(poses: dict[str, np.ndarray], as_given: dict[str, np.ndarray]) -> 
 
 def _follow(colmap, posed: Posed, steps: Progress) -> None:
     """Find the pictures' features and match them; `workspace`/database.db holds both."""
-    database, cpu, extraction = posed.workspace / "database.db", colmap.Device.cpu, colmap.FeatureExtractionOptions()
+    database, extraction = posed.workspace / "database.db", colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = FEATURES
     for folder, (lens, params) in posed.lenses.items():
         steps.step(note=f"features of {folder}")
         names = [name for name in posed.poses if name.startswith(f"{folder}/")]
         reader = colmap.ImageReaderOptions(camera_model=lens, camera_params=",".join(map(repr, params)))
-        colmap.extract_features(
-            database, posed.workspace / "images", names, colmap.CameraMode.SINGLE, reader_options=reader,
-            extraction_options=extraction, device=cpu,
-        )  # fmt: skip
+        _extract(colmap, database, posed.workspace / "images", names, reader, extraction)
     steps.step(note="matches")
     listed = posed.workspace / "pairs.txt"
     listed.write_text("".join(f"{a} {b}\n" for a, b in posed.pairs))
-    colmap.match_image_pairs(database, pairing_options=colmap.ImportedPairingOptions(match_list_path=str(listed)), device=cpu)
+    pairing, verification = colmap.ImportedPairingOptions(match_list_path=str(listed)), _verification(colmap)
+    colmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification, device=colmap.Device.cpu)
+
+
+def _extract(colmap, database: Path, pictures: Path, names: list[str], reader, extraction) -> None:
+    """Find the named pictures' features. They are written down first, in their order: threads would do so as they get ready, and what is
+    found hangs on it."""
+    single = colmap.CameraMode.SINGLE
+    colmap.Database.open(database).close()
+    colmap.import_images(database, pictures, single, names, reader)
+    colmap.extract_features(database, pictures, names, single, reader, extraction, device=colmap.Device.cpu)
+
+
+def _mapping(colmap):
+    """How points and poses are found. Threads would try pairs to begin with and add up in any order, and lenses come out 5 % apart."""
+    options = colmap.IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = SEED, 1
+    return options
+
+
+def _verification(colmap):
+    """How matches are tested against the geometry of two views."""
+    options = colmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    return options
 
 
 def _match_following(colmap, database: Path, names: list[str]) -> None:
@@ -263,7 +287,7 @@ def _match_following(colmap, database: Path, names: list[str]) -> None:
 
     in_order = {name: f"{i:08d}" for i, name in enumerate(names)}  # COLMAP goes by the alphabet, where 10.jpg comes before 9.jpg
     rename(in_order)
-    colmap.match_sequential(database, device=colmap.Device.cpu)
+    colmap.match_sequential(database, verification_options=_verification(colmap), device=colmap.Device.cpu)
     rename({number: name for name, number in in_order.items()})
 
 
@@ -277,7 +301,8 @@ def _at_poses(colmap, workspace: Path, poses: dict[str, np.ndarray]):
         found.register_frame(image.frame_id)
     if len(found.images) > 1:
         (workspace / "found").mkdir()
-        found = colmap.triangulate_points(found, database, workspace / "images", workspace / "found")
+        options = _mapping(colmap)
+        found = colmap.triangulate_points(found, database, workspace / "images", workspace / "found", options=options)
     return found
 
 

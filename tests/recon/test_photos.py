@@ -161,7 +161,7 @@ def test_many_photos_are_matched_in_the_order_of_their_numbers(tmp_path, monkeyp
 
     colmap.extract_features(database, tmp_path, names, camera_mode=colmap.CameraMode.SINGLE, device=colmap.Device.cpu)
     before = {i.image_id: i.name for i in _images(colmap, database)}
-    monkeypatch.setattr(colmap, "match_sequential", lambda path, device: seen.extend(_images(colmap, path)))
+    monkeypatch.setattr(colmap, "match_sequential", lambda path, **_: seen.extend(_images(colmap, path)))
     sfm._match_following(colmap, database, names)
     assert [before[i.image_id] for i in sorted(seen, key=lambda i: i.name)] == names
     assert {i.image_id: i.name for i in _images(colmap, database)} == before
@@ -225,24 +225,36 @@ def test_pictures_without_overlap_are_refused_with_the_fix(tmp_path):
         open_log(folder)
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_real_photos_are_placed(shared, tmp_path, told):
-    """Six photos of a street, 4 metres apart, which know the focal length, or whose angle of view is told."""
-    folder = tmp_path / "street"
+def lund(shared, folder, knows_lens):
+    """Six photos of a street, 4 metres apart."""
     folder.mkdir()
     for i in range(8, 14):
         with Image.open(shared / f"lund/images/{i:02d}.jpg") as photo:
-            knows = {} if told else {"exif": photo.info["exif"]}
+            knows = {"exif": photo.info["exif"]} if knows_lens else {}
             photo.resize((640, 480)).save(folder / f"{i:02d}.jpg", quality=95, **knows)
+    return folder
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_real_photos_are_placed(shared, tmp_path, told):
+    """They know the focal length, or their angle of view is told."""
+    folder = lund(shared, tmp_path / "street", knows_lens=not told)
     (known,) = read_model(shared / "lund/colmap_sparse").cameras.values()
     angle = 2 * math.atan(known.width / 2 / known.params[0])
     log = open_log(folder, angle_of_view=angle if told else None)
     camera = log.camera("camera")
     if told:
         assert camera.lens.focal()[0] == pytest.approx(known.params[0] * 640 / known.width)
-    # how many of so few are placed is luck: matching draws lots
     assert len(camera) >= 3 and len(log.points.xyz) > 50 and camera.lens.kind == "opencv"
     assert torch.isfinite(log.ego.world_from_body).all() and camera.image(0).shape == (480, 640, 3)
+
+
+def test_the_same_photos_have_the_same_poses_each_time(shared, tmp_path):
+    """Matching and mapping draw lots, and threads end in any order."""
+    first, second = (open_log(lund(shared, tmp_path / name, knows_lens=False)) for name in ("once", "again"))
+    assert torch.equal(first.camera("camera").world_from_cam, second.camera("camera").world_from_cam)
+    assert torch.equal(first.camera("camera").lens.params(), second.camera("camera").lens.params())
+    assert np.array_equal(first.points.xyz, second.points.xyz)
 
 
 def test_the_folder_one_is_in_is_read_too(walk, solved, tmp_path, monkeypatch):

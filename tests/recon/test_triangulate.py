@@ -41,6 +41,11 @@ def test_points_of_a_drive_without_lidar_stand_where_it_shows_them(bare, found):
     assert np.median(np.concatenate(off)) < 0.01
 
 
+def test_the_same_pictures_have_the_same_points_each_time(bare, found):
+    frames, points = found
+    assert np.array_equal(triangulated(bare, frames).xyz, points.xyz)
+
+
 def test_pictures_held_out_show_no_points(found):
     frames, points = found
     assert [len(points.seen[frames.names[v.camera]][v.index]) for v in frames.held_out()] == [0, 0, 0, 0]
