@@ -141,7 +141,8 @@ def _seen_from(asset: Asset) -> dict[str, str]:
     mirrored = " (the other side is its mirror image)" if asset.meta.get("mirrored") else ""
     closed = " and ".join(asset.meta.get("closed", ()))
     guess = ", ".join(unseen_sides(asset)) + (f" ({closed} closed by the outline of the sides)" if closed else "")
-    told = {"seen from": seen + mirrored, "a guess from": guess}
+    patches = f"{asset.meta['patched_m2']:.1f} m2 of its sides, by what is around them" if asset.meta.get("patched_m2") else ""
+    told = {"seen from": seen + mirrored, "a guess from": guess, "holes closed": patches}
     return {key: value for key, value in told.items() if value}
 
 
