@@ -126,7 +126,7 @@ class Edit:
         from scenes import Databank
         from scenes import edit as edits
         from scenes.astray import astray, meeting
-        from scenes.match import other_model
+        from scenes.match import light_held, other_model
         from scenes.usd_edit import add_change, free_name
 
         scene, _ = open_scene(self.scene)
@@ -138,6 +138,8 @@ class Edit:
         name = self.name or free_name(self.scene, "edit")
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
+        lit = {actor.track: edit.apply(actor, scene).asset for actor in scene.actors if actor.track in wanted}
+        others += [line for track, asset in lit.items() for line in light_held(wanted[track], asset, scene)]
         layer = self.scene / "edits" / f"{name}.usda"
         done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
         return [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)], [done]
