@@ -157,7 +157,7 @@ class Add:
     scale: Ratio = None
     """Metres a unit of the file."""
     up: Axis = None
-    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, and else -y, as cameras
+    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, else -y, as cameras
     have it."""
     forward: Axis = None
     """The axis that points forward: a mesh's is z, as in glTF; of splats -y in .glb, x in USD with z up, and else z."""

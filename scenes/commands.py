@@ -84,7 +84,23 @@ class Convert:
 
         thing, warnings = open_splats(self.source, self.drop_invalid)
         warn(warnings)
+        if turned := _turned(self.source):
+            print(turned)
         print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite, model_of(self.source))}")
+
+
+def _turned(source: Path) -> str:
+    """What is done to the splats of a USD stage that says another axis up than z, or another unit than the metre, as a sentence, or ""."""
+    from scenes.formats import USD, found
+
+    if found(source) is not USD:
+        return ""
+    from scenes.usd_splats import stage_axes
+
+    up, metres = stage_axes(source)
+    done = ["turned from y up to z up"] if up == "y" else []
+    done += [f"scaled from units of {metres:g} m to metres"] if metres != 1 else []
+    return f"{source} is {' and '.join(done)}, as all files are that Sidestep writes" if done else ""
 
 
 @dataclass

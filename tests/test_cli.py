@@ -359,6 +359,18 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     assert 'suffix ".obj"' in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "c.obj")], 1)[1]
 
 
+def test_a_stage_that_is_y_up_is_converted_to_z_up_and_that_is_said(door, tmp_path):
+    source, target = tmp_path / "y.usda", tmp_path / "z.ply"
+    save_gaussians(source, made.car().gaussians)
+    assert "turned" not in door(["convert", str(source), str(target)])[0]
+    plain = load(target).means
+    source.write_text(source.read_text().replace('upAxis = "Z"', 'upAxis = "Y"').replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    out, _ = door(["convert", str(source), str(target), "-w"])
+    assert "y.usda is turned from y up to z up and scaled from units of 0.01 m to metres" in out and "off by at most nothing" in out
+    x, y, z = (0.01 * plain).unbind(1)
+    torch.testing.assert_close(load(target).means, torch.stack([x, -z, y], 1), rtol=1e-5, atol=1e-6)
+
+
 def test_splats_alone_are_rendered_from_around(door, tmp_path):
     door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.splat")])
     words = ["--size", "64x36", "--duration", "100ms", "-o", str(tmp_path / "a.mp4"), "--outputs", "alpha"]
