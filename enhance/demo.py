@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scenes.atomic import atomic_folder
 from scenes.opening import fresh, open_scene, warn
 from scenes.options import Output, Overwrite
 from scenes.placement import parse_placement
@@ -42,9 +43,16 @@ class Demo:
         start = time.monotonic()
         if not DATA.is_dir():
             raise FileNotFoundError(f"the demo's drive is not at {DATA}: it comes with the source; clone that and run make demo there")
-        self.output.mkdir(exist_ok=True)
-        files = [fresh(self.output / name, self.overwrite) for name in ("out.mp4", "out.json", "contact.png")]
-        demonstrate(DATA, self.output)
+        if self.output.exists() and not self.output.is_dir():
+            raise FileExistsError(f"{self.output} is a file, and the demo makes a folder; give it another name with -o")
+        files = [self.output / name for name in ("out.mp4", "out.json", "contact.png")]
+        if self.output.exists():
+            for file in files:
+                fresh(file, self.overwrite)
+            demonstrate(DATA, self.output)
+        else:
+            with atomic_folder(self.output) as whole:
+                demonstrate(DATA, whole)
         print(f"made {', '.join(map(str, files[:-1]))} and {files[-1]} in {time.monotonic() - start:.0f} s")
 
 

@@ -141,7 +141,8 @@ def _seen_from(asset: Asset) -> dict[str, str]:
     mirrored = " (the other side is its mirror image)" if asset.meta.get("mirrored") else ""
     closed = " and ".join(asset.meta.get("closed", ()))
     guess = ", ".join(unseen_sides(asset)) + (f" ({closed} closed by the outline of the sides)" if closed else "")
-    told = {"seen from": seen + mirrored, "a guess from": guess}
+    patches = f"{asset.meta['patched_m2']:.1f} m2 of its sides, by what is around them" if asset.meta.get("patched_m2") else ""
+    told = {"seen from": seen + mirrored, "a guess from": guess, "holes closed": patches}
     return {key: value for key, value in told.items() if value}
 
 
@@ -156,7 +157,7 @@ class Add:
     scale: Ratio = None
     """Metres a unit of the file."""
     up: Axis = None
-    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, and else -y, as cameras
+    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, else -y, as cameras
     have it."""
     forward: Axis = None
     """The axis that points forward: a mesh's is z, as in glTF; of splats -y in .glb, x in USD with z up, and else z."""

@@ -60,9 +60,10 @@ class Frame:
     median_depth `[H, W]` the same of the splat behind which less than half of the light passes, inf where alpha is below 0.5; normal
     `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
-    visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32; instance_alpha `[H, W, P]` what each
-    placed instance adds to alpha, of a scene what each id does; need `[H, W]` 0 to 1, how badly the place is supported by photos
-    (`render/need.py`).
+    visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32, the id whose splats weigh most together
+    of what is drawn there (of two always the heavier, of more surely one that is more than half), -1 where alpha is below 0.5;
+    instance_alpha `[H, W, P]` what each placed instance adds to alpha, of a scene what each id does; need `[H, W]` 0 to 1, how badly the
+    place is supported by photos (`render/need.py`).
 
     No outputs, but added to frames that are to be enhanced (`render/references.py`): reference `[H, W, 3]`, what the drive's photos say the
     view looks like, and trust `[H, W]` 0 to 1, how far to go from rgb to it.

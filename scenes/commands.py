@@ -84,7 +84,23 @@ class Convert:
 
         thing, warnings = open_splats(self.source, self.drop_invalid)
         warn(warnings)
+        if turned := _turned(self.source):
+            print(turned)
         print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite, model_of(self.source))}")
+
+
+def _turned(source: Path) -> str:
+    """What is done to the splats of a USD stage that says another axis up than z, or another unit than the metre, as a sentence, or ""."""
+    from scenes.formats import USD, found
+
+    if found(source) is not USD:
+        return ""
+    from scenes.usd_splats import stage_axes
+
+    up, metres = stage_axes(source)
+    done = ["turned from y up to z up"] if up == "y" else []
+    done += [f"scaled from units of {metres:g} m to metres"] if metres != 1 else []
+    return f"{source} is {' and '.join(done)}, as all files are that Sidestep writes" if done else ""
 
 
 @dataclass
@@ -126,7 +142,7 @@ class Edit:
         from scenes import Databank
         from scenes import edit as edits
         from scenes.astray import astray, meeting
-        from scenes.match import other_model
+        from scenes.match import light_held, other_model
         from scenes.usd_edit import add_change, free_name
 
         scene, _ = open_scene(self.scene)
@@ -138,6 +154,8 @@ class Edit:
         name = self.name or free_name(self.scene, "edit")
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
+        lit = {actor.track: edit.apply(actor, scene).asset for actor in scene.actors if actor.track in wanted}
+        others += [line for track, asset in lit.items() for line in light_held(wanted[track], asset, scene)]
         layer = self.scene / "edits" / f"{name}.usda"
         done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
         return [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)], [done]

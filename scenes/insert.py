@@ -13,7 +13,7 @@ from scenes.asset import Actor, Asset
 from scenes.collide import collisions
 from scenes.edit import named
 from scenes.lane import Lane
-from scenes.match import at_place, other_model
+from scenes.match import at_place, light_held, other_model
 from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
@@ -77,6 +77,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     warnings += other_model(placement.asset, asset, scene)
     path = Trajectory(times, torch.stack(poses))
     there = at_place(asset, scene, path, start_us)
+    warnings += light_held(placement.asset, there, scene)
     marked = replace(there, meta={**there.meta, "inserted": True})
     actor = Actor(marked, path, _track(scene, placement.asset))
     warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us)).values()]

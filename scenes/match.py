@@ -59,15 +59,32 @@ def at_place(asset: Asset, scene: Scene, path: Trajectory, moment_us: int) -> As
 
 
 def matched(asset: Asset, scene: Scene, xy: torch.Tensor) -> Asset:
-    """The asset in the light of a place `[2]` of a scene; as it is where either ground is unknown."""
+    """The asset in the light of a place `[2]` of a scene; as it is where either ground is unknown. What it was multiplied by is its
+    `meta["light_gain"]`, and what that would be without `LIMIT`, where this tells, `meta["light_wanted"]`."""
     there, here = asset.meta.get("ground_linear"), ground_linear(scene, xy)
     if there is None or here is None:
         return asset
-    gain = (here / torch.tensor(there).clamp_min(1e-3)).clamp(1 / LIMIT, LIMIT)
+    wanted = here / torch.tensor(there).clamp_min(1e-3)
+    gain = wanted.clamp(1 / LIMIT, LIMIT)
     if float((gain - 1).abs().max()) < 0.02:
         return asset
     meta = {**asset.meta, "ground_linear": here.tolist(), "light_gain": [round(g, 4) for g in gain.tolist()]}
+    meta.pop("light_wanted", None)
+    if not torch.equal(gain, wanted):
+        meta["light_wanted"] = [round(g, 4) for g in wanted.tolist()]
     return replace(asset, gaussians=relit(asset.gaussians, gain), meta=meta)
+
+
+def light_held(name: str, asset: Asset, scene: Scene) -> list[str]:
+    """What to tell of an asset that goes by `name`, as `matched` left it, whose light should change by more than `LIMIT`: a sentence, or
+    none."""
+    wanted = asset.meta.get("light_wanted")
+    if not wanted:
+        return []
+    where = str(scene.meta.get("name", "the scene"))
+    asked = ", ".join(f"{gain:.2g}" for gain in wanted)
+    said = f"{name} should be {asked} times as bright (red, green, blue) to match the ground of {where} where it stands, but the limit is"
+    return [f"{said} {LIMIT:g} times brighter or darker: look whether that ground is a street, and in what light it was taken"]
 
 
 def other_model(name: str, asset: Asset, scene: Scene) -> list[str]:

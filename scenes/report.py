@@ -277,7 +277,8 @@ def _missing(bank: Path, entry: Entry) -> list[Path]:
 def _usd_files(path: Path) -> list[Path]:
     """The USD files that stand for a path: a scene's root and its edits, an asset's file, or the file itself."""
     if path.is_dir():
-        return [p for p in (path / "scene.usda", path / "asset.usdc") if p.is_file()] + sorted(path.glob("edits/*.usda"))
+        edits = (p for p in sorted(path.glob("edits/*.usda")) if not p.name.startswith("."))  # as what a killed edit was writing does
+        return [*(p for p in (path / "scene.usda", path / "asset.usdc") if p.is_file()), *edits]
     return [path] if found(path) is USD else []
 
 

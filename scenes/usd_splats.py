@@ -8,6 +8,7 @@ ones lose centimetres, and 3 digits of everything else.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +27,7 @@ from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
 EXTENT_SIGMAS = 3.0
 _SPLATS = "ParticleField3DGaussianSplat"
 _HALF_MAX = 65504.0
+_Z_FROM_Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # as glTF's is turned
 Clean = Callable[[Gaussians, str], Gaussians]
 
 
@@ -38,11 +40,14 @@ def save_gaussians(path: Path, gaussians: Gaussians, model: SplatModel | None = 
 
 
 def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
-    """The splats of a USD file that has exactly one splat prim, in the stage's frame."""
+    """The splats of a USD file that has exactly one splat prim, in the stage's frame: z up and in metres where it says how it differs."""
     with open_stage(path) as stage:
         prim = only_splats(stage.GetPseudoRoot(), path)
         transform = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
-        return clean(moved(read_splats(prim), torch.tensor(np.array(transform).T), path), str(path))  # USD's vectors are rows
+        up, metres = _authored_axes(stage, path)
+        upright = torch.eye(4, dtype=torch.float64)
+        upright[:3, :3] = metres * (_Z_FROM_Y_UP if up == "y" else upright[:3, :3])
+        return clean(moved(read_splats(prim), upright @ torch.tensor(np.array(transform).T), path), str(path))  # USD's vectors are rows
 
 
 def model_in(path: Path) -> SplatModel:
@@ -51,11 +56,23 @@ def model_in(path: Path) -> SplatModel:
         return read_model(only_splats(stage.GetPseudoRoot(), path))
 
 
-def stage_axes(path: Path) -> tuple[str, float]:
-    """Which axis of a USD file is up, "y" or "z", and the metres of its unit: 1 where it does not say, as splat tools write it."""
+def stage_axes(path: Path) -> tuple[str | None, float]:
+    """Which axis of a USD file is up, "y" or "z", and the metres of its unit, as the file itself says; None and 1 where it does not.
+
+    UsdGeom would then take y and 0.01. But splat tools that write neither mean the frame of their training, as in all their other files.
+    """
     with open_stage(path) as stage:
-        metres = UsdGeom.GetStageMetersPerUnit(stage) if UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1.0
-        return UsdGeom.GetStageUpAxis(stage).lower(), metres
+        return _authored_axes(stage, path)
+
+
+def _authored_axes(stage: Usd.Stage, path: Path) -> tuple[str | None, float]:
+    up = UsdGeom.GetStageUpAxis(stage).lower() if stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis) else None
+    metres = UsdGeom.GetStageMetersPerUnit(stage) if UsdGeom.StageHasAuthoredMetersPerUnit(stage) else 1.0
+    if not (math.isfinite(metres) and metres > 0):
+        raise ValueError(
+            f"{path} says that its unit is {metres:g} metres (metersPerUnit), which is no length; set what it is, 1 for metres"
+        )
+    return up, metres
 
 
 def save_asset(path: Path, asset: Asset, half: bool = False) -> None:

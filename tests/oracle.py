@@ -256,7 +256,9 @@ def _composite(pixels, lens: Lens, there, depths, mean, conic, opacity, colour, 
     total = 1 - passing[:, -1] if len(depths) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
     depth = torch.where(drawn, weight @ depths / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
-    who = instances[weight.detach().argmax(1)] if len(depths) else torch.full((len(pixels),), -1)
+    ids = instances.unique()
+    of_each = torch.stack([weight.detach()[:, instances == i].sum(1) for i in ids], 1) if len(ids) else None
+    who = torch.full((len(pixels),), -1) if of_each is None else ids[of_each.argmax(1)]
     out = (weight @ colour, total, depth, torch.where(total < 0.5, -1, who), jump)
     return tuple(t.reshape(*shape, *t.shape[1:]) for t in out)
 

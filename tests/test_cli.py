@@ -123,12 +123,13 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
     assert load(street).actors[0].asset.label == "car"
 
 
-def test_another_asset_of_another_splat_model_is_said(door, tmp_path):
+def test_another_asset_of_another_splat_model_and_light_is_said(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     bank = Databank(tmp_path / "bank")
-    bank.add(replace(made.car(), model=SplatModel("ewa")))
+    bank.add(replace(made.car(), model=SplatModel("ewa"), meta={"ground_linear": [0.001, 0.1, 0.1]}))
     _, errors = door(["edit", str(tmp_path / "street"), "--replace", "veh_1=car/0001", "--databank", str(bank.path)])
     assert "warning: car/0001 was trained with SplatModel(projection='ewa'" in errors
+    assert "warning: car/0001 should be " in errors and "the limit is 4 times" in errors
 
 
 def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
@@ -356,6 +357,18 @@ def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     assert "is valid" in door(["validate", str(tmp_path / "b.compressed.ply")])[0]
     assert "background.usdc" in door(["convert", "street", str(tmp_path / "c.ply")], 1)[1]
     assert 'suffix ".obj"' in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "c.obj")], 1)[1]
+
+
+def test_a_stage_that_is_y_up_is_converted_to_z_up_and_that_is_said(door, tmp_path):
+    source, target = tmp_path / "y.usda", tmp_path / "z.ply"
+    save_gaussians(source, made.car().gaussians)
+    assert "turned" not in door(["convert", str(source), str(target)])[0]
+    plain = load(target).means
+    source.write_text(source.read_text().replace('upAxis = "Z"', 'upAxis = "Y"').replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    out, _ = door(["convert", str(source), str(target), "-w"])
+    assert "y.usda is turned from y up to z up and scaled from units of 0.01 m to metres" in out and "off by at most nothing" in out
+    x, y, z = (0.01 * plain).unbind(1)
+    torch.testing.assert_close(load(target).means, torch.stack([x, -z, y], 1), rtol=1e-5, atol=1e-6)
 
 
 def test_splats_alone_are_rendered_from_around(door, tmp_path):

@@ -96,6 +96,33 @@ def test_the_demo_makes_a_clip_a_report_and_a_contact_sheet(data, tmp_path, monk
     assert read_image(tmp_path / "contact.png").shape[1] > 4 * 64
 
 
+def test_a_demo_that_fails_leaves_no_folder_and_spoils_none(data, tmp_path, monkeypatch):
+    from enhance import demo
+
+    def failing(_, folder):
+        (folder / "out.json").write_text("{}")
+        raise ValueError("no light")
+
+    monkeypatch.setattr(demo, "DATA", data)
+    monkeypatch.setattr(demo, "demonstrate", failing)
+    with pytest.raises(ValueError, match="no light"):
+        demo.Demo(tmp_path / "demo").run()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FileNotFoundError, match="the folder .*nowhere does not exist; create it first"):
+        demo.Demo(tmp_path / "nowhere" / "demo").run()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(FileExistsError, match="file is a file, and the demo makes a folder"):
+        demo.Demo(tmp_path / "file").run()
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "out.mp4").write_text("mine")
+    with pytest.raises(FileExistsError, match="out.mp4 exists; give -w to replace it"):
+        demo.Demo(tmp_path / "there").run()
+    assert (tmp_path / "there" / "out.mp4").read_text() == "mine"
+    monkeypatch.setattr(demo, "demonstrate", lambda _, folder: [(folder / n).touch() for n in ("out.mp4", "out.json", "contact.png")])
+    demo.Demo(tmp_path / "demo").run()
+    assert sorted(p.name for p in (tmp_path / "demo").iterdir()) == ["contact.png", "out.json", "out.mp4"]
+
+
 def test_the_bundled_street_has_what_the_demo_needs():
     from enhance.demo import CAMERA, MOVING, PARKED
     from scenes import load

@@ -56,8 +56,9 @@ def add_splats(
         raise ValueError(f"{file} holds no plain splats; assets and scenes are opened as they are")
     if not len(splats):
         raise ValueError(f"{file} holds no splats")
-    own_up, own_forward, metres = own_axes(file)
-    upright = turned_upright(splats, scale or metres, up or own_up, forward or own_forward)
+    own_up, own_forward, loaded, metres = own_axes(file)
+    up, forward = (name if name is None else loaded.get(name, name) for name in (up, forward))
+    upright = turned_upright(splats, scale / metres if scale else 1.0, up or own_up, forward or own_forward)
     low, high = solid_box(upright)
     base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
     asset = Asset(
@@ -67,21 +68,24 @@ def add_splats(
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
 
 
-def own_axes(file: Path) -> tuple[str, str, float]:
-    """The axes up and forward of loaded splats, and metres a unit, by their file's format.
+def own_axes(file: Path) -> tuple[str, str, dict[str, str], float]:
+    """Of splats as they were loaded from a file the axes up and forward by its format, those that axes of the file became where they were
+    turned, and the metres of its unit that they were multiplied by.
 
-    glTF faces +z with y up, and is turned to z up when it is loaded. A USD stage says which axis is up, and its unit if it is not the
-    metre; y up faces z as glTF does, z up faces x as robots do. All others stand as cameras see them: y down, z ahead.
+    glTF faces +z with y up, and is turned to z up when it is loaded; so is a USD stage that says y up, and one that names its unit is in
+    metres then; z up faces x as robots do. All others stand as cameras see them: y down, z ahead.
     """
     form = found(file)
     if form is GLB:
-        return "z", "-y", 1.0
+        return "z", "-y", {}, 1.0
     if form is USD:
         from scenes.usd_splats import stage_axes
 
-        up, metres = stage_axes(file)
-        return up, {"y": "z", "z": "x"}[up], metres
-    return "-y", "z", 1.0
+        said, metres = stage_axes(file)
+        if said == "y":
+            return "z", "-y", {"y": "z", "-y": "-z", "z": "-y", "-z": "y"}, metres
+        return ("z", "x", {}, metres) if said == "z" else ("-y", "z", {}, metres)
+    return "-y", "z", {}, 1.0
 
 
 def turned_upright(splats: Gaussians, scale: float, up: str, forward: str) -> Gaussians:

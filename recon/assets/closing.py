@@ -6,12 +6,11 @@ hull, Laurentini 1994, of two silhouettes), in the colours that its sides have a
 as one (`scenes/seen.py`).
 
 What stood before an end hid it in part, from all photos of a row of parked cars: a hole, through which the street shows. Of an end that
-photos show, the same hull closes what lets light through.
+photos show, the same hull closes what lets light through; those of the sides are closed in `patching.py`.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,14 +18,10 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from recon.seeds.points import Cloud, splats_from
+from recon.assets.patching import CLEARANCE, OPAQUE, SOLID, STEP, in_colours_of, patched, shown_alone
 from recon.tracks import VEHICLES
-from render import Frame, rasterize
 from scenes.asset import Asset
-from scenes.camera import Camera
 from scenes.gaussians import Gaussians
-from scenes.harmonics import rgb_from_sh
-from scenes.lenses import Orthographic
 from scenes.seen import unseen_sides
 
 ENDS = {"front": 1.0, "rear": -1.0}
@@ -35,26 +30,11 @@ ENDS = {"front": 1.0, "rear": -1.0}
 ROW = 0.08
 """Metres between the heights at which a vehicle's outline is taken."""
 
-CLEARANCE = 0.25
-"""Metres above the ground at which an end begins."""
-
-STEP = 0.05
-"""Metres between the splats that close it."""
-
 THERE = 0.15
 """Metres within which what was reconstructed is kept, and nothing added."""
 
-SOLID = 0.3
-"""Opacity from which on a splat is a part of the outline."""
-
-OPAQUE = 0.8
-"""Alpha from which on an end has no hole."""
-
 HOLE = 6
 """Points within two steps of one, itself among them, from which on what lets light through is a hole; 13 where all do."""
-
-PIXEL = 0.02
-"""Metres of a pixel in which holes are looked for."""
 
 ROUND = 0.75
 """Metres over which an end curves into the sides."""
@@ -65,21 +45,19 @@ FEWEST = 20
 LAMPS = 0.6
 """Metres from the other end whose colours, lamps' and a plate's, an end that nobody saw does not get."""
 
-ALIKE = 48
-"""Nearest splats of the sides whose median colour a splat gets; what differs in height counts `LEVEL` times as far."""
-LEVEL = 3.0
-
 
 def closed(asset: Asset) -> Asset:
     """A vehicle with those of its ends closed of which nobody took a photo (`unseen_sides`), which `meta["closed"]` names, and with the
-    holes of the others closed."""
-    unseen, splats, done = unseen_sides(asset), asset.gaussians, []
+    holes of the others and of both sides closed; `meta["patched_m2"]` says how much of the sides that is."""
+    unseen, splats, done, area = unseen_sides(asset), asset.gaussians, [], 0.0
     if asset.label in VEHICLES and asset.meta.get("sectors"):
         for name in sorted(ENDS, key=lambda end: end not in unseen):  # what closes an end reaches up to the roof, where no hole is then
             hull = hull_of_end(splats, asset.size.numpy(), ENDS[name], name not in unseen)
             splats = Gaussians.cat([splats, hull])
             done += [name] if name in unseen and len(hull) else []
-    return replace(asset, gaussians=splats, meta=asset.meta | {"closed": done})
+        patches, area = patched(splats, asset.size.numpy())
+        splats = Gaussians.cat([splats, patches])
+    return replace(asset, gaussians=splats, meta=asset.meta | {"closed": done, "patched_m2": round(area, 2)})
 
 
 def hull_of_end(splats: Gaussians, size: np.ndarray, end: float, seen: bool = False) -> Gaussians:
@@ -102,25 +80,14 @@ def hull_of_end(splats: Gaussians, size: np.ndarray, end: float, seen: bool = Fa
         points, solid = points[donors], solid.select(torch.from_numpy(donors))
     if not len(surface) or not len(points):
         return Gaussians.empty(splats.sh.shape[1])
-    alike = np.abs(points) * [1, 1, LEVEL]
-    nearest = cKDTree(alike).query(np.abs(surface) * [1, 1, LEVEL], k=min(ALIKE, len(alike)))[1]
-    colours = np.median(rgb_from_sh(solid.sh[:, 0]).numpy()[nearest.reshape(len(surface), -1)], axis=1)
-    cloud = Cloud(surface * [end, 1, 1], colours)
-    return splats_from(cloud, np.full(len(surface), STEP), splats.sh.shape[1], STEP)
+    return in_colours_of(solid, surface * [end, 1, 1], np.abs(points), np.abs(surface))
 
 
 def lets_through(splats: Gaussians, size: np.ndarray, end: float, points: np.ndarray) -> np.ndarray:
     """Mask `[M]` of points `[M, 3]` where some light passes the half of a vehicle at its front (`end` 1) or rear (-1), seen along x."""
-    half = splats.select(splats.means[:, 0] * end > 0)
-    columns, rows = (math.ceil(metres / PIXEL) for metres in size[1:])
-    # the camera looks backwards at a front and forwards at a rear
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor([[0.0, 0.0, -end], [end, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    pose[0, 3] = end * size[0]
-    camera = Camera(Orthographic(1 / PIXEL, 1 / PIXEL, columns / 2, float(rows)), columns, rows, pose)
-    with torch.no_grad():
-        frame = rasterize(half, camera, ("alpha",))
-    assert isinstance(frame, Frame) and frame.alpha is not None
+    camera, frame = shown_alone(splats, size, 0, end)
+    assert frame.alpha is not None
+    pose, rows, columns = camera.world_from_cam, camera.height, camera.width
     column, row = camera.lens.project((torch.from_numpy(points) - pose[:3, 3]) @ pose[:3, :3]).floor().long().unbind(1)
     return (frame.alpha[row.clamp(0, rows - 1), column.clamp(0, columns - 1)] < OPAQUE).numpy()
 

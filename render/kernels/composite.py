@@ -18,7 +18,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.lanewise import below, cut, greater, largest, least, lesser
+from render.kernels.lanewise import below, cut, greater, largest, least, lesser, voted
 from render.kernels.rows import ROLLED, corner_of, exp_of, rows_met
 from render.kernels.types import BLUE, GREEN, INSTANCE, MEDIAN, OPACITY, RED, S_MAX, TILE, WHO, K, Wanted, Window, Z, lanes
 
@@ -43,7 +43,7 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
         first: int,
     ):  # fmt: skip
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
-        state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its weight, where in the
+        state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its lead, where in the
         tile's list the lane went dark, its transmittance then, median depth, channels.
         held `[bands * BATCH]`: the records of the batch's entries; terms `[bands * BATCH * 2]`: their exponents' terms by row, and the same
         memory as numbers.
@@ -126,10 +126,9 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
                                     here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
                                     state[band, 10, r] = state[band, 10, r] + here * record[Z]
                                 if wp.static(wanted.instance):
-                                    most = state[band, 7, r]
-                                    leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
-                                    state[band, 6, r] = state[band, 6, r] + wp.cw_mul(leads, lanes(record[INSTANCE]) - state[band, 6, r])
-                                    state[band, 7, r] = wp.max(most, w)
+                                    who, lead = voted(state[band, 6, r], state[band, 7, r], record[INSTANCE], w)
+                                    state[band, 6, r] = who
+                                    state[band, 7, r] = lead
                                 t = t - w
                             state[band, 1, r] = red
                             state[band, 2, r] = green

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.canonical import CENTRE, GROUP
-from render.kernels.lanewise import below
+from render.kernels.lanewise import below, voted
 from render.kernels.ray_rows import (
     ALPHA,
     NONE,
@@ -146,7 +146,7 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
                     weights = lanes(0.0)
                     median = lanes(0.0)
                     who = lanes(-1.0)
-                    most = lanes(0.0)
+                    lead = lanes(0.0)
                     if wp.static(wanted.channels):
                         for c in range(channels):
                             planes[wp.static(wanted.first_channel) + c, row, tx] = lanes(0.0)
@@ -167,9 +167,7 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
                         if wp.static(wanted.median):
                             median = median + lists[band, PICKED, m] * record[Z]
                         if wp.static(wanted.instance):
-                            leads = wp.min(wp.max((w - most) * 1.0e30, lanes(0.0)), lanes(1.0))
-                            who = who + wp.cw_mul(leads, lanes(record[INSTANCE]) - who)
-                            most = wp.max(most, w)
+                            who, lead = voted(who, lead, record[INSTANCE], w)
                     planes[0, row, tx] = t
                     planes[1, row, tx] = red
                     planes[2, row, tx] = green

@@ -47,6 +47,28 @@ def cut(s: lanes, limit: float, v: lanes):
 
 
 @wp.func
+def signed(who: lanes, instance: float, w: lanes):
+    """w where `who` is the instance, else -w."""
+    return lanes(
+        wp.where(who[0] == instance, w[0], -w[0]), wp.where(who[1] == instance, w[1], -w[1]),
+        wp.where(who[2] == instance, w[2], -w[2]), wp.where(who[3] == instance, w[3], -w[3]),
+        wp.where(who[4] == instance, w[4], -w[4]), wp.where(who[5] == instance, w[5], -w[5]),
+        wp.where(who[6] == instance, w[6], -w[6]), wp.where(who[7] == instance, w[7], -w[7]),
+        wp.where(who[8] == instance, w[8], -w[8]), wp.where(who[9] == instance, w[9], -w[9]),
+        wp.where(who[10] == instance, w[10], -w[10]), wp.where(who[11] == instance, w[11], -w[11]),
+        wp.where(who[12] == instance, w[12], -w[12]), wp.where(who[13] == instance, w[13], -w[13]),
+        wp.where(who[14] == instance, w[14], -w[14]), wp.where(who[15] == instance, w[15], -w[15]),
+    )  # fmt: skip
+
+
+@wp.func
+def voted(who: lanes, lead: lanes, instance: float, w: lanes):
+    """The instance that leads, and by how much, when one more splat has voted by its weight (`types.WHO`)."""
+    left = lead + signed(who, instance, w)
+    return who + cut(left, 0.0, lanes(instance) - who), left - 2.0 * cut(left, 0.0, left)
+
+
+@wp.func
 def least(v: lanes, limit: float):
     """The lesser of v and limit."""
     return lanes(

@@ -162,14 +162,14 @@ def pixel_functions(ray: bool, eyes: bool):
 
 @wp.struct
 class Pixel:
-    """What a pixel has summed up so far: the light that still passes, colour, sum of w z, sum of w, and the splats it picks."""
+    """What a pixel has summed up so far: the light that still passes, colour, sum of w z, sum of w, and what it picks."""
 
     t: float
     colour: wp.vec3
     z: float
     weights: float
     median: float
-    most: float
+    lead: float
     who: float
 
 
@@ -204,9 +204,10 @@ def pixel_layers(wanted: Wanted):
         if wp.static(wanted.median):  # noqa: SIM102 - a static branch and a dynamic one
             if p.t >= 0.5 and p.t - w < 0.5:
                 p.median = r[Z]
-        if wp.static(wanted.instance):  # noqa: SIM102 - a static branch and a dynamic one
-            if w > p.most:
-                p.most = w
+        if wp.static(wanted.instance):
+            p.lead += wp.where(p.who == r[INSTANCE], w, -w)
+            if p.lead < 0.0:
+                p.lead = -p.lead
                 p.who = r[INSTANCE]
         p.t -= w
         return p

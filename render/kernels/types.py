@@ -48,8 +48,10 @@ class Wanted(NamedTuple):
 
 
 MEDIAN, WHO = 0, 1
-"""Planes that pick one splat a pixel: the depth of the one behind which less than half the light passes, the id of the one that
-weighs most."""
+"""Planes that pick one for each pixel: the depth of the splat behind which less than half the light passes, the id of the instance whose
+splats weigh most together. This is found by a vote that takes two numbers however many instances there are (Boyer and Moore 1981, MJRTY,
+weighted): one is held with its lead; its own splats add their weight to that, all others take it away, and who takes away more than there
+is, is held. So whoever weighs more than all others together is held at the end, and of two always the heavier."""
 
 ITEM = 64
 """Splats of an item of projection's work at most; their pose gradient is summed before it is written."""

@@ -43,6 +43,17 @@ def test_splats_in_files_that_say_which_axis_is_up_need_no_axes(tmp_path, name, 
     if up == "Y":
         text = file.read_text().replace('upAxis = "Z"', 'upAxis = "Y"').replace("metersPerUnit = 1", "metersPerUnit = 0.01")
         file.write_text(text)
+    axes = [(None, None, None)] if up is None else [(None, None, None), (1 / units, up.lower(), {"Z": "x", "Y": "z"}[up])]
+    for scale, up_axis, forward in axes:  # what is said once more, of the file as it is, changes nothing
+        id, _ = add_splats(tmp_path / "bank", file, "car", scale, up_axis, forward, {})
+        torch.testing.assert_close(Databank(tmp_path / "bank").load(id).gaussians.means, upright.means, atol=2e-3, rtol=0)
+
+
+def test_splats_of_a_usd_file_that_says_no_axis_stand_as_cameras_see_them(tmp_path):
+    upright, file = box((4.2, 1.8, 1.5), (0.8, 0.2, 0.1)), tmp_path / "car.usda"
+    turn = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward to z, y left to -x, z up to -y
+    save(replace(upright, means=upright.means @ turn.T), file)
+    file.write_text("".join(line for line in file.read_text().splitlines(True) if "upAxis" not in line and "metersPerUnit" not in line))
     id, _ = add_splats(tmp_path / "bank", file, "car", None, None, None, {})
     torch.testing.assert_close(Databank(tmp_path / "bank").load(id).gaussians.means, upright.means, atol=2e-3, rtol=0)
 

@@ -5,6 +5,9 @@ import pytest
 import torch
 
 from recon.assets.closing import closed, lets_through
+from recon.assets.extract import completed
+from recon.assets.patching import patched, shown_alone
+from recon.commands import _seen_from
 from scenes import Asset, Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 
@@ -107,3 +110,57 @@ def test_a_front_does_not_get_the_colour_of_tail_lamps():
     sh[(x < -2.1) & (z > 0.5) & (z < 0.8), 0] = sh_from_rgb(torch.tensor([1.0, 0.0, 0.0]))
     made = closed(replace(car, gaussians=replace(car.gaussians, sh=sh)))
     assert (rgb_from_sh(made.gaussians.sh[len(car.gaussians) :, 0])[:, 0] < 0.5).all()
+
+
+def saloon(without=None) -> tuple[Asset, Gaussians]:
+    """A dense car that was seen from everywhere, and with a hole where `without` of x, y, z says; and what stood in the hole."""
+    whole = two_tailed().gaussians
+    whole = replace(whole, log_scales=whole.log_scales + 0.3)
+    gone = without(*whole.means.unbind(1)) if without else torch.zeros(len(whole), dtype=torch.bool)
+    meta = {"sectors": {"front": 9, "rear": 9, "left": 9, "right": 9}}
+    return Asset(whole.select(~gone), SIZE, "car", meta=meta), whole.select(gone)
+
+
+def added_to(asset: Asset) -> tuple[Gaussians, Asset]:
+    made = closed(asset)
+    return made.gaussians.select(torch.arange(len(asset.gaussians), len(made.gaussians))), made
+
+
+def test_a_hole_in_a_side_is_closed_behind_its_surface_in_the_colour_around_it():
+    holed, gone = saloon(lambda x, y, z: (y > 0) & (x > -0.6) & (x < 0.5) & (z > 0.35) & (z < 0.75))
+    patch, made = added_to(holed)
+    x, y, z = patch.means.unbind(1)
+    assert made.meta["closed"] == [] and 0.15 < made.meta["patched_m2"] < 1.1 * 0.4  # what stands around it reaches in
+    assert (x - -0.05).abs().max() < 0.62 and z.min() > 0.28 and z.max() < 0.82
+    assert y.min() > 0.83 and y.max() < 0.9, "on its own side, not before what was seen"
+    assert (rgb_from_sh(patch.sh[:, 0])[:, 2] > 0.7).all() and not patch.sh[:, 1:].any()
+    camera, frame = shown_alone(made.gaussians, SIZE.numpy(), 1, 1.0)
+    column, row = camera.lens.project((gone.means.double() - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3]).long().unbind(1)
+    assert (frame.alpha[row, column] > 0.8).float().mean() > 0.95
+
+
+def test_a_mirrored_side_is_closed_as_the_side_that_was_seen():
+    both, _ = saloon(lambda x, y, z: (x > -0.6) & (x < 0.5) & (z > 0.35) & (z < 0.75) & (y.abs() > 0.85))
+    half = both.gaussians.select(both.gaussians.means[:, 1] > 0)
+    whole, mirrored = completed(half, 9.0, 0.0)
+    assert mirrored
+    patch, made = added_to(replace(both, gaussians=whole))
+    left, right = (patch.means[patch.means[:, 1] * side > 0] * torch.tensor([1.0, side, 1.0]) for side in (1, -1))
+    assert len(left) == len(right) > 50
+    off = (left[:, None] - right[None]).norm(dim=2).min(1).values
+    assert "m2 of its sides" in _seen_from(made)["holes closed"] and "holes closed" not in _seen_from(saloon()[0])
+    assert off.max() < 0.05 and 0.3 < made.meta["patched_m2"] < 0.88
+
+
+def test_a_side_goes_down_to_where_it_begins_and_stays_open_below_an_end_that_rises():
+    sill, _ = saloon(lambda x, y, z: (x.abs() < 0.8) & (z < 0.5))
+    patch, _ = added_to(sill)
+    assert 0.2 < patch.means[:, 2].min() < 0.32 and patch.means[:, 0].abs().max() < 0.9
+    rising, _ = saloon(lambda x, y, z: (x > 1.2) & (z < 0.7))
+    patch, area = patched(rising.gaussians, SIZE.numpy())
+    assert area < 0.3 and not ((patch.means[:, 0] > 1.5) & (patch.means[:, 2] < 0.5)).any()
+
+
+def test_sides_without_holes_are_left_alone():
+    patch, made = added_to(saloon()[0])
+    assert len(patch) == 0 and made.meta["patched_m2"] == 0

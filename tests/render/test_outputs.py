@@ -170,6 +170,26 @@ def test_where_nothing_moves_everything_is_visible_through_thin_splats_too():
     assert frame.visible_next.all()
 
 
+@pytest.mark.parametrize("order", ["tile", "pixel"])
+@pytest.mark.parametrize("response", ["conic", "ray"])
+def test_a_pixel_is_of_the_instance_whose_splats_weigh_most_together(response, order):
+    """Not of the one that has the heaviest splat: a street is many faint ones on top of each other, a car's door is one."""
+    told = []
+    for count in (2, 4):
+        clouds = [replace(random_splats(60 * n, n), logit_opacities=torch.full((60 * n,), 2.0 - n)) for n in range(1, count + 1)]
+        placed = [Placed(g, pose_from([1, 0.1 * n, 0.2, 0.05], [0.1, 0.1 * n, 6.0]), instance=2 * n) for n, g in enumerate(clouds)]
+        outputs = ("alpha", "instance", "instance_alpha")
+        frame = rasterize(placed, CAMERA, outputs, model=SplatModel(response=response), config=RenderConfig(order=order))
+        most, who = frame.instance_alpha.max(-1)
+        drawn = frame.alpha > 0.5
+        sure = drawn & (2 * most - frame.alpha > 1e-5)  # of two all but ties
+        assert sure.float().mean() > 0.2
+        assert torch.equal(frame.instance[sure], 2 * who[sure].int())
+        assert (frame.instance[~drawn] == -1).all() and (frame.instance[drawn] >= 0).all()
+        told.append(frame.instance[sure].unique().numel())
+    assert told[0] == 2 and told[1] >= 3
+
+
 def test_outputs_do_not_change_one_another():
     placed = two_instances(7)
     features = torch.randn(170, 5, generator=torch.Generator().manual_seed(0))

@@ -127,6 +127,19 @@ def test_an_asset_from_a_darker_bluer_place_comes_to_the_light_of_this_one(stree
     assert back.meta["light_gain"] == pytest.approx([2.5, 2.0, 1.4286], rel=1e-3)
 
 
+def test_an_asset_that_would_have_to_be_more_than_four_times_as_bright_says_so(street):
+    here = ground_linear(street, torch.tensor([12.0, 0.0]))
+    night = replace(car(), meta={"ground_linear": (here * torch.tensor([0.1, 0.5, 1.0])).tolist()})
+    put_in = insert(street, night, Placement("car/0007", 12, 0))
+    (said,) = [w for w in put_in.warnings if "as bright" in w]
+    assert said.startswith("car/0007 should be 10, 2, 1 times as bright") and "the limit is 4 times" in said
+    assert str(street.meta.get("name", "the scene")) in said
+    assert put_in.actor.asset.meta["light_gain"] == pytest.approx([4.0, 2.0, 1.0], rel=1e-3)
+    at_limit = replace(car(), meta={"ground_linear": (here * torch.tensor([0.26, 3.9, 1.0])).tolist()})
+    calm = insert(street, at_limit, Placement("car/0007", 12, 0))
+    assert not any("as bright" in w for w in calm.warnings) and "light_wanted" not in calm.actor.asset.meta
+
+
 def test_an_asset_whose_light_is_unknown_is_left_as_it_is(street):
     assert matched(car(), street, torch.tensor([12.0, 0.0])).gaussians is not None
     assert "light_gain" not in insert(street, car(), Placement("car", 12, 0)).actor.asset.meta

@@ -93,6 +93,14 @@ def test_a_deleted_edit_is_a_warning_and_a_problem(saved):
     assert any(f"sidestep edit {saved} --undo first" in p for p in validate(saved))
 
 
+def test_what_a_killed_edit_was_writing_is_no_edit(saved):
+    (saved / "edits").mkdir(exist_ok=True)
+    (saved / "edits" / ".first.a1b2c3d4.usda").write_text("#usda 1.0\n(")
+    assert validate(saved) == []
+    (saved / "edits" / "second.usda").write_text("#usda 1.0\n(")
+    assert any("second.usda" in problem for problem in validate(saved))
+
+
 def test_bad_splats_are_problems_and_counted(tmp_path, monkeypatch):
     g = gaussians(6)
     g.means[4, 0], g.quats[2], g.log_scales[3] = float("nan"), 0, 15.0

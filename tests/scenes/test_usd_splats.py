@@ -12,8 +12,10 @@ from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 from randomized import asset, gaussians
 
 from scenes import Gaussians, load, load_dropping, save
+from scenes.harmonics import evaluate
 from scenes.poses import matrix_from_quat
 from scenes.usd import usd_problems, valid_names
+from scenes.usd_splats import stage_axes
 
 SUFFIXES = ["usdc", "usda", "usd"]
 
@@ -178,6 +180,45 @@ def test_another_tools_file_with_some_half_attributes_loads(tmp_path):
 def test_another_tools_bad_file_is_refused(tmp_path, edit, said):
     with pytest.raises(ValueError, match=said):
         load(foreign(tmp_path / "a.usda", edit))
+
+
+def saying(path, up=None, metres=None):
+    """The file with its stage's axis and unit as given, or not said at all."""
+    stage = Usd.Stage.Open(str(path))
+    for name, value in (("upAxis", up), ("metersPerUnit", metres)):
+        stage.SetMetadata(name, value) if value is not None else stage.ClearMetadata(name)
+    stage.GetRootLayer().Save()
+    return path
+
+
+@pytest.mark.parametrize(("up", "metres"), [("Y", 1.0), ("Z", 0.01), ("Y", 0.01)])
+def test_a_stage_that_says_its_axis_and_unit_comes_to_z_up_and_metres(tmp_path, up, metres):
+    as_written = gaussians(60, 4)
+    save(as_written, tmp_path / "a.usda")
+    plain, found = load(tmp_path / "a.usda"), load(saying(tmp_path / "a.usda", up, metres))
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if up == "Y" else torch.eye(3)
+    torch.testing.assert_close(found.means, metres * plain.means @ turn.T, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.log_scales, plain.log_scales + torch.tensor(metres).log(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(matrix_from_quat(found.quats), turn @ matrix_from_quat(plain.quats), rtol=0, atol=1e-5)
+    look = torch.nn.functional.normalize(torch.randn(60, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    torch.testing.assert_close(evaluate(found.sh, look @ turn.T), evaluate(plain.sh, look), rtol=1e-4, atol=1e-4)
+    save(found, tmp_path / "b.usdc")  # what is written says z and metres
+    torch.testing.assert_close(load(tmp_path / "b.usdc").means, found.means, rtol=0, atol=0)
+
+
+def test_a_stage_that_says_neither_is_taken_as_it_is(tmp_path):
+    save(gaussians(60, 4), tmp_path / "a.usda")
+    plain, found = load(tmp_path / "a.usda"), load(saying(tmp_path / "a.usda"))
+    assert stage_axes(tmp_path / "a.usda") == (None, 1.0)
+    for name, tensor in plain.tensors().items():
+        assert torch.equal(tensor, getattr(found, name)), name
+
+
+@pytest.mark.parametrize("metres", [0.0, -1.0, float("nan")])
+def test_a_unit_that_is_no_length_is_refused(tmp_path, metres):
+    save(gaussians(5), tmp_path / "a.usda")
+    with pytest.raises(ValueError, match=r"a\.usda says that its unit is .* metres \(metersPerUnit\), which is no length"):
+        load(saying(tmp_path / "a.usda", "Z", metres))
 
 
 def test_splats_under_a_transform_are_moved_by_it(tmp_path):
