@@ -14,7 +14,7 @@ import torch
 from recon.adjust import adjusted
 from recon.album import keep_album
 from recon.align import MOVED, aligned, as_aligned
-from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, save_checkpoint
+from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint, tracks_of
 from recon.exposed import exposed_by
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
@@ -116,7 +116,8 @@ def reconstruct(
     within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     for sweep in () if saved else within:
         sweep.read()  # they are used after the fit: a damaged one is told before it
-    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size, saved[1].get("path") if saved else None)
+    known = (saved[1].get("path"), saved[1].get("movers")) if saved else (None, None)
+    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size, *known)
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])
@@ -128,6 +129,7 @@ def reconstruct(
 
     def keep() -> None:
         so_far = {"seconds": seconds(), "live": live.curve, "path": {MOVED: log.meta.get(MOVED)}}
+        so_far["movers"] = plain_tracks(log.tracks) if "movers" in log.meta else None
         save_checkpoint(checkpoint, options, start, fit.tensors() | so_far)
 
     with Progress("fit", total=config.steps) as steps:
@@ -183,9 +185,10 @@ def readied(
     span: tuple[int, int],
     size: tuple[int, int],
     known: dict | None = None,
+    movers: Sequence[dict] | None = None,
 ) -> Log:
     """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, or as is `known` from before
-    (`as_aligned`); and with the movers that sweeps show where it has no boxes."""
+    (`as_aligned`); and with the movers that sweeps show where it has no boxes, or that were found before (`plain_tracks`)."""
     if known is not None:
         log = as_aligned(log, known)
     elif "path" in config.refine and sweeps:
@@ -194,6 +197,8 @@ def readied(
     elif "path" in config.refine and log.points is None:  # else the poses come from the pictures
         log = adjusted(log, names[0], span, size)
     places = {s.index for s in sweeps}
+    if movers is not None:
+        return _moved_by(log, tracks_of(movers))
     return annotated(log, [s for s in log.sweeps if s.index in places])
 
 
@@ -205,7 +210,11 @@ def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
         found = with_movers(log, sweeps, steps.step)
     count = len(found.tracks)
     print(f"{log.path} has no boxes: its lidar shows {count} thing{'s that move' if count != 1 else ' that moves'}", file=sys.stderr)
-    return replace(found, meta={**log.meta, "movers": "found in lidar"})
+    return _moved_by(log, found.tracks)
+
+
+def _moved_by(log: Log, tracks: Sequence[Track]) -> Log:
+    return replace(log, tracks=tuple(tracks), meta={**log.meta, "movers": "found in lidar"})
 
 
 def choose(

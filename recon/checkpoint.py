@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -70,14 +71,7 @@ def plain_config(config: FitConfig) -> dict:
 
 def _plain_start(start: Start) -> dict:
     return {
-        "tracks": [
-            {
-                "name": t.name, "label": t.label, "moving": t.moving,
-                "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us),
-                "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
-            }
-            for t in start.tracks
-        ],
+        "tracks": plain_tracks(start.tracks),
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
@@ -85,6 +79,29 @@ def _plain_start(start: Start) -> dict:
         "swept": start.swept.keys,
         "gains": list(start.gains),
     }  # fmt: skip
+
+
+def plain_tracks(tracks: Sequence[Track]) -> list[dict]:
+    """Tracks as a checkpoint holds them; `tracks_of` makes them again."""
+    return [
+        {
+            "name": t.name, "label": t.label, "moving": t.moving,
+            "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us),
+            "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
+        }
+        for t in tracks
+    ]  # fmt: skip
+
+
+def tracks_of(plain: Sequence[dict]) -> list[Track]:
+    """The tracks that `plain_tracks` were made of."""
+    return [
+        Track(
+            t["name"], t["label"], t["moving"], t["size"].numpy(), t["times_us"].numpy(),
+            t["world_from_box"], t["sensor"].numpy(), tuple(t["sources"]),
+        )
+        for t in plain
+    ]  # fmt: skip
 
 
 def _plain_camera(r: RigCamera) -> list:
@@ -100,16 +117,9 @@ def _camera(plain: list) -> RigCamera:
 def _start(plain: dict, fit: dict) -> Start:
     from recon.fit.model import Splats
 
-    tracks = [
-        Track(
-            t["name"], t["label"], t["moving"], t["size"].numpy(), t["times_us"].numpy(),
-            t["world_from_box"], t["sensor"].numpy(), tuple(t["sources"]),
-        )
-        for t in plain["tracks"]
-    ]  # fmt: skip
     rig = {n: _camera(r) for n, r in plain["rig"].items()}
     heights, origin, cell = plain["ground"]
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
     measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
-    return Start(splats, tracks, fit["sky"], fit["exposures"], ego, ground, rig, measured, swept, tuple(plain["gains"]))
+    return Start(splats, tracks_of(plain["tracks"]), fit["sky"], fit["exposures"], ego, ground, rig, measured, swept, tuple(plain["gains"]))

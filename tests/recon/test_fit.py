@@ -129,6 +129,30 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
     assert resumed.meta["held_out"] == whole[1].meta["held_out"] and out.is_dir()
 
 
+def test_movers_that_were_found_in_lidar_are_not_sought_again(drive, tmp_path, monkeypatch):
+    config, log, out = replace(CONFIG, steps=24), open_log(drive), tmp_path / "scene"
+    bare, sought, step = replace(log, tracks=()), [], Fit.step
+
+    def found(log_, sweeps, report):
+        sought.append(len(sweeps))
+        return replace(log_, tracks=log.tracks)
+
+    monkeypatch.setattr("recon.build.with_movers", found)
+    at_once = reconstruct(bare, tmp_path / "other", size=SIZE, held_out=4, config=config)
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr(Fit, "step", lambda self: os.kill(os.getpid(), signal.SIGINT) if self.step_count == 12 else step(self))
+        reconstruct(bare, out, size=SIZE, held_out=4, config=config)
+    assert len(sought) == 2
+    resumed = reconstruct(bare, out, size=SIZE, held_out=4, config=config, resume=True)
+    assert len(sought) == 2
+    assert [a.track for a in resumed.actors] == [a.track for a in at_once.actors] != []
+    assert torch.equal(resumed.actors[0].trajectory.world_from_body, at_once.actors[0].trajectory.world_from_body)
+    assert torch.equal(resumed.background.gaussians.means, at_once.background.gaussians.means)
+    for table in ("held_out", "off_path"):
+        assert resumed.meta[table] == at_once.meta[table]
+    assert resumed.meta["movers"] == at_once.meta["movers"]
+
+
 def test_a_size_that_is_too_small_is_refused_before_any_picture_is_read(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(LogCamera, "image", lambda *_: pytest.fail("read a picture"))
     with pytest.raises(ValueError, match="pictures of 28x15 are too small to fit to; the smallest size is 16x16"):
