@@ -118,6 +118,8 @@ def reconstruct(
         sweep.read()  # they are used after the fit: a damaged one is told before it
     known = (saved[1].get("path"), saved[1].get("movers")) if saved else (None, None)
     log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size, *known)
+    unseen = {s.index for s in within}
+    within = [s for s in log.sweeps if s.index in unseen]  # where the corrected path has them
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)
     if saved:
         fit.restore(saved[1])

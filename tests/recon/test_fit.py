@@ -13,6 +13,7 @@ from PIL import Image
 
 from recon import open_log, reconstruct, stopped_early
 from recon.actors import split_points
+from recon.align import moved
 from recon.build import _span, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
@@ -31,7 +32,7 @@ from render.album import references_of
 from render.compare import psnr
 from render.rays import world_directions
 from scenes import Scene, load
-from scenes.poses import inverse
+from scenes.poses import inverse, translation
 from scenes.sky import sample_equirect
 from scenes.trajectory import Trajectory
 from tests.bench.presets import random_splats
@@ -151,6 +152,20 @@ def test_movers_that_were_found_in_lidar_are_not_sought_again(drive, tmp_path, m
     for table in ("held_out", "off_path"):
         assert resumed.meta[table] == at_once.meta[table]
     assert resumed.meta["movers"] == at_once.meta["movers"]
+
+
+def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, tmp_path, monkeypatch):
+    log, measured = open_log(drive), []
+
+    def raised(log, sweeps, report):
+        return moved(log, Trajectory(log.ego.times_us[:1], translation(0.0, 0.0, 0.5)[None]))
+
+    monkeypatch.setattr("recon.build.aligned", raised)
+    monkeypatch.setattr("recon.build.off_path_table", lambda scene, log, sweeps, frames: measured.extend(sweeps) or [])
+    reconstruct(log, tmp_path / "scene", size=SIZE, held_out=4, config=replace(CONFIG, steps=1))
+    assert [s.index for s in measured] == [2, 6]
+    for sweep, recorded in zip(measured, (log.sweeps[2], log.sweeps[6]), strict=True):
+        np.testing.assert_allclose(sweep.read().xyz, recorded.read().xyz + [0, 0, 0.5])
 
 
 def test_a_size_that_is_too_small_is_refused_before_any_picture_is_read(drive, tmp_path, monkeypatch):
