@@ -120,8 +120,8 @@ def enhance_video(
             done += 1
             if progress is not None:
                 progress(done, clip.count)
-    if isinstance(clip, Pictures) and clip.dropped:
-        warn([f"{out} is without what pictures of {source} had: {clip.dropped}"])
+    if clip.dropped:
+        warn([f"{out} is without what {'pictures of ' * isinstance(clip, Pictures)}{source} had: {clip.dropped}"])
     if isinstance(clip, Video):
         warn(odd_warning(out, clip.width, clip.height))
     if isinstance(clip, Video) and clip.sound:

@@ -64,8 +64,8 @@ class Enhancer:
         self.about = about or {}
         self.bfloat16 = has_bfloat16(self.device) if bfloat16 is None else bfloat16
         self.history = net.config.history if history is None else history
-        if not 0 <= self.history <= net.config.history:
-            raise ValueError(f"history must be 0 to {net.config.history}, as the network was trained, got {history}")
+        if self.history not in range(net.config.history + 1):
+            raise ValueError(f"history must be a whole number from 0 to {net.config.history}, as the network was trained, got {history}")
         gains = self.about.get(REPAIR_GAIN, (WORTH, WORTH))
         self.repairs = tuple(gain >= WORTH if repair is None else repair for gain in gains)
         if not any(self.repairs):

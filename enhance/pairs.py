@@ -36,6 +36,8 @@ from scenes.sky import Sky
 from scenes.spread import spread
 from scenes.usd_scene import load_recorded
 
+FITS = ("early", "refits")
+"""Folders of the reconstructions that pairs are made from, beside the pairs."""
 ANYWHERE = ("underfit", "isp", "isp_frame", "clean")
 """Kinds that need nothing but a scene and its recording."""
 
@@ -126,15 +128,16 @@ def prepare_sources(
     """What `kinds` are made from, all that can be made where None (`kinds` of the result): reconstructions, kept in `folder` (made on
     `device`, some minutes each, once; each seed leaves out other things), assets cut out of the scene and those of a databank, and .hdr
     skies; `relit` is the folder in which DiffusionRenderer is met. Raises ValueError for an unknown kind, where the rig has too few cameras
-    for one, and where shadow has no asset to put in."""
+    for one, where shadow has no asset to put in, and for a databank's asset or a sky that is broken."""
     check_kinds(kinds or ())
     folder = Path(folder)
+    bank = Databank(databank) if databank is not None else None  # now, and skies: what is broken must not cost the wait for the fits
+    stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
+    above = [_sky(path) for path in skies]
     names = [name for name in log.cameras if name in scene.rig]
     log = with_ego_masks(of_scene(log, scene), names, PairConfig.width)
     found = list(candidates(scene)) if kinds is None or {"shadow", "reinsert"} & set(kinds) else []
     kinds = kinds_for(scene, log, found, databank) if kinds is None else kinds
-    bank = Databank(databank) if databank is not None else None
-    stored = [bank.load(entry.id) for entry in bank.entries()] if bank is not None else []
     anywhere = [c.evenly_lit() for c in found if not c.flaw] + stored
     if "shadow" in kinds and not anywhere:
         raise ValueError(
@@ -143,14 +146,14 @@ def prepare_sources(
     less = Less.drawn(seed)
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
     there, half_done = as_aligned(log, scene.meta), exposed_as(scene, half_done)
-    early = stopped_early(there, folder / "early", names, config=half_done, device=device) if "underfit" in kinds else []
+    early = stopped_early(there, folder / FITS[0], names, config=half_done, device=device) if "underfit" in kinds else []
     shots = shots_of(as_reconstructed(log, scene), scene) if {"underfit", "reinsert"} & set(kinds) else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]
-    made = {kind: refits(kind, scene, log, folder / "refits", less, device=device) for kind in REFITS if kind in kinds}
+    made = {kind: refits(kind, scene, log, folder / FITS[1], less, device=device) for kind in REFITS if kind in kinds}
     moved = [c for c in found if _returns(c)] if "reinsert" in kinds else []
     own = {c.track: replace(c.asset, photos=c.photos(scene, shots)) for c in moved}
     lit = None if relit is None else Relit(Path(relit))
-    return Sources(unfinished, shots, made, [_sky(path) for path in skies], lit, own, anywhere, tuple(kinds))
+    return Sources(unfinished, shots, made, above, lit, own, anywhere, tuple(kinds))
 
 
 def kinds_for(scene: Scene, log: Log, found: Sequence[Candidate], databank: str | Path | None = None) -> tuple[str, ...]:
@@ -251,13 +254,16 @@ def claim_pairs(out: str | Path, scene: Scene, log: Log, seed: int, config: Pair
 
 
 def claim(out: Path, settings: dict, made_of: dict) -> None:
-    """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say."""
-    note, before = made_folder(out) / NOTE, {}
+    """Note in a folder how its pairs are made, and of what; or refuse a folder made otherwise. Of what, folders of before do not say.
+    What a run noted that made nothing, as it was refused or stopped before, binds none."""
+    note, before = made_folder(out) / NOTE, None
     if note.exists():
         try:
-            before = dict(json.loads(note.read_text()))
+            noted = dict(json.loads(note.read_text()))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{note} does not say how these pairs were made ({error}); choose another folder") from error
+        before = _binding(out, noted)
+    if before is not None:
         if {k: v for k, v in before.items() if k in settings} != settings:
             raise ValueError(f"{out} holds pairs made with other settings ({note.read_text()}); choose another folder")
         for name, digest in made_of.items():
@@ -266,7 +272,16 @@ def claim(out: Path, settings: dict, made_of: dict) -> None:
         if made_of.keys() <= before.keys():
             return
     with atomic_file(note) as half:
-        Path(half).write_text(json.dumps(before | settings | made_of))
+        Path(half).write_text(json.dumps((before or {}) | settings | made_of))
+
+
+def _binding(out: Path, noted: dict) -> dict | None:
+    """Of what a folder's note says, what something that is there was made by, as "skies of shadow" where there are clips of shadow; None
+    where nothing is there."""
+    kinds = {clip.parent.name for clip in out.glob("*/*.json")} & set(KINDS)
+    if not kinds and not any(any(out.glob(f"{fits}/*")) for fits in FITS):
+        return None
+    return {name: of for name, of in noted.items() if (kind := name.rpartition(" of ")[2]) not in KINDS or kind in kinds}
 
 
 def _digest(scene: Scene) -> str:

@@ -57,14 +57,17 @@ def checked(frame: Frame | torch.Tensor) -> Given:
         check_tensor("flow_prev", flow, (height, width, 2))
     if instance is not None:
         check_tensor("instance", instance, (height, width))
+        instance = _ids(instance)
     if need is not None:
         check_tensor("need", need, (height, width))
         need = torch.nan_to_num(need, nan=1.0)  # where nobody knows there may be need
     if reference is not None:
         check_tensor("reference", reference[0], (height, width, 3))
         check_tensor("trust", reference[1], (height, width))
-        _check_finite("reference", reference[0])
-        _check_finite("trust", reference[1])
+        check_rgb("reference", reference[0])  # stored ones are bytes, and would be laid in as white
+        if reference[1].dtype != torch.bool:
+            check_floats("trust", reference[1])
+            _check_finite("trust", reference[1])
         reference = reference[0], reference[1].clamp(0, 1)
     return Given(rgb, flow, instance, need, reference)
 
@@ -79,6 +82,14 @@ def check_rgb(name: str, rgb: torch.Tensor, rendered: bool = False) -> None:
     _check_finite(name, rgb)
     if not rendered and (mean := float(rgb.mean(dtype=torch.float32))) > BYTES:
         raise ValueError(f"{name} must be floats in 0..1, but its mean is {mean:.4g}; divide bytes by 255")
+
+
+def _ids(instance: torch.Tensor) -> torch.Tensor:
+    """Objects' ids as torch compares them, which it hardly does as unsigned 16 bits; ValueError unless they are whole numbers: of floats
+    some may be none, or a mask's soft edge."""
+    if instance.is_floating_point() or instance.is_complex():
+        raise ValueError(f"instance must hold ids, whole numbers, got {instance.dtype}; give instance.round().int(), 0 where no object is")
+    return instance.long() if instance.dtype in (torch.uint16, torch.uint32, torch.uint64) else instance
 
 
 def frame_of(rgb: torch.Tensor, instance: torch.Tensor | None) -> Frame:

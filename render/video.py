@@ -59,8 +59,9 @@ class Video:
     """A video file's frames, decoded one at a time: iterate for rgb `[H, W, 3]` float32 0..1, turned as the file says (phones').
 
     fps: frames a second in the mean; width, height: pixels of the turned frames; pixel_aspect: how much wider than high a pixel is to be
-    shown; count, seconds: frames and length as the file claims, None where it does not say; sound: whether it has any. Raises ValueError
-    where the file is no video, has no frames, breaks off in the middle, or goes on in another size.
+    shown; count, seconds: frames and length as the file claims, None where it does not say; sound: whether it has any; dropped: what of the
+    first frame is not read, in words, or ''. Raises ValueError where the file is no video, has no frames, breaks off in the middle, or goes
+    on in another size.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -83,6 +84,7 @@ class Video:
         frames = self._decoded()
         first = next(frames)  # what turns them is said with the frames
         frames.close()
+        self.dropped = _dropped(first)
         lies = _quarters(first) % 2 == 1
         self.width, self.height = (first.height, first.width) if lies else (first.width, first.height)
         self.pixel_aspect = 1 / aspect if lies else aspect
@@ -136,6 +138,15 @@ class Video:
 def _quarters(frame) -> int:
     """Quarter turns to the left that show a frame of PyAV's upright."""
     return round(frame.rotation / 90)
+
+
+def _dropped(frame) -> str:
+    """What 8-bit RGB leaves out of a frame of PyAV's, '' for nothing. A GIF's has an alpha channel even where all of it is opaque."""
+    from scenes.pictures import unread
+
+    parts = frame.format.components
+    alpha = any(part.is_alpha for part in parts) and bool((frame.to_ndarray(format="rgba")[..., 3] < 255).any())
+    return unread(alpha, any(part.bits > 8 for part in parts))
 
 
 def read_video(path: str | os.PathLike) -> Video:

@@ -1,5 +1,6 @@
 """Files and folders that appear whole or not at all: written beside their target, then renamed."""
 
+import errno
 import os
 import shutil
 import tempfile
@@ -7,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What a write says for which there is no room: on the disk, in one's share of it, in a file."""
 
 
 @contextmanager
@@ -26,8 +30,9 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
         partial.chmod(0o666 & ~_umask())  # mkstemp's 0600 would outlive the rename
         os.replace(partial, path)
     except OSError as error:
-        if error.filename == str(partial):
-            error.filename = str(path)  # a full disk is told with the name that the user knows
+        # a full disk is told with the name that the user knows; where a write fails, and not the opening, Python names no file
+        if error.filename == str(partial) or (error.filename is None and error.errno in FULL):
+            error.filename = str(path)
         raise
     finally:
         partial.unlink(missing_ok=True)

@@ -36,11 +36,21 @@ def scene_folder(path: str | Path) -> Path:
 
 
 def check_device(device: str | torch.device) -> None:
-    """ValueError where the machine has no such device."""
+    """ValueError where there is no such device, or the machine has none."""
     import torch
 
-    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+    try:
+        known = torch.device(device)
+    except (RuntimeError, TypeError):
+        known = None
+    if known is None or known.type not in ("cpu", "cuda"):
+        raise ValueError(f'device must be "cpu" or "cuda", of several GPUs one as "cuda:1"; got {device!r}')
+    if known.type == "cpu":
+        return
+    if not torch.cuda.is_available():
         raise ValueError("this machine has no CUDA device that torch can use; leave --device cuda out")
+    if known.index is not None and known.index >= (count := torch.cuda.device_count()):
+        raise ValueError(f"this machine has {count} CUDA device{'s' * (count != 1)}, from cuda:0; got {known}")
 
 
 def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]]:

@@ -41,7 +41,12 @@ def rgb_of(picture: Image.Image) -> Image.Image:
 def dropped_of(picture: Image.Image) -> str:
     """What `rgb_of` leaves out of an opened picture, '' for nothing: its alpha channel, or what its values have beyond 8 bits."""
     finer = picture.mode[0] in "IF" or any(";16" in str(tile[3]) for tile in getattr(picture, "tile", ()))
-    return " and ".join(["its alpha channel"] * picture.has_transparency_data + ["all beyond 8 bits of its values"] * finer)
+    return unread(picture.has_transparency_data, finer)
+
+
+def unread(alpha: bool, finer: bool) -> str:
+    """What 8-bit RGB has no place for, in words."""
+    return " and ".join(["its alpha channel"] * alpha + ["all beyond 8 bits of its values"] * finer)
 
 
 def is_turned(picture: Image.Image) -> bool:

@@ -18,9 +18,5 @@ def save_state(path: Path, state: dict) -> None:
     whole = BytesIO()  # written by Python, which says that the disk is full; torch's own writer says "unexpected pos"
     torch.save(state, whole)
     clear_partials(path)
-    with atomic_file(path) as half:
-        try:
-            with open(half, "wb") as file:
-                file.write(whole.getbuffer())
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(path)) from error
+    with atomic_file(path) as half, open(half, "wb") as file:
+        file.write(whole.getbuffer())

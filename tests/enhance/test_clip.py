@@ -162,6 +162,26 @@ def test_what_a_pictures_enhanced_one_lacks_is_said(tmp_path, pictures, capsys, 
     assert said in errors and ("is without what" in errors) == bool(said)
 
 
+@pytest.mark.parametrize(
+    ("stored", "alpha", "said"),
+    [
+        ("bgra", 90, "had: its alpha channel\n"),
+        ("bgra", 255, ""),
+        ("yuv420p10le", 255, "had: all beyond 8 bits of its values\n"),
+        ("yuv420p", 255, ""),
+    ],
+)
+def test_what_a_videos_enhanced_one_lacks_is_said(tmp_path, capsys, stored, alpha, said):
+    with av.open(str(tmp_path / "in.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, stored
+        frame = av.VideoFrame.from_ndarray(np.full((32, 48, 4), (90, 90, 90, alpha), np.uint8), format="rgba")
+        container.mux([*stream.encode(frame), *stream.encode(None)])
+    enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", Marking())
+    errors = capsys.readouterr().err
+    assert said in errors and ("is without what" in errors) == bool(said)
+
+
 def ids(kind: str, number: int) -> np.ndarray | Image.Image:
     """Object 7 in the columns from `number` on."""
     array = np.zeros((34, 50), np.int32)

@@ -112,6 +112,28 @@ def test_what_is_no_picture_is_refused(enhancer, wrong, says):
         enhancer.step(wrong)
 
 
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ({"reference": picture().mul(255).byte(), "trust": torch.ones(32, 48)}, "reference must be floats in 0..1, got torch.uint8"),
+        ({"reference": picture() * 255, "trust": torch.ones(32, 48)}, "reference must be floats in 0..1, but its mean"),
+        ({"reference": picture(), "trust": torch.full((32, 48), 90, dtype=torch.uint8)}, "trust must be floats in 0..1, got torch.uint8"),
+        ({"instance": torch.full((32, 48), torch.nan)}, "instance must hold ids, whole numbers, got torch.float32"),
+    ],
+)
+def test_what_is_told_in_other_numbers_is_refused(enhancer, told, says):
+    with pytest.raises(ValueError, match=says):
+        enhancer.step(frame(picture(), **told))
+
+
+@pytest.mark.parametrize("kind", [torch.bool, torch.uint8, torch.uint16, torch.int64])
+def test_ids_of_any_whole_numbers_are_the_same(enhancer, kind):
+    instance = torch.zeros(32, 48, dtype=torch.int32)
+    instance[8:20, 8:30] = 1
+    wanted = enhancer.step(frame(picture(), instance=instance))[0]
+    assert torch.equal(enhancer.step(frame(picture(), instance=instance.to(kind)))[0], wanted)
+
+
 def test_what_comes_back_may_be_written_to_and_learnt_through(enhancer):
     better, memory = enhancer.step(picture().requires_grad_())
     assert not better.requires_grad and not memory.past.latents.requires_grad

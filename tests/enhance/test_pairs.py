@@ -366,9 +366,36 @@ def test_pairs_are_of_what_was_recorded_whatever_was_edited_since(street, tmp_pa
 
 def test_a_clip_that_is_there_is_not_made_again_of_other_things(street, recording, tmp_path):
     claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "[]"})
+    (tmp_path / "relight").mkdir()
+    (tmp_path / "relight" / "front_camera_0000.json").write_text("{}")
     claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of shadow": "['a.hdr']"})
     with pytest.raises(ValueError, match="holds pairs of another skies of relight"):
         claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "['a.hdr']"})
+
+
+def test_a_run_that_made_nothing_leaves_its_folder_free(street, recording, tmp_path):
+    """As one that was refused for a sky or a databank that is broken: the mended command must not be refused for that."""
+    claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of shadow": "['broken.hdr']"})
+    (tmp_path / "shadow").mkdir()
+    claim_pairs(tmp_path, street, recording, 1, CONFIG, {"skies of shadow": "['a.hdr']"})
+    make_pairs(street, recording, tmp_path, kinds=("clean",), seed=1, config=CONFIG)
+    claim_pairs(tmp_path, street, recording, 1, CONFIG, {"skies of shadow": "[]"})  # there are no shadows yet
+    with pytest.raises(ValueError, match="other settings"):
+        claim_pairs(tmp_path, street, recording, 0, CONFIG)
+    for fits in ("early", "refits"):
+        (tmp_path / fits / fits / "sparse_scene").mkdir(parents=True)
+        claim_pairs(tmp_path / fits, street, recording, 0, CONFIG)
+        with pytest.raises(ValueError, match="other settings"):
+            claim_pairs(tmp_path / fits, street, recording, 1, CONFIG)
+
+
+def test_a_broken_sky_or_asset_is_refused_before_anything_is_reconstructed(street, recording, tmp_path):
+    (tmp_path / "a.hdr").write_bytes(b"no sky")
+    with pytest.raises(ValueError, match="a.hdr"):
+        prepare_sources(street, recording, tmp_path / "p", ("sparse", "shadow"), skies=[tmp_path / "a.hdr"])
+    with pytest.raises(FileNotFoundError, match="is not a databank"):
+        prepare_sources(street, recording, tmp_path / "p", ("sparse", "shadow"), databank=tmp_path)
+    assert not (tmp_path / "p").exists()
 
 
 def test_pairs_in_a_folder_that_takes_no_files_are_refused_before_anything_is_made(tmp_path, street, recording, monkeypatch):

@@ -242,6 +242,19 @@ def test_weights_are_never_trained_over(tmp_path):
     assert [p.read_bytes() for p in out.iterdir()] == [b"someone's weights"]
 
 
+@pytest.mark.parametrize("device", ["gpu", "CPU", "meta", "", None])
+def test_a_device_that_does_not_exist_is_refused_in_words(device):
+    with pytest.raises(ValueError, match='device must be "cpu" or "cuda"'):
+        Enhancer.load("builtin", device=device)
+
+
+def test_a_gpu_beyond_those_that_are_there_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ValueError, match="this machine has 1 CUDA device, from cuda:0; got cuda:7"):
+        Enhancer.load("builtin", device="cuda:7")
+
+
 def test_a_gpu_that_is_not_there_is_refused_before_anything_is_loaded(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for device in ("cuda", "cuda:0", torch.device("cuda")):

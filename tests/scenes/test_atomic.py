@@ -35,9 +35,11 @@ def test_a_broken_write_leaves_the_old_file_and_nothing_else(tmp_path, error):
     assert target.read_text() == "old" and listing(tmp_path) == ["a.json"]
 
 
-def test_a_write_that_fails_names_the_target(tmp_path):
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG, errno.EDQUOT])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_write_that_fails_names_the_target(tmp_path, code, named):
     with pytest.raises(OSError) as caught, atomic_file(tmp_path / "a.mp4") as partial:
-        raise OSError(errno.ENOSPC, "No space left on device", str(partial))
+        raise OSError(code, os.strerror(code), *[str(partial)] * named)
     assert caught.value.filename == str(tmp_path / "a.mp4")
 
 
