@@ -164,8 +164,9 @@ def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, 
     monkeypatch.setattr("recon.build.off_path_table", lambda scene, log, sweeps, frames: measured.extend(sweeps) or [])
     reconstruct(log, tmp_path / "scene", size=SIZE, held_out=4, config=replace(CONFIG, steps=1))
     assert [s.index for s in measured] == [2, 6]
-    for sweep, recorded in zip(measured, (log.sweeps[2], log.sweeps[6]), strict=True):
-        np.testing.assert_allclose(sweep.read().xyz, recorded.read().xyz + [0, 0, 0.5])
+    recorded = {s.index: s.read().xyz for s in log.sweeps}
+    for sweep in measured:
+        np.testing.assert_allclose(sweep.read().xyz, recorded[sweep.index] + [0, 0, 0.5])
 
 
 def test_a_size_that_is_too_small_is_refused_before_any_picture_is_read(drive, tmp_path, monkeypatch):
