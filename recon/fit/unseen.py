@@ -30,9 +30,9 @@ LOW = 0.2
 NEIGHBOURS = 16
 """Splats of known colour beside one of unknown, whose mean it is given."""
 
-STREET_NEIGHBOURS = 64
-"""The same of what is hidden of the street, whose middle colour it is given. The nearest few are known by a picture's rim, black or
-pale."""
+CELL, CELLS = 0.5, 32
+"""Metres of a cell of the street, and the nearest of these, of each of which the middle colour counts once, whose middle colour is given to
+what is hidden of it. The nearest splats are many small ones of a rim, or of a parked car's sill: black, pale, or as blue as that."""
 
 
 def shown_parts(placed: Sequence[Placed], camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
@@ -88,32 +88,43 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
     in any picture, the colours of their group's nearest others, in place. Returns which these are, bool `[N]`; of groups without any other
     none.
 
-    What is hidden of the street, pulled at or not, takes the middle one of the street's, channel by channel: beside a parked car the
-    nearest are the car's, and one glint of it would shine all over the road.
+    What is hidden of the street, pulled at or not, takes the middle colour of the street around, channel by channel, cell by cell.
     """
     hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
-    off = off_ground(splats, ground)
-    unknown = _coloured(splats, hidden & (off < LOW), known & (off < ON), STREET_NEIGHBOURS, lambda found, _: found.median(1).values)
+    means, sh, off = splats.fields["means"], splats.fields["sh"], off_ground(splats, ground)
+    street = known & (off < ON)
+    unknown = torch.zeros_like(hidden)
+    if street.sum() >= NEIGHBOURS:
+        unknown |= hidden & (off < LOW)
+        places, colours = _cells(means[street], sh[street])
+        _colour(splats, unknown, places, colours, CELLS, lambda found, _: found.median(1).values)
     for i in range(len(splats.sizes)):
-        mine = group == i
-        unknown |= _coloured(
-            splats, pulled & hidden & mine & ~unknown, known & mine, NEIGHBOURS, lambda found, share: (found * share).sum(1)
-        )
+        mine = known & (group == i)
+        if mine.sum() >= NEIGHBOURS:
+            which = pulled & hidden & (group == i) & ~unknown
+            _colour(splats, which, means[mine], sh[mine], NEIGHBOURS, lambda found, share: (found * share).sum(1))
+            unknown |= which
     return unknown
 
 
-def _coloured(
-    splats: Splats, which: torch.Tensor, known: torch.Tensor, count: int, mix: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-) -> torch.Tensor:
-    """Give some of the splats a mix of the colours of the `count` nearest known, both bool `[N]`. Returns which those are; none where too
-    few are known. mix: of `[M, count, K, 3]`, and of how near they are, `[M, count, 1, 1]`, 1 in all."""
-    known = known.nonzero()[:, 0]
-    if len(known) < NEIGHBOURS or not which.any():
-        return torch.zeros_like(which)
-    means, sh = splats.fields["means"], splats.fields["sh"]
-    away, nearest = cKDTree(means[known].cpu().numpy()).query(means[which].cpu().numpy(), range(1, min(count, len(known)) + 1))
+def _cells(means: torch.Tensor, sh: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of splats' means `[N, 3]` and colours `[N, K, 3]` those of the cells `[C]` of the ground that they lie in: mean place, middle
+    colour."""
+    _, cell, counts = (means[:, :2] / CELL).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
+    parts = cell.argsort().split(counts.tolist())
+    return torch.stack([means[p].mean(0) for p in parts]), torch.stack([sh[p].median(0).values for p in parts])
+
+
+def _colour(
+    splats: Splats, which: torch.Tensor, places: torch.Tensor, colours: torch.Tensor, count: int, mix: Callable[..., torch.Tensor]
+) -> None:
+    """Give splats, bool `[N]`, a mix of the `colours` `[C, K, 3]` of the `count` nearest of `places` `[C, 3]`, in place. mix: of `[M,
+    count, K, 3]`, and of how near they are, `[M, count, 1, 1]`, 1 in all."""
+    if not which.any():
+        return
+    at = splats.fields["means"][which].cpu().numpy()
+    away, nearest = cKDTree(places.cpu().numpy()).query(at, range(1, min(count, len(places)) + 1))
     wide = splats.fields["log_scales"][which].exp().mean(1)
-    share = 1 / (torch.from_numpy(away).to(sh).square() + wide.square()[:, None])
-    found = sh[known[torch.from_numpy(nearest).to(known)]]
-    sh[which] = mix(found, (share / share.sum(1, keepdim=True))[:, :, None, None])
-    return which
+    share = 1 / (torch.from_numpy(away).to(colours).square() + wide.square()[:, None])
+    found = colours[torch.from_numpy(nearest).to(colours.device)]
+    splats.fields["sh"][which] = mix(found, (share / share.sum(1, keepdim=True))[:, :, None, None])

@@ -115,14 +115,15 @@ def test_the_nearest_count_most():
 
 
 def test_the_street_beside_a_parked_car_takes_the_streets_colour_pulled_at_or_not():
-    """Blue splats are nearer, and higher; one that stands there and is hidden takes theirs. A few nearer ones of the street, of which the
-    pictures show a rim, are black."""
+    """Blue splats are nearer, and higher; one that stands there and is hidden takes theirs. Nearer ones of the street, many
+    on one spot, are black."""
     flat = Ground(torch.zeros(21, 21), (-10.0, -10.0), 1.0)
     splats, part = splats_of([[1.0] * 80 + [0.0] * 3], lambda p: [0.3, 0.3, 0.3])
     means, sh = splats.fields["means"], splats.fields["sh"]
     generator = torch.Generator().manual_seed(0)
     means[:40] = torch.cat([3 + torch.rand(40, 2, generator=generator), 0.02 * torch.rand(40, 1, generator=generator)], 1)
-    means[:12, :2], sh[:12, 0] = means[:12, :2] - 2, sh_from_rgb(torch.zeros(3))
+    means[:30, :2], sh[:30, 0] = 1.1 + 0.1 * (means[:30, :2] - 3), sh_from_rgb(torch.zeros(3))
+    means[30:40, :2] = 3 + 4 * (means[30:40, :2] - 3)
     means[40:80] = torch.rand(40, 3, generator=generator) * 0.2 + torch.tensor([0.0, 0.0, 0.15])
     sh[40:80, 0] = sh_from_rgb(torch.tensor([0.1, 0.1, 0.8]))
     means[80:] = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.12], [0.1, 0.1, 0.5]])
@@ -130,7 +131,7 @@ def test_the_street_beside_a_parked_car_takes_the_streets_colour_pulled_at_or_no
     pulled[80] = False
     guessed = as_neighbours(splats, part, pulled, flat)
     assert guessed.nonzero()[:, 0].tolist() == [80, 81, 82]
-    torch.testing.assert_close(sh[80:82, 0], sh[12:14, 0])
+    torch.testing.assert_close(sh[80:82, 0], sh[30:32, 0])
     torch.testing.assert_close(sh[82, 0], sh[40, 0])
 
 
