@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from enhance.grain import Excess, Grain, of_object, usual_of, without
-from enhance.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, spots, whole_of
+from enhance.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, reaching_over, spots, whole_of
 from enhance.seam import ENDS, fitted
 from enhance.shade import NONE, optical_depths, read_ground, shaded
 
@@ -87,6 +87,7 @@ def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found:
     new: dict[int, Correction] = {}
     if due:
         whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
+        instance = reaching_over(instance)
         for i in due:
             box = found[i]
             part, ids = rgb[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns]

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from enhance.ahead import Batch
 from enhance.isp import alter, random_isp
 from enhance.masks import random_mask
-from enhance.objects import Box, Evidence, boxes, evidence, grid_of, spots, whole_of
+from enhance.objects import Box, Evidence, boxes, evidence, grid_of, reaching_over, spots, whole_of
 from enhance.shards import RENDERED, Shard
 
 PIXELS = 384
@@ -102,9 +102,9 @@ class ObjectSampler:
         fresh: bool,
     ) -> list[tuple]:
         ids = instance[box.outer_rows, box.outer_columns].int()
-        mask = ids == pick
-        share = float(mask.sum()) / instance.numel()
-        at = spots(mask, box, share)
+        mask, seen_as = ids == pick, reaching_over(torch.where(ids == 255, 0, ids)) == pick
+        share = float(seen_as.sum()) / instance.numel()
+        at = spots(seen_as, box, share)
         judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
         y, x = torch.cat([at.yx, judged]).unbind(1)
         strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]

@@ -115,6 +115,18 @@ def boxes(instance: torch.Tensor) -> dict[int, Box]:
     return found
 
 
+def reaching_over(ids: torch.Tensor) -> torch.Tensor:
+    """Ids `[h, w]` where every object has also the pixels next to it that are nobody's (0 and less).
+
+    So objects are looked at. At the last pixel that is mostly an object's, and the next, colours are still a mixture of both: what differs
+    across the seam there is the object from its ground, which would be taken for a wrong light. A pixel on, it is the ground on both sides.
+    """
+    near = F.pad(ids.clamp_min(0), (1, 1, 1, 1))
+    near = torch.maximum(torch.maximum(near[:-2], near[1:-1]), near[2:])
+    near = torch.maximum(torch.maximum(near[:, :-2], near[:, 1:-1]), near[:, 2:])
+    return torch.where((ids <= 0) & (near > 0), near, ids)
+
+
 def grid_of(rgb: torch.Tensor) -> torch.Tensor:
     """Evenly spaced pixels of a frame `[3, H, W]`: `[3, ROWS, COLUMNS]`, of which the grid is all of them again."""
     y, x = _grid(rgb.device)

@@ -3,10 +3,17 @@
 import numpy as np
 import torch
 
+from enhance import Enhancer
+from enhance.clip import telling
 from enhance.corrections import STEADY, Correction, correct
+from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
 from enhance.object_samples import PIXELS, ObjectSampler
-from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, spots, whole_of
+from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, reaching_over, spots, whole_of
 from enhance.shade import KNOTS
+from render import render_clip
+from scenes import Databank, load
+from scenes.insert import insert
+from scenes.placement import parse_placement
 
 
 def scene(top=10, left=20, height=16, width=24, seed=0):
@@ -173,3 +180,26 @@ def test_an_object_that_fills_the_frame_keeps_its_colours():
     assert torch.equal(correct(stirred(), rgb, instance, {})[0], rgb)
     instance[:, 60:] = 0
     assert not torch.equal(correct(stirred(), rgb, instance, {})[0], rgb)
+
+
+def test_objects_are_looked_at_a_pixel_over_their_edge():
+    ids = torch.tensor([[-1, -1, 0, 0, 0], [-1, 2**31 - 8, 0, 0, 7], [0, 0, 0, 0, 7], [0, 0, 0, 0, 3]], dtype=torch.int32)
+    far = 2**31 - 8
+    assert reaching_over(ids).tolist() == [[far, far, far, 7, 7], [far, far, far, 7, 7], [far, far, far, 7, 7], [0, 0, 0, 7, 3]]
+    assert ids[0, 0] == -1
+    all_of_it = torch.full((4, 5), 2)
+    assert torch.equal(reaching_over(all_of_it), all_of_it)
+
+
+def test_a_car_of_the_street_that_is_put_into_it_keeps_its_colours():
+    """At its edge, where pixels are a mixture of it and the street, it differs from what is around; that is no wrong light."""
+    street, net = load(DATA / "drive002"), Enhancer.load("builtin").net.objects
+    start = int(street.frame_times(CAMERA)[0])
+    for text in (PARKED, MOVING):
+        placement = parse_placement(text)
+        street = insert(street, Databank(DATA / "databank").load(placement.asset), placement, start).scene
+    (frame,) = render_clip(street, CAMERA, SHIFT, [start + 1_200_000], 640, 360, outputs=("rgb", "instance"))
+    told = telling(frame, street.anew())
+    rgb = told.rgb.permute(2, 0, 1).clamp(0, 1)
+    better, _ = correct(net, rgb, told.instance, {})
+    assert (told.instance > 0).sum() > 5000 and torch.equal(better[:, told.instance > 0], rgb[:, told.instance > 0])
