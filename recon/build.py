@@ -32,6 +32,7 @@ from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
 from recon.seeds.triangulate import triangulated
 from recon.skies import seen_sky
+from recon.sky_told import under_their_sky
 from recon.sound import check_path
 from recon.start import Start, prepare
 from recon.tracks import LIMBED
@@ -286,6 +287,7 @@ def begin(
     sparse = log.points
     if sparse is None and not log.sweeps_within(span):
         sparse = triangulated(log, frames)
+        frames = replace(frames, views=under_their_sky(log, names, frames.views, sparse))
         if asked:
             frames = replace(frames, views=exposed_by(sparse, log, names, frames.views))
     with Progress("prepare") as steps:

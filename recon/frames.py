@@ -9,13 +9,12 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from recon.egomask import at_size, ego_mask
 from recon.exposed import balanced, exposed
 from recon.log import Log, LogCamera
-from recon.skies import SkyKind, sky_mask
-from recon.sky_kind import coarse_sky, under_their_sky
+from recon.skies import fine_sky
+from recon.sky_told import coarse_sky, under_their_sky
 from recon.view import View
 from scenes.camera import Camera, followed
 
@@ -37,13 +36,12 @@ class Frames:
     """The views of a fit, those of camera `names[c]` of width and height `sizes[c]`. Every `held_out`th of each takes no part.
 
     From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
-    shows at its edges, no other one does. `under` is one of `SkyKind`.
+    shows at its edges, no other one does.
     """
 
     names: list[str]
     sizes: list[tuple[int, int]]
     views: list[View]
-    under: SkyKind = "blue"
 
     def camera(self, log: Log, view: View) -> Camera:
         """A view's camera, at the size of its picture and where the log says that it stood."""
@@ -57,13 +55,8 @@ class Frames:
 
     def sky_of(self, view: View) -> np.ndarray:
         """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
-        found = sky_mask(view.image.numpy(), self.under)
-        if view.ego is not None:
-            found &= ~view.ego.numpy()
-        if self.under == "blue":
-            return found
-        rows, columns = (np.arange(n) * of // n for n, of in zip(found.shape, view.sky.shape, strict=True))
-        return found & ndimage.binary_dilation(view.sky.numpy(), iterations=2)[rows[:, None], columns]
+        found = fine_sky(view.image.numpy(), view.sky.numpy())
+        return found if view.ego is None else found & ~view.ego.numpy()
 
     def followed(self, time_us: int) -> torch.Tensor | None:
         """The gain `[3]` at a time that the cameras have in the mean, None where none varies."""
@@ -113,12 +106,12 @@ def load_frames(
         if not any(v.camera == c and not v.held_out for v in views):
             there = f"{len(chosen)} of its {len(camera)} lie there" + (f", held out as one of every {held_out}" if chosen else "")
             raise ValueError(f"camera {name} has no frame to train on in the chosen span: {there}; choose a longer one")
-    views, under = under_their_sky(log, names, views)
+    views = under_their_sky(log, names, views, log.points)
     if log.points is not None:
         views = balanced(log, names, views)
     elif gains:
         views = exposed(log, names, views)
-    return Frames(names, sizes, views, under)
+    return Frames(names, sizes, views)
 
 
 def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tuple[int, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Literal
 
 import numpy as np
 import torch
@@ -26,34 +25,63 @@ FREE = 0.05
 HIDDEN = 128
 """Rows of the grid of directions in which the sky is never seen: 1.4 degrees each."""
 
-SkyKind = Literal["blue", "overcast", "blinding"]
-"""How skies look: what is no blue sky is known by less, and may as well be a white wall."""
+EVEN = 3.0
+"""Levels a pixel by which the sky changes at most, but for clouds' edges."""
 
-WHITE = 250
-"""Of all channels, from which on a blinding sky is clipped."""
+WIRE = 80
+"""Of a picture's width, how wide wires are at most."""
 
-TINT, BRIGHTEST = 32, 0.8
-"""Of an overcast sky: levels between its channels at most, and part of the light of the picture's brightest fiftieth that it has."""
+RATHER, SPREAD, NEAR = 8.0, 2.5, 4.0
+"""Levels by which a pixel may differ from the sky about it, and how many times what that varies there; and the cells about it."""
 
 
-def sky_mask(image: np.ndarray, kind: SkyKind = "blue") -> np.ndarray:
-    """Pixels `[H, W]` of a uint8 image that are surely sky, as such a one looks: smooth, bright enough, joined to the image's top row, and
-    bluish; under an overcast sky without colour and the brightest there is; under a blinding one bluish or clipped."""
+def sky_mask(image: np.ndarray) -> np.ndarray:
+    """Pixels `[H, W]` of a uint8 image that are sky whatever else is known: smooth, bright enough, bluish, and joined to the image's top
+    row."""
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     grey = rgb.mean(-1)
-    edge = np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8
-    if kind == "overcast":
-        coloured = (np.ptp(rgb, axis=-1) < TINT) & (grey > BRIGHTEST * np.percentile(grey, 98))
-    else:
-        coloured = rgb[..., 2] > rgb[..., 0] + 2
-    if kind == "blinding":
-        coloured |= rgb.min(-1) >= WHITE
-    smooth = (edge < 3.0) & coloured & (grey > 90)
-    label, _ = ndimage.label(smooth)
-    large = np.bincount(label.ravel()) > 1e-3 * grey.size
-    top = np.array([k for k in np.unique(label[:3][smooth[:3]]) if large[k]], dtype=label.dtype)
+    return closed(reaching_top(even(grey) & (rgb[..., 2] > rgb[..., 0] + 2) & (grey > 90)))
+
+
+def even(grey: np.ndarray) -> np.ndarray:
+    """Where levels `[H, W]` change as little as a sky's."""
+    return np.hypot(ndimage.sobel(grey, 0), ndimage.sobel(grey, 1)) / 8 < EVEN
+
+
+def reaching_top(mask: np.ndarray) -> np.ndarray:
+    """What of a mask is joined to its top rows, in parts that are large enough."""
+    label, _ = ndimage.label(mask)
+    large = np.bincount(label.ravel()) > 1e-3 * mask.size
+    top = np.array([k for k in np.unique(label[:3][mask[:3]]) if large[k]], dtype=label.dtype)
+    return np.isin(label, top)
+
+
+def closed(mask: np.ndarray) -> np.ndarray:
+    """A mask without its narrow gaps."""
     # beyond the edge nothing closes, so the edge is repeated
-    return ndimage.binary_closing(np.pad(np.isin(label, top), 4, mode="edge"), iterations=2)[4:-4, 4:-4]
+    return ndimage.binary_closing(np.pad(mask, 4, mode="edge"), iterations=2)[4:-4, 4:-4]
+
+
+def fine_sky(image: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    """Pixels `[H, W]` of a uint8 image that are surely sky where a coarse mask `[h, w]` says so: they look like what of it is about them,
+    and do not change as at an edge where the mask ends."""
+    rows, columns = (np.arange(n) * of // n for n, of in zip(image.shape[:2], coarse.shape, strict=True))
+    step = image.shape[1] // coarse.shape[1]
+    rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
+    small = rgb[step // 2 :: step, step // 2 :: step][: coarse.shape[0], : coarse.shape[1]]
+    weight = ndimage.gaussian_filter(coarse.astype(np.float32), NEAR) + 1e-6
+    mean, squares = (ndimage.gaussian_filter(v * coarse[..., None], (NEAR, NEAR, 0)) / weight[..., None] for v in (small, small**2))
+    varies = np.sqrt(np.maximum(squares - mean**2, 0))
+    grey = rgb.mean(-1)
+    # as the sky itself varies more where wires cross it, they are also told by being darker than both their sides
+    dips = ndimage.grey_closing(grey, max(3, image.shape[1] // WIRE)) - grey
+
+    def over(cells: np.ndarray) -> np.ndarray:
+        return cells[rows[:, None], columns]
+
+    alike = (np.abs(rgb - over(mean)) < over(RATHER + SPREAD * varies)).all(-1) & (dips < over(RATHER + varies.mean(-1)))
+    alike &= over(ndimage.binary_dilation(coarse, iterations=2))
+    return alike & (even(grey) | over(ndimage.binary_erosion(coarse, border_value=1)))
 
 
 def like_sky(image: np.ndarray, sky: np.ndarray, reach: int = 40) -> np.ndarray:

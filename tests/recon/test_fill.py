@@ -31,16 +31,6 @@ def test_a_sky_of_which_hardly_anything_was_seen_takes_that_everywhere():
     np.testing.assert_allclose(sky.picture(), np.broadcast_to(np.float32([0.2, 0.4, 0.6]), (64, 128, 3)), atol=1e-4)
 
 
-def test_an_overcast_sky_is_known_by_its_light_and_only_where_it_is_asked_for():
-    generator = np.random.default_rng(0)
-    image = generator.integers(40, 160, (48, 64, 3)).astype(np.uint8)
-    image[:20] = 238, 236, 233
-    image[:20, 40:] = 150, 150, 150  # a concrete wall, as smooth as the sky
-    found = sky_mask(image, "overcast")
-    assert found[2:17, 2:37].all() and not found[:, 42:].any() and not found[23:].any()
-    assert not sky_mask(image).any()
-
-
 def test_sky_is_what_is_smooth_and_blue_down_from_the_top():
     image = house_under_sky()
     mask = sky_mask(image)

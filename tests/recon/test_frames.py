@@ -11,7 +11,8 @@ from PIL import Image
 from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
 from recon.frames import load_frames, size_like
-from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
+from recon.log import LidarPoints, Log, LogCamera, Packed, SparsePoints, Sweep
+from recon.sky_told import under_their_sky
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse
 from scenes.trajectory import Trajectory
@@ -44,63 +45,63 @@ def _log(
     return Log("street", Path("street"), {"front": camera}, (sweep,), (), Trajectory(times, bodies), {}, ("front",))
 
 
-def _skies(log: Log) -> tuple[str, np.ndarray, np.ndarray]:
+def _skies(log: Log) -> tuple[np.ndarray, np.ndarray]:
     frames = load_frames(log, ["front"], ALL, SIZE, 0)
-    return frames.under, frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
+    return frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
 
 
-def test_a_white_wall_under_an_overcast_sky_is_told_from_it_by_lidar():
-    under, coarse, fine = _skies(_log((236, 238, 240)[::-1], strikes=True))
-    assert under == "overcast"
-    for mask in (coarse, fine):
+@pytest.mark.parametrize("sky", [(240, 238, 236), (226, 150, 96), (92, 84, 100), (9, 8, 11), (150, 180, 225)])
+def test_a_sky_of_any_colour_is_told_by_lidar_from_a_white_wall(sky):
+    for mask in _skies(_log(sky, strikes=True)):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
-    _, unguarded, _ = _skies(_log((236, 238, 240)[::-1], strikes=False))
-    assert unguarded[3:40, 140:235].mean() > 0.9  # so it was lidar that told
 
 
-def test_under_a_blue_sky_nothing_white_is_taken_for_it():
-    under, coarse, fine = _skies(_log((150, 180, 225), strikes=False))
-    assert under == "blue"
-    for mask in (coarse, fine):
+def test_without_lidar_or_points_only_blue_is_sky():
+    for mask in _skies(_log((150, 180, 225), strikes=False)):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
+    for mask in _skies(_log((226, 150, 96), strikes=False)):
+        assert not mask.any()
 
 
-def test_beside_blue_what_is_clipped_is_sky_where_lidar_does_not_strike_it():
+def test_without_lidar_the_points_that_pictures_showed_tell_a_sky():
+    log = replace(_log((226, 150, 96), strikes=False), sweeps=())
+    frames = load_frames(log, ["front"], ALL, SIZE, 0)
+    y, z = np.meshgrid(np.linspace(-9.5, 9.5, 40), np.linspace(-4, 0.7, 20))  # on what is below the sky, and up the wall's left part
+    wall = np.stack(np.meshgrid(np.linspace(-9, -1.5, 20), np.linspace(1, 4.5, 12)), -1).reshape(-1, 2)
+    xyz = np.concatenate([np.stack([y.ravel(), z.ravel()], 1), wall])
+    points = SparsePoints(np.insert(xyz, 0, 10.0, axis=1), {"front": (np.arange(len(xyz)), *[np.zeros(0, np.int64)] * 2)})
+    told = under_their_sky(log, ["front"], frames.views, points)
+    for view in told:  # those that show none of the points learn from their neighbours
+        for mask in (view.sky.numpy(), frames.sky_of(view)):
+            assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
+    few = replace(points, seen={"front": (np.arange(5),) * 3})
+    assert not any(v.sky.any() for v in under_their_sky(log, ["front"], frames.views, few)), "five points teach nothing"
+
+
+def test_what_is_clipped_beside_blue_is_sky_where_lidar_does_not_strike_it():
     """A low sun behind houses blinds the camera: what shines there is no wall, and what shines and is struck is one."""
     dazzled = _log((150, 180, 225), strikes=True, wall=(255, 255, 255), glare=True)
-    under, coarse, fine = _skies(dazzled)
-    assert under == "blinding"
-    for mask in (coarse, fine):
+    for mask in _skies(dazzled):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
-    under, coarse, fine = _skies(replace(dazzled, sweeps=()))
-    assert under == "blue"  # nothing tells
-    for mask in (coarse, fine):
-        assert mask[3:40, 5:55].mean() > 0.95 and mask[:, 70:].mean() < 0.02
+    for mask in _skies(replace(dazzled, sweeps=())):
+        assert mask[3:40, 5:55].mean() > 0.95 and mask[:, 70:].mean() < 0.02  # nothing tells
 
 
 def test_of_a_wall_that_beams_reach_only_the_foot_of_all_is_no_sky():
-    low = _log((150, 180, 225), strikes=True, wall=(255, 255, 255), glare=True, up_to=0.35)  # two degrees, as KITTI's lidar
-    under, coarse, fine = _skies(low)
-    assert under == "blinding"
-    for mask in (coarse, fine):
+    for mask in _skies(_log((226, 150, 96), strikes=True, up_to=0.35)):  # two degrees, as KITTI's lidar
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
 
 
-def test_pictures_without_colour_tell_no_sky():
-    under, coarse, _ = _skies(_log((255, 255, 255), strikes=True))
-    assert under == "overcast" and coarse.any()  # white among colours
-    grey = _log((255, 255, 255), strikes=True)
+def test_pictures_without_colour_tell_their_sky_by_lidar():
+    grey = _log((235, 240, 250), strikes=True)
     plain = BytesIO()
     Image.open(BytesIO(grey.cameras["front"].files[0].read())).convert("L").save(plain, "png")
     camera = grey.cameras["front"]
     object.__setattr__(camera, "files", (Packed("grey", plain.getvalue),) * 3)
-    under, coarse, _ = _skies(grey)
-    assert under == "blue" and not coarse.any()
-
-
-def test_the_made_up_streets_sky_is_blue(drive):
-    log = open_log(drive)
-    assert load_frames(log, list(log.cameras), ALL, (96, 54), 8).under == "blue"
+    for mask in _skies(grey):
+        assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02
+    for mask in _skies(replace(grey, sweeps=())):
+        assert not mask.any()
 
 
 def test_a_camera_of_sixteen_bits_of_grey_is_seen_as_one_of_eight():
