@@ -62,7 +62,7 @@ def shoot(desk: Path, monkeypatch, *words: str) -> list[torch.Tensor]:
 @ON_A_GPU
 def test_render_with_all_outputs(desk, monkeypatch):
     here, there = shoot(desk, monkeypatch, *CARS, "--outputs", ",".join(set(OUTPUTS) - {"features"}))
-    assert (here - there).abs().mean() < 1 / 255
+    assert (here - there).abs().mean() < 2 / 255, "of one clip x264 makes videos that are 1 / 255 apart, now and then"
 
 
 @ON_A_GPU
