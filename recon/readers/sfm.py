@@ -25,7 +25,7 @@ SEED = 0
 """Of COLMAP's draws, all of them: by its default one set of photos has another lens and other poses each time."""
 
 WIDEST = math.radians(118)
-"""From the left to the right side, of a lens that nobody told. A street ahead can be squeezed into a wider one that it was not taken with:
+"""Along the longer side, of a lens that nobody told. A street ahead can be squeezed into a wider one that it was not taken with:
 nine small photos of `lund` had 124 to 133 degrees by four draws of six, and a pixel of error where their own 70 have half of one."""
 
 FEWEST_PLACED = 3
