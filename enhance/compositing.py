@@ -111,7 +111,7 @@ def _alone(actor: Actor, camera: Camera, scene: Scene) -> tuple[torch.Tensor, to
     """An actor without anything around it, exposed as the camera exposes: premultiplied rgb `[H, W, 3]` and alpha `[H, W, 1]`."""
     with torch.no_grad():
         placed = Placed(actor.asset.gaussians, actor.trajectory.at(camera.time_us))
-        frame = rasterize(placed, camera, ("rgb", "alpha"), model=scene.model)
+        frame = rasterize(placed, camera, ("rgb", "alpha"), model=scene.model_for(camera))
     assert frame.rgb is not None and frame.alpha is not None
     alpha = frame.alpha[..., None]
     if camera.exposure is None:

@@ -47,7 +47,7 @@ def room_aside(scene: Scene, camera: Camera, world_from_body: torch.Tensor, left
     pose[:3, 3] = eye
     focal = PIXELS / 2 / math.tan(WIDE / 2)
     looking = Camera(Pinhole(focal, focal, PIXELS / 2, PIXELS / 2), PIXELS, PIXELS, pose)
-    frame = rasterize(scene.background, looking, ("median_depth",), model=scene.model)
+    frame = rasterize(scene.background, looking, ("median_depth",), model=scene.model_for(looking))
     assert isinstance(frame, Frame) and frame.median_depth is not None
     room = min(reach, max(0.0, float(frame.median_depth.median()) - BEFORE))
     while room > 0 and (beyond := outside_ground(scene, (eye + room * aside)[:2])) > 0:

@@ -60,7 +60,7 @@ def differentiated(placed: Sequence[Placed], camera: Camera, features: torch.Ten
 
 def view_sides(camera: Camera, model: SplatModel) -> torch.Tensor:
     """Unit normals `[5, 3]`, out of the view, of the planes through the eye that bound it, and of the plane of the camera."""
-    left, right, top, bottom = view_box(camera.lens, camera.width, camera.height, 4 * math.sqrt(model.dilation) + 1)
+    left, right, top, bottom = view_box(camera.lens, camera.width, camera.height, 4 * math.sqrt(model.widening) + 1)
     normals = [[1, 0, -right], [-1, 0, left], [0, 1, -bottom], [0, -1, top], [0, 0, -1]]
     return torch.nn.functional.normalize(torch.tensor(normals, dtype=torch.float64), dim=1)
 

@@ -63,7 +63,7 @@ def render_frame(
         fields["need"] = support_fields(placed, camera)
     features = [torch.cat(parts, 1) for parts in zip(*fields.values(), strict=True)] if fields else None
     needed |= {"features"} if fields else set()
-    frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model, config, features, room=room)
+    frame = rasterize(placed, camera, tuple(sorted(needed)), None, flow_to or None, scene.model_for(camera), config, features, room=room)
 
     rgb = frame.rgb
     support = frame.features

@@ -98,7 +98,7 @@ class Portraits:
         camera = photo.camera
         camera = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
         placed = Placed(self.asset.gaussians, torch.eye(4, dtype=torch.float64), instance=self.instance)
-        frame = rasterize(placed, camera, ("rgb", "alpha", "depth", "instance"), model=self.model)
+        frame = rasterize(placed, camera, ("rgb", "alpha", "depth", "instance"), model=self.model.at_scale(shrink))
         assert isinstance(frame, Frame) and frame.rgb is not None and frame.alpha is not None and frame.instance is not None
         rgba = torch.from_numpy(photo.read()).to(frame.rgb).permute(2, 0, 1)[None] / 255
         rgba = torch.cat([rgba[:, :3] * rgba[:, 3:], rgba[:, 3:]], 1)  # of what is not the asset no colour counts

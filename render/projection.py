@@ -163,11 +163,12 @@ def _view(settings: Settings, lens: Lens) -> View:
         left, right, top, bottom = view_box(lens, settings.width, settings.height)
         half_x, half_y = 0.15 * (right - left), 0.15 * (bottom - top)  # the 0.3 of 1.3 tan, on either side
         v.clamp_left, v.clamp_right, v.clamp_top, v.clamp_bottom = left - half_x, right + half_x, top - half_y, bottom + half_y
-        margin = 4 * math.sqrt(settings.model.dilation) + 1
+        margin = 4 * math.sqrt(settings.model.widening) + 1
         v.left, v.right, v.top, v.bottom = view_box(lens, settings.width, settings.height, margin)
     v.tile_left, v.tile_top, v.tiles_x, v.tiles_y = settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y
     v.along_rays = int(settings.model.response == "ray")
-    v.dilation, v.near, v.log_cutoff = settings.model.dilation, NEAR, -math.log(settings.cutoff)
+    v.dilation, v.smoothing = settings.model.widening, settings.model.compensated
+    v.near, v.log_cutoff = NEAR, -math.log(settings.cutoff)
     v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
-    v.unscented, v.antialias = int(settings.model.projection == "ut"), int(settings.model.antialias)
+    v.unscented = int(settings.model.projection == "ut")
     return v

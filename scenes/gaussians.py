@@ -16,19 +16,24 @@ SH_COUNTS = (1, 4, 9, 16)
 PROJECTIONS = ("ut", "ewa")
 RESPONSES = ("conic", "ray")
 
+AVERAGED = 0.1
+"""Variance in px^2 of a Gaussian that averages as a pixel does."""
+
 
 @dataclass(frozen=True)
 class SplatModel:
     """How the splats turn into pixels: stored with them, since trained splats fit only the model that trained them.
 
     projection: "ut" (unscented transform) or "ewa" (Zwicker et al. 2001); response: "conic" (2D) or "ray" (3D, 3DGUT);
-    dilation: px^2 added to both 2D variances; antialias: opacity compensated for that dilation (Mip-Splatting's 2D filter).
+    dilation: px^2 added to both 2D variances; antialias: opacity compensated for that dilation (Mip-Splatting's 2D filter); smoothing: px^2
+    added besides, opacity compensated for these, as for pictures smaller than those that were trained on (`at_scale`).
     """
 
     projection: str = "ut"
     response: str = "conic"
     dilation: float = 0.3
     antialias: bool = False
+    smoothing: float = 0.0
 
     def __post_init__(self):
         if self.projection not in PROJECTIONS:
@@ -37,6 +42,25 @@ class SplatModel:
             raise ValueError(f"response must be one of {', '.join(RESPONSES)}, got {self.response!r}")
         if not 0 <= self.dilation < math.inf:
             raise ValueError(f"dilation must be at least 0 px^2 and finite, got {self.dilation}")
+        if not 0 <= self.smoothing < math.inf:
+            raise ValueError(f"smoothing must be at least 0 px^2 and finite, got {self.smoothing}")
+
+    @property
+    def widening(self) -> float:
+        """px^2 added to both 2D variances in all."""
+        return self.dilation + self.smoothing
+
+    @property
+    def compensated(self) -> float:
+        """Of the widening, what opacities are compensated for."""
+        return self.widening if self.antialias else self.smoothing
+
+    def at_scale(self, scale: float) -> SplatModel:
+        """The model for pictures that are `scale` times as large as those that were trained on: what these added to a splat is as large a
+        part of it there, and what a pixel of a smaller picture averages is made up for."""
+        if self.antialias or scale == 1:
+            return self
+        return replace(self, dilation=self.dilation * scale**2, smoothing=self.smoothing + AVERAGED * max(0.0, 1 - scale**2))
 
 
 @dataclass(frozen=True)

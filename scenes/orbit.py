@@ -47,7 +47,7 @@ def around(thing: Asset | Gaussians, path: str, up: str = "z", model: SplatModel
     inward = torch.eye(4, dtype=torch.float64)
     inward[:3, :3] = torch.tensor([[1.0, 0.0, 0.0], [0.0, -sine, cosine], [0.0, -cosine, -sine]])  # right is ahead, depth to the left
     times = FRAME_US * torch.arange(FRAMES + 1)
-    camera = RigCamera(Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT, inward, times_us=times[:-1])
+    camera = RigCamera(Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT, inward, times_us=times[:-1], fitted=False)
     stands = torch.eye(4, dtype=torch.float64)
     stands[:3, :3] = torch.from_numpy(turn)
     still = Placed(gaussians, stands)

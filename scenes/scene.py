@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -58,6 +59,16 @@ class Scene:
     def camera(self, name: str, time_us: int, ego: Trajectory | None = None) -> Camera:
         """The named camera at a time, on the recorded path or on another one, as `ego.shifted(lateral=2)`."""
         return self.rig_camera(name).along(ego or self.ego, time_us)
+
+    def model_for(self, camera: Camera) -> SplatModel:
+        """The scene's model for pictures of a camera: larger or smaller ones than the splats were fitted to, which those of the rig's camera
+        were that sees most nearly as wide an angle."""
+        fitted = [c for c in self.rig.values() if c.fitted]
+        if not fitted:
+            return self.model
+        focal = max(camera.lens.focal())
+        same = min(fitted, key=lambda c: abs(math.log(max(c.lens.focal()) / c.width * camera.width / focal)))
+        return self.model.at_scale(float(focal / max(same.lens.focal())))
 
     def frame_times(self, name: str) -> torch.Tensor:
         """When the named camera took its frames, int64 `[F]`; the body's times where the log does not say."""

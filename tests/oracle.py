@@ -1,6 +1,6 @@
 """Truth: the splat model in float64 torch, slow and obviously right, differentiable by autograd.
 
-The model (projection, response, dilation, antialiasing) is what a scene was trained with. Its exact picture, which `truth` gives, sums
+The model (projection, response, dilation, antialiasing, smoothing) is what a scene was trained with. Its exact picture, which `truth` gives, sums
 all splats along every pixel's own ray in that ray's own order, with no cutoff, no clamp and no termination. `render` can also take the
 shortcuts of the kernels one by one (order by centres, cutoff, clamp), so that each kernel is held against exactly what it promises.
 
@@ -125,9 +125,10 @@ def render(
                 ways.append((pose, g["means"][rows], matrix_from_quat(g["quats"][rows]) * g["log_scales"][rows].exp()[:, None, :]))
         parts.append((*part, torch.full((len(part[0]),), instance)))
     points, axes, colour, opacity, mean, covariance, instances = (torch.cat(p) for p in zip(*parts, strict=True))
-    dilated = covariance + model.dilation * torch.eye(2, dtype=torch.float64)
-    if model.antialias:
-        opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
+    less = covariance + (0.0 if model.antialias else model.dilation) * torch.eye(2, dtype=torch.float64)
+    dilated = covariance + (model.dilation + model.smoothing) * torch.eye(2, dtype=torch.float64)
+    if model.antialias or model.smoothing:
+        opacity = opacity * (torch.linalg.det(less) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
     conic = torch.linalg.inv(dilated)
     drawn = (optics.depth(points), mean, conic, opacity, colour, instances)
     reach = BEYOND * torch.diagonal(dilated.detach(), dim1=-2, dim2=-1).sqrt()
@@ -149,7 +150,7 @@ def _pinhole(g, cam_from_local: torch.Tensor, camera: Camera, model: SplatModel,
     """Points, axes, colours, opacities, means and covariances of the splats that a pinhole shows."""
     points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
     axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
-    keep = in_view(points, axes, lens, camera.width, camera.height, model.dilation)
+    keep = in_view(points, axes, lens, camera.width, camera.height, model.widening)
     colour = _shown(g, keep, g["means"][keep] - inverse(cam_from_local)[:3, 3])
     points, axes = points[keep], axes[keep]
     if model.projection == "ewa":

@@ -115,7 +115,7 @@ def shown(lens: Lens, camera: Camera, model: SplatModel, points: torch.Tensor, a
     """Mask of splats in the lens's domain, beyond the near plane, whose ellipsoid is not wholly beyond one side of the view."""
     seen = lens.valid(points) & (lens.depth(points) > NEAR)
     if isinstance(lens, Pinhole | OpenCV):
-        left, right, top, bottom = view_box(lens, camera.width, camera.height, 4 * math.sqrt(model.dilation) + 1)
+        left, right, top, bottom = view_box(lens, camera.width, camera.height, 4 * math.sqrt(model.widening) + 1)
         for plane in ([1, 0, -right], [-1, 0, left], [0, 1, -bottom], [0, -1, top]):
             normal = torch.tensor(plane, dtype=torch.float64)
             seen &= points @ normal <= REACH * (axes.transpose(1, 2) @ normal).norm(dim=-1)

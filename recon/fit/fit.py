@@ -24,7 +24,7 @@ from recon.fit.reach import reach_of
 from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
-from recon.fit.targets import Targets, ego_at
+from recon.fit.targets import Targets, ego_at, scale_of
 from recon.fit.turns import Turns
 from recon.fit.unseen import LOW, as_neighbours, curtains, off_ground, shown_parts
 from recon.frames import Frames
@@ -165,7 +165,8 @@ class Fit:
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
             closing = shown.held(self.flat_ground.on(shown), ("means", "quats"))
-            haze = haze + self.openings.gaps(draw(self._placed(closing, view, aside), aside, "alpha")[0], aside)
+            (solid,) = draw(self._placed(closing, view, aside), aside, "alpha", scale=scale_of(view, aside))
+            haze = haze + self.openings.gaps(solid, aside)
         for weight, there in known:
             haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)
         unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
@@ -240,7 +241,8 @@ class Fit:
         placed = self._placed(shown, view, camera)
         of_groups = None if features is None else features.split(shown.sizes)
         theirs = None if of_groups is None else [of_groups[p.instance] for p in placed]
-        drawn = draw(self.motion.as_read(placed, ends, view, camera), camera, *outputs, features=theirs)
+        read = self.motion.as_read(placed, ends, view, camera)
+        drawn = draw(read, camera, *outputs, features=theirs, scale=scale_of(view, camera))
         found = dict(zip(outputs, drawn, strict=True))
         return found | {"rgb": developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)}
 
@@ -275,7 +277,7 @@ class Fit:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
             which = self._in_sight(view, camera, [], None)
             placed = self._placed(self.splats.select(which, 1), view, camera)
-            shown, within = shown_parts(placed, camera)
+            shown, within = shown_parts(placed, camera, scale_of(view, camera))
             part[which] = torch.maximum(part[which], shown)
             inside[which] |= within
         stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)

@@ -127,9 +127,12 @@ MODEL = SplatModel(projection="ewa")
 """What is trained: EWA costs less than UT, and splats this small look the same under both."""
 
 
-def draw(placed: list[Placed], camera: Camera, *outputs: str, features: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
-    """The named outputs of one picture under `MODEL`; features `[N, C]` of each of the placed."""
-    frame = rasterize(placed, camera, outputs, model=MODEL, features=features)
+def draw(
+    placed: list[Placed], camera: Camera, *outputs: str, features: list[torch.Tensor] | None = None, scale: float = 1.0
+) -> list[torch.Tensor]:
+    """The named outputs of one picture under `MODEL`; features `[N, C]` of each of the placed. scale: how large the picture is to those
+    that the finished splats are fitted to."""
+    frame = rasterize(placed, camera, outputs, model=MODEL.at_scale(scale), features=features)
     return [getattr(frame, name) for name in outputs]
 
 

@@ -38,3 +38,8 @@ def ego_at(view: View, camera: Camera) -> torch.Tensor:
     """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`."""
     assert view.ego is not None
     return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
+
+
+def scale_of(view: View, camera: Camera) -> float:
+    """How large a camera's picture of a view is to the whole one."""
+    return camera.width / view.image.shape[1]

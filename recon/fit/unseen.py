@@ -35,15 +35,15 @@ CELL, CELLS = 0.5, 32
 what is hidden of it. The nearest splats are many small ones of a rim, or of a parked car's sill: black, pale, or as blue as that."""
 
 
-def shown_parts(placed: Sequence[Placed], camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def shown_parts(placed: Sequence[Placed], camera: Camera, scale: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Of all groups' splats `[N]`, the part of its weight that a picture shows, what stands before it taken off, and whether its middle is
     in the picture, without which that part is 0. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture
-    (`footprint`)."""
+    (`footprint`). scale: as of `draw`."""
     groups = [p.gaussians.detach() for p in placed]
     blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
     drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
     with torch.enable_grad():
-        (rgb,) = draw(drawn, camera, "rgb")
+        (rgb,) = draw(drawn, camera, "rgb", scale=scale)
         weights = torch.autograd.grad(rgb[..., 0].sum() / C0, blank)
     whole = torch.cat([footprint(p, camera) for p in placed])
     return torch.where(whole > 0, torch.cat(weights)[:, 0, 0] / whole, 0.0), whole > 0

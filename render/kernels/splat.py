@@ -84,10 +84,17 @@ def dilated(e: Ellipse, view: View):
 
 
 @wp.func
+def unsmoothed(e: Ellipse, view: View):
+    """The determinant, dilated by what is no smoothing."""
+    rest = wp.float64(view.dilation) - wp.float64(view.smoothing)
+    return e.det0 + rest * (e.xx + e.yy + rest)
+
+
+@wp.func
 def fade(e: Ellipse, opacity: float, view: View):
-    """Opacity, compensated for dilation where that is wanted, and the exponent up to which the splat shows; 0 where it does not."""
-    if view.antialias != 0:
-        opacity = opacity * wp.sqrt(float(e.det0 / wp.max(dilated(e, view)[2], LEAST)))
+    """Opacity, compensated for the smoothing, and the exponent up to which the splat shows; 0 where it does not."""
+    if view.smoothing > 0.0:
+        opacity = opacity * wp.sqrt(float(unsmoothed(e, view) / wp.max(dilated(e, view)[2], LEAST)))
     s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
     if opacity <= view.least_opacity or not (e.xx < LARGEST and e.yy < LARGEST):
         s_max = 0.0
@@ -173,16 +180,21 @@ def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: in
     out.det0 = g_det
     out.xy = g[G_M] / yy
     g_o = g[G_OPACITY]
-    if view.antialias != 0:
-        # opacity sqrt(det0 / det): its two derivatives by det0 nearly cancel for large splats, so they are taken together
-        ratio = wp.sqrt(e.det0 / det)
+    by_rest = wp.float64(0.0)
+    if view.smoothing > 0.0:
+        # opacity sqrt(less / det): its two derivatives by det0 nearly cancel for large splats, so they are taken together
+        smoothing = wp.float64(view.smoothing)
+        rest = dilation - smoothing
+        less = wp.max(unsmoothed(e, view), LEAST)
+        ratio = wp.sqrt(less / det)
         g_ratio = HALF * g_o * wp.float64(o) * ratio / det
         g_trace -= g_ratio
-        out.det0 += g_ratio * dilation * (e.xx + e.yy + dilation) / wp.max(e.det0, LEAST)
+        by_rest = g_ratio * rest * det / less
+        out.det0 += g_ratio * smoothing * (e.xx + e.yy + dilation + rest) / less
         g_o = g_o * ratio
     out.logit = float(g_o) * o * (1.0 - o)
-    out.xx = g_trace * dilation
-    out.yy = (HALF * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * dilation
+    out.xx = g_trace * dilation + by_rest
+    out.yy = (HALF * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * dilation + by_rest
     out.x = g[G_X]
     out.y = g[G_Y]
     out.depth = g[G_Z]

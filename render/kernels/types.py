@@ -98,14 +98,14 @@ class View:
     tile_top: int
     tiles_x: int
     tiles_y: int
-    dilation: float
+    dilation: float  # px^2 added to both variances
+    smoothing: float  # of the dilation, what opacities make up for
     along_rays: int  # whether records only bound a splat (`ray_bound.py`)
     near: float
     log_cutoff: float  # ln(1 / alpha cutoff)
     faint: float  # opacity below which a splat's cutoff shrinks with it
     least_opacity: float  # splats up to it are not drawn
     unscented: int
-    antialias: int
 
 
 @wp.struct

@@ -47,6 +47,7 @@ def test_scenes_by_lot_are_drawn_as_the_oracle_draws_them(part):
         placed = changed(make(seed), dice.choice([0.0, 0.0, dice.uniform(-3, 1)]), dice.choice([0.0, 0.0, dice.uniform(-4, 6)]))
         if not moving:
             placed = [replace(p, world_from_local_end=None) for p in placed]
+        model = replace(model, smoothing=dice.choice([0.0, 0.1]))
         with torch.no_grad():
             rgb, *_, unsure = oracle.render(
                 oracle.as_oracle(placed), camera, model, cutoff=1 / 255, alpha_max=0.999, order=order,

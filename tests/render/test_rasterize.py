@@ -15,6 +15,7 @@ from tests.bench.presets import random_splats
 CAMERA = Camera(Pinhole(60.0, 62.0, 34.0, 22.0), 70, 50, pose_from([1, 0.02, 0.01, -0.03], [0.1, 0.2, -0.3]))
 TWICE = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
 MODELS = [SplatModel(projection=p, antialias=a) for p in ("ewa", "ut") for a in (False, True)]
+MODELS += [SplatModel(projection=p).at_scale(0.4) for p in ("ewa", "ut")]
 EXACT = RenderConfig(alpha_cutoff=1e-8, termination=0)
 
 

@@ -16,7 +16,13 @@ NASTY = st.one_of(
     st.floats(-3, 3, width=32),
     st.sampled_from([0.0, -0.0, 1e-45, 1e-30, -1e-30, 1e30, -1e30, 3e38, 88.0, -88.0, 100.0, -104.0, math.nan, math.inf, -math.inf]),
 )
-MODELS = st.builds(SplatModel, projection=st.sampled_from(["ewa", "ut"]), antialias=st.booleans(), dilation=st.sampled_from([0.0, 0.3]))
+MODELS = st.builds(
+    SplatModel,
+    projection=st.sampled_from(["ewa", "ut"]),
+    antialias=st.booleans(),
+    dilation=st.sampled_from([0.0, 0.3]),
+    smoothing=st.sampled_from([0.0, 0.1]),
+)
 
 
 @st.composite
