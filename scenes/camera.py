@@ -87,8 +87,8 @@ class RigCamera:
     """A camera fixed to the body: `body_from_cam` float64 `[4, 4]`, affine exposure `[3, 4]`, and when it took its frames.
 
     gains float32 `[F, 3]`, of frames that were exposed one by one: how many times as much as `exposure` each was; None where all alike.
-    fitted: whether splats were fitted to pictures of its size. shutter "rows" or "columns": an image is read out over `readout_us` from its time on, top (left) edge first; negative: that one last, at
-    its time.
+    fitted: whether splats were fitted to pictures of its size. shutter "rows" or "columns": an image is read out over `readout_us` from its
+    time on, top (left) edge first; negative: that one last, at its time.
     """
 
     lens: Lens

@@ -61,8 +61,8 @@ class Scene:
         return self.rig_camera(name).along(ego or self.ego, time_us)
 
     def model_for(self, camera: Camera) -> SplatModel:
-        """The scene's model for pictures of a camera: larger or smaller ones than the splats were fitted to, which those of the rig's camera
-        were that sees most nearly as wide an angle."""
+        """The scene's model for pictures of a camera, larger or smaller ones than the splats were fitted to: those of the rig's camera that
+        sees most nearly as wide an angle."""
         fitted = [c for c in self.rig.values() if c.fitted]
         if not fitted:
             return self.model
