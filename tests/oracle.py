@@ -1,8 +1,9 @@
 """Truth: the splat model in float64 torch, slow and obviously right, differentiable by autograd.
 
-The model (projection, response, dilation, antialiasing, smoothing) is what a scene was trained with. Its exact picture, which `truth` gives,
-sums all splats along every pixel's own ray in that ray's own order, with no cutoff, no clamp and no termination. `render` can also take the
-shortcuts of the kernels one by one (order by centres, cutoff, clamp), so that each kernel is held against exactly what it promises.
+The model (projection, response, dilation, antialiasing, smoothing) is what a scene was trained with. Its exact picture, which `truth`
+gives, sums all splats along every pixel's own ray in that ray's own order, with no cutoff, no clamp and no termination. `render` can also
+take the shortcuts of the kernels one by one (order by centres, cutoff, clamp), so that each kernel is held against exactly what it
+promises.
 
 Written from the papers' matrices (Zwicker et al. 2001; Julier and Uhlmann 1997 with alpha = 1, beta = 2, kappa = 0), not from the
 kernels' factored form, so that an error in that algebra shows.
