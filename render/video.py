@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import torch
@@ -67,7 +68,9 @@ class Video:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         if self.path.is_dir():
-            raise ValueError(f"{path} is a folder, not a video; of pictures make one first, as by ffmpeg -i {path}/%06d.png clip.mp4")
+            raise ValueError(
+                f"{path} is a folder, not a video; of pictures make one first, as by ffmpeg -i {quote(str(path))}/%06d.png clip.mp4"
+            )
         if not self.path.is_file():
             raise FileNotFoundError(f"no such video: {path}")
         with self._open() as container:

@@ -73,6 +73,12 @@ def test_sixteen_bits_of_grey_are_shown_as_eight(tmp_path):
     assert (read_image(tmp_path / "a.png")[..., 1] * 255).flatten().tolist() == pytest.approx(range(256), abs=0.01)
 
 
+def test_floats_are_refused_and_not_shown_as_black(tmp_path):
+    Image.fromarray(np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4)).save(tmp_path / "a.tif")
+    with pytest.raises(ValueError, match="a.tif .*its values are floats, of which nothing says what is white: store it with 8 or 16 bits"):
+        read_image(tmp_path / "a.tif")
+
+
 @pytest.mark.parametrize("picture", [np.int32, ">u2"], ids=["I", "I;16B"])
 def test_other_orders_of_bytes_are_sixteen_bits_too(picture):
     grey = np.array([[0, 257, 32896, 65535]])
