@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union
 
 import tyro
@@ -97,7 +98,8 @@ class Insert:
         add_edit(self.scene, result.actor.track, [result.actor], about)
         recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
         warn([*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))])
-        layer, fix = self.scene / "edits" / f"{result.actor.track}.usda", f"sidestep edit {self.scene} --undo {result.actor.track}"
+        layer = self.scene / "edits" / f"{result.actor.track}.usda"
+        fix = f"sidestep edit {quote(str(self.scene))} --undo {result.actor.track}"
         print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit: delete it, or {fix}, to undo it")
 
 

@@ -26,6 +26,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -163,7 +164,9 @@ class PairSet:
         found: dict[Path, Path] = {}  # a folder may be named twice, or with one in it
         for folder in map(Path, folders):
             if not folder.is_dir():
-                raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
+                raise FileNotFoundError(
+                    f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {quote(str(folder))}"
+                )
             for file in sorted([*folder.glob("*/*.json"), *folder.glob("*/*/*.json")]):
                 if file.parent.name in KINDS and file.name != NOTE and not file.name.startswith("."):
                     found.setdefault(file.resolve(), file)
@@ -171,7 +174,7 @@ class PairSet:
         if not self.shards:
             raise ValueError(
                 f"no pairs in {', '.join(map(str, folders))}; "
-                f"make some with: sidestep pairs SCENE --data DRIVE -o {folders[0] if folders else 'pairs'}"
+                f"make some with: sidestep pairs SCENE --data DRIVE -o {quote(str(folders[0])) if folders else 'pairs'}"
             )
 
     def digest(self) -> str:

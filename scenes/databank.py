@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
+from shlex import quote
 
 import torch
 
@@ -53,7 +54,8 @@ class Databank:
         """All entries, by id. FileNotFoundError where there is no databank, ValueError where its index is corrupt."""
         index = self.path / "index.json"
         if not index.is_file():
-            fix = f"sidestep assets extract SCENE --databank {self.path}, or assets add, makes one; another is named by --databank"
+            makes = f"sidestep assets extract SCENE --databank {quote(str(self.path))}, or assets add, makes one"
+            fix = f"{makes}; another is named by --databank"
             raise FileNotFoundError(f"{self.path} is not a databank: it has no index.json; {fix}")
         try:
             data = json.loads(index.read_text(encoding="utf-8"))

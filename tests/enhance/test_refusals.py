@@ -186,9 +186,12 @@ def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street,
     monkeypatch.setattr("enhance.pairs.open_recording", lambda *_: recording)
     monkeypatch.setattr("enhance.pairs.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
     save(street, tmp_path / "street")
+    (tmp_path / "other").mkdir()
     one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))
     with pytest.raises(ValueError, match="Did you mean left_camera"):
         one.run()
+    with pytest.raises(ValueError, match="other is neither a scene"):  # before the first scene's pairs, which may take hours
+        replace(one, cameras=None, scenes=(*one.scenes, tmp_path / "other"), data=(tmp_path, tmp_path)).run()
     with pytest.raises(ValueError, match="called img"):
         replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
     with pytest.raises(UsageError, match="--cameras names none"):
