@@ -19,6 +19,7 @@ from shlex import quote
 
 import torch
 
+from scenes.alone import alone
 from scenes.asset import Asset
 from scenes.atomic import atomic_file, atomic_folder
 from scenes.gaussians import Gaussians
@@ -90,6 +91,10 @@ class Databank:
 
         Of `asset.meta`, licence, attribution, source and views go into the index. Raises as `ready` does.
         """
+        with alone(self.path if self.path.is_dir() else self.path.absolute().parent):
+            return self._added(asset, thumb_png, half)
+
+    def _added(self, asset: Asset, thumb_png: bytes | None, half: bool) -> str:
         from scenes.usd_splats import save_asset, to_json
 
         asset.gaussians.validate(f"asset {asset.label!r}")
