@@ -178,8 +178,9 @@ class PairSet:
             )
 
     def digest(self) -> str:
-        """Which clips these are: the same for the same names, sizes and seeds."""
-        told = sorted((s.meta["kind"], s.path.stem, s.frames, s.height, s.width, s.meta.get("seed", 0)) for s in self.shards)
+        """Which clips these are: the same for the same names, sizes, seeds and times, which tell drives of one data set apart."""
+        names = [(s.meta["kind"], s.path.stem, s.frames, s.height, s.width, s.meta.get("seed", 0)) for s in self.shards]
+        told = sorted([*name, *s.meta.get("times_us", [])[:1]] for name, s in zip(names, self.shards, strict=True))
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
     def of(self, kind: str | None = None, split: str | None = None) -> list[Shard]:

@@ -265,3 +265,14 @@ def test_a_gpu_that_is_not_there_is_refused_before_anything_is_loaded(tmp_path, 
             Enhancer.load("nowhere", device=device)
     with pytest.raises(ValueError, match="no CUDA device that torch can use"):
         reconstruct(None, tmp_path / "scene", device="cuda")
+
+
+def test_clips_of_two_drives_by_the_same_names_are_told_apart(street, recording, tmp_path):
+    config = PairConfig(width=96, frames=3, every=4)
+    folder = make_pairs(street, recording, tmp_path / "one", kinds=("clean",), config=config)
+    shutil.copytree(folder, tmp_path / "other")
+    assert PairSet(folder).digest() == PairSet(tmp_path / "other").digest()
+    for file in (tmp_path / "other" / "clean").glob("*.json"):
+        meta = json.loads(file.read_text())
+        file.write_text(json.dumps({**meta, "times_us": [t + 60_000_000 for t in meta["times_us"]]}))
+    assert PairSet(folder).digest() != PairSet(tmp_path / "other").digest()
