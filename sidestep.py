@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union
 
 import tyro
@@ -84,20 +85,24 @@ class Insert:
         if self.trajectory is not None and (self.yaw or self.speed or self.path != "straight"):
             raise UsageError("--trajectory says it all, also where the asset heads and how fast; leave --yaw, --speed and --path out")
         from scenes import Databank
+        from scenes.alone import alone
         from scenes.insert import insert
         from scenes.seen import seeing, unseen_warning
         from scenes.usd_edit import add_edit
 
-        scene, _ = open_scene(self.scene)
         placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.path, self.trajectory)
-        result = insert(scene, Databank(self.databank).load(self.asset), placement, int(scene.ego.times_us[0]) + self.start)
         straight = {"at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}
         way = straight if self.trajectory is None else {"trajectory": self.trajectory.name}
         about = {"kind": "insert", "asset": self.asset, **way}
-        add_edit(self.scene, result.actor.track, [result.actor], about)
+        asset = Databank(self.databank).load(self.asset)
+        with alone(self.scene):  # the track's name is free of what the scene has
+            scene, _ = open_scene(self.scene)
+            result = insert(scene, asset, placement, int(scene.ego.times_us[0]) + self.start)
+            add_edit(self.scene, result.actor.track, [result.actor], about)
         recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
         warn([*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))])
-        layer, fix = self.scene / "edits" / f"{result.actor.track}.usda", f"sidestep edit {self.scene} --undo {result.actor.track}"
+        layer = self.scene / "edits" / f"{result.actor.track}.usda"
+        fix = f"sidestep edit {quote(str(self.scene))} --undo {result.actor.track}"
         print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit: delete it, or {fix}, to undo it")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
@@ -107,7 +108,10 @@ def enhance_video(
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
     if like is not None:
-        enhancer = Graded(enhancer, Grade.read(like, clip.width))
+        grade = Grade.read(like, clip.width)
+        if grade.grey:
+            warn([f"{like} holds grey photos alone, so {out} is grey, too; give photos in colour to keep its own"])
+        enhancer = Graded(enhancer, grade)
     memory: Any = None
     done, changed, told = 0, 0, False
     with _writer(out, clip) as writer:
@@ -125,7 +129,7 @@ def enhance_video(
     if isinstance(clip, Video):
         warn(odd_warning(out, clip.width, clip.height))
     if isinstance(clip, Video) and clip.sound:
-        fix = f"ffmpeg -i {out} -i {source} -map 0:v -map 1:a -c copy with_sound{Path(out).suffix} puts it back"
+        fix = f"ffmpeg -i {quote(str(out))} -i {quote(str(source))} -map 0:v -map 1:a -c copy with_sound{Path(out).suffix} puts it back"
         warn([f"{out} is without the sound of {source}; {fix}"])
     if not changed:
         why = f"its colours are those of {like}" if like is not None else _why(rendered, instances, told)

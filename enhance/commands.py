@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -55,8 +56,8 @@ class Pairs:
         _some("--cameras", self.cameras)
         _check_seed(self.seed)
         if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
-            counts = f"{len(self.scenes)} scenes and {len(self.data)} recordings"
-            raise UsageError(f"give each scene's recording with --data, in the scenes' order; there are {counts}")
+            counts = f"scenes: {len(self.scenes)}, recordings: {len(self.data)}"
+            raise UsageError(f"give each scene's recording with --data, in the scenes' order; {counts}")
         names = [path.resolve().name for path in self.scenes]
         if twice := sorted({n for n in names if names.count(n) > 1}):
             raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
@@ -68,11 +69,13 @@ class Pairs:
             raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
         check_device(self.device)
         with stopped_saying(lambda: "the same command goes on from here"):
-            for path, name, data in zip(self.scenes, names, self.data, strict=True):
+            drives = []
+            for path, name, data in zip(self.scenes, names, self.data, strict=True):  # all now: a wrong one must not cost another's hours
                 scene = open_reconstruction(path)
                 log = open_recording(data, scene)
-                cameras = check_cameras(scene, log, self.cameras)
                 out = self.output if len(self.scenes) == 1 else self.output / name
+                drives.append((name, scene, log, check_cameras(scene, log, self.cameras), out))
+            for name, scene, log, cameras, out in drives:
                 claim_pairs(out, scene, log, self.seed, config, self._made_of())
                 relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
                 sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
@@ -172,7 +175,7 @@ class Train:
                     device=self.device,
                     vgg=self.vgg,
                 )
-        print(f"wrote {weights}; use it with --weights {weights}")
+        print(f"wrote {weights}; use it with --weights {quote(str(weights))}")
 
 
 @dataclass

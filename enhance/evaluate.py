@@ -212,7 +212,8 @@ def _told(shards: Sequence[Shard]) -> list[Frame]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips."""
+    """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips, where
+    there are several."""
     measures = ["PSNR in the region", "gain, dB (95 %)", "PSNR of the frame", "SSIM region / frame", "features", "warp error", "sharpness"]
     names = ["damage", "method", *measures, "ms"]
     lines = [f"| {' | '.join(names)} |", "|" + len(names) * "---|"]
@@ -222,8 +223,8 @@ def table(rows: Sequence[Row]) -> str:
         if r.method != "identity" and r.kind in identity:
             gains = r.gain(identity[r.kind], "region")
             low, high = interval(gains)
-            if np.isfinite(low):
-                cells[1] = f"{np.nanmean(gains):+.2f} ({low:+.2f} to {high:+.2f})"
+            if np.isfinite(gains).any():  # of a single clip without an interval
+                cells[1] = f"{np.nanmean(gains):+.2f}" + (f" ({low:+.2f} to {high:+.2f})" if np.isfinite(low) else "")
         cells.append(f"{_written(r.mean('ssim in the region'), 3)} / {_written(r.mean('ssim'), 3)}")
         cells += [_written(r.mean("features"), 4), _written(r.mean("warp error")), _written(r.mean("sharpness"))]
         spent = "-" if r.method == "identity" else f"{r.milliseconds:.0f}"

@@ -45,20 +45,26 @@ OFTEN = 0.9
 """Part of the photos whose excess of grain over others is usual."""
 
 
+GREY = 2 / 255
+"""Most by which a grey photo's channels differ."""
+
+
 class Grade:
     """Colours and grain of photos of one place.
 
+    grey         whether no photo has any colour
     usual        mean square by which a photo is changed that is given the colours of others
     usual_grain  excess that nine of ten photos have over others
     """
 
     def __init__(self, photos: Iterable[torch.Tensor]):
         """Of pictures `[H, W, 3]` in 0..1, best as wide as the frames. ValueError where there are none, or one is no such picture."""
-        colours, ranks, self.grains = [], [], []
+        colours, ranks, self.grains, self.grey = [], [], [], True
         for i, photo in enumerate(photos):
             check_rgb(f"photo {i}", photo)
             small = _small(photo)
             colours.append(Colours.of(small.flatten(0, 1)))
+            self.grey &= bool((small.amax(-1) - small.amin(-1)).max() < GREY)
             ranks.append(_ranks(small))
             self.grains.append(Grain.of(photo))
         if not colours:

@@ -36,7 +36,8 @@ class ObjectIds:
         file = self.files[number]
         ids = _array(file) if file.suffix.lower() == ".npy" else _picture(file)
         if ids.shape != (height, width):
-            raise ValueError(f"{file} has the shape {list(ids.shape)}, but its picture is {height} rows of {width}")
+            fix = f"resize them to {width}x{height} by nearest neighbour, which mixes no ids" if ids.ndim == 2 else "give one id a pixel"
+            raise ValueError(f"{file} has ids of the shape {list(ids.shape)}, but its picture is {height} rows of {width}; {fix}")
         if (count := len(np.unique(ids[ids > 0]))) > MOST:
             fix = "give every object one value, without soft edges"
             raise ValueError(f"{file} tells of {count} objects, and {MOST} are the most of one picture; {fix}")

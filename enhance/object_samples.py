@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,10 +46,13 @@ class ObjectSampler:
         self.plain = [s for kind in ("clean", "isp") for s in shards.get(kind, ())]
         self.rendered = [s for kind in RENDERED for s in shards.get(kind, ())]
 
-    def draw(self, rng: np.random.Generator, count: int) -> Objects:
+    def draw(self, rng: np.random.Generator, count: int, progress: Callable[[int], None] | None = None) -> Objects:
+        """`count` objects; `progress` is called with how many there are, after each picture."""
         drawn: list[tuple] = []
         while len(drawn) < count:
             drawn += self._object(rng)
+            if progress is not None:
+                progress(min(len(drawn), count))
         e, *pixels = zip(*drawn[:count], strict=True)
         return Objects(Evidence.stacked(list(e)), *(torch.stack(p) for p in pixels))
 

@@ -170,11 +170,15 @@ class Run:
         all_of["enhancer"] = 1 - sum(all_of.values())
         return all_of[stage] / sum(all_of[s] for s in self.stages) if stage in self.stages else 0.0
 
+    def passed(self, stage: str) -> bool:
+        """Whether a later stage has begun."""
+        return any(self.step[other] for other in STAGES[STAGES.index(stage) + 1 :])
+
     def done(self, stage: str) -> float:
         """How much of a stage's budget is spent, 0 to 1: all where a later one has begun, though the budget be longer now, since what a
         stage learnt is lost where an earlier one goes on below it."""
-        share, later = self.share(stage), STAGES[STAGES.index(stage) + 1 :]
-        if share <= 0 or any(self.step[other] for other in later):
+        share = self.share(stage)
+        if share <= 0 or self.passed(stage):
             return 1.0
         if self.steps is not None:
             return min(1.0, self.step[stage] / max(share * self.steps, 1))

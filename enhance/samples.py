@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
@@ -117,9 +117,9 @@ class Sampler:
         drawn = [self._sample(rng, frames, size) for _ in range(count)]
         return Sample(**{f.name: torch.stack([getattr(s, f.name) for s in drawn]) for f in fields(Sample)})
 
-    def objects(self, step: int, count: int) -> Objects:
-        """Objects in wrong colours or in their own."""
-        return self._objects.draw(self.rng(step), count)
+    def objects(self, step: int, count: int, progress: Callable[[int], None] | None = None) -> Objects:
+        """Objects in wrong colours or in their own; `progress` is called with how many are drawn."""
+        return self._objects.draw(self.rng(step), count, progress)
 
     def grounds(self, step: int, count: int) -> Grounds | None:
         """Ground by objects with and without their shadow."""

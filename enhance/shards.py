@@ -26,6 +26,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -163,7 +164,9 @@ class PairSet:
         found: dict[Path, Path] = {}  # a folder may be named twice, or with one in it
         for folder in map(Path, folders):
             if not folder.is_dir():
-                raise FileNotFoundError(f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {folder}")
+                raise FileNotFoundError(
+                    f"{folder} is not a folder of pairs; make one with: sidestep pairs SCENE --data DRIVE -o {quote(str(folder))}"
+                )
             for file in sorted([*folder.glob("*/*.json"), *folder.glob("*/*/*.json")]):
                 if file.parent.name in KINDS and file.name != NOTE and not file.name.startswith("."):
                     found.setdefault(file.resolve(), file)
@@ -171,12 +174,13 @@ class PairSet:
         if not self.shards:
             raise ValueError(
                 f"no pairs in {', '.join(map(str, folders))}; "
-                f"make some with: sidestep pairs SCENE --data DRIVE -o {folders[0] if folders else 'pairs'}"
+                f"make some with: sidestep pairs SCENE --data DRIVE -o {quote(str(folders[0])) if folders else 'pairs'}"
             )
 
     def digest(self) -> str:
-        """Which clips these are: the same for the same names, sizes and seeds."""
-        told = sorted((s.meta["kind"], s.path.stem, s.frames, s.height, s.width, s.meta.get("seed", 0)) for s in self.shards)
+        """Which clips these are: the same for the same names, sizes, seeds and times, which tell drives of one data set apart."""
+        names = [(s.meta["kind"], s.path.stem, s.frames, s.height, s.width, s.meta.get("seed", 0)) for s in self.shards]
+        told = sorted([*name, *s.meta.get("times_us", [])[:1]] for name, s in zip(names, self.shards, strict=True))
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
     def of(self, kind: str | None = None, split: str | None = None) -> list[Shard]:

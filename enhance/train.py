@@ -139,8 +139,9 @@ def train(
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
         go("prior", partial(_right, run, sampler), partial(_prior_step, run))
         go("objects", lambda step: sampler.objects(4 * step + 3, config.looked_at), partial(_objects_step, run))
-        if "objects" in run.stages:
-            run.net.objects.usual.copy_(usual_changes(sampler.objects(3, USUAL)))
+        if "objects" in run.stages and not run.passed("objects"):  # else the checkpoint has it
+            run.save(checkpoint)  # what follows takes long, and a training that is killed in it must not have been in vain
+            _learn_usual(run, sampler, report, stops)
         # its objects are read once and then cheap to draw: further processes would each have to read them
         go("shade", lambda step: sampler.grounds(step, 2 * config.looked_at), partial(_shade_step, run), processes=0)
         now = run.net.state_dict()
@@ -227,6 +228,18 @@ def _stage(
             saved = time.monotonic()
         stops.end()
     run.loss(name)
+
+
+def _learn_usual(run: Run, sampler: Sampler, report: _Reporter, stops: Stops) -> None:
+    """What changes objects usually need, for the seam (`enhance.seam`): the same whenever it is asked for, so that nothing of it is kept
+    where it is broken off."""
+
+    def drawn(count: int) -> None:
+        report("objects", f"looked at {count} of {USUAL} objects for what changes are usual")
+        stops.end()
+
+    run.net.objects.usual.copy_(usual_changes(sampler.objects(3, USUAL, drawn)))
+    report("objects")
 
 
 def _images(run: Run, sampler: Sampler, step: int) -> Images:
@@ -349,9 +362,10 @@ class _Reporter:
     def __init__(self, run: Run, progress: Callable[[float, str], None] | None):
         self.run, self.progress, self.told = run, progress, 0.0
 
-    def __call__(self, stage: str) -> None:
-        if self.progress is None or (time.monotonic() - self.told < 5 and self.run.done(stage) < 1):
+    def __call__(self, stage: str, said: str | None = None) -> None:
+        """said: what is told in place of the loss."""
+        if self.progress is None or (time.monotonic() - self.told < 5 and (said is not None or self.run.done(stage) < 1)):
             return
         self.told = time.monotonic()
         done = sum(self.run.share(name) * self.run.done(name) for name in STAGES)
-        self.progress(done, f"{stage}: step {self.run.step[stage]}, loss {self.run.loss(stage):.4f}")
+        self.progress(done, f"{stage}: {said or f'step {self.run.step[stage]}, loss {self.run.loss(stage):.4f}'}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
+from shlex import quote
 
 import torch
 
@@ -56,7 +57,7 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
     if not path.is_file():
         raise FileNotFoundError(
             f'no weights at {path}; write "builtin" for the shipped ones, fetch a public model and give where it lies, '
-            f"or train some: sidestep train PAIRS -o {path.parent}"
+            f"or train some: sidestep train PAIRS -o {quote(str(path.parent))}"
         )
     try:
         with safe_open(path, "pt") as file:

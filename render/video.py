@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import torch
@@ -67,7 +68,9 @@ class Video:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         if self.path.is_dir():
-            raise ValueError(f"{path} is a folder, not a video; of pictures make one first, as by ffmpeg -i {path}/%06d.png clip.mp4")
+            raise ValueError(
+                f"{path} is a folder, not a video; of pictures make one first, as by ffmpeg -i {quote(str(path))}/%06d.png clip.mp4"
+            )
         if not self.path.is_file():
             raise FileNotFoundError(f"no such video: {path}")
         with self._open() as container:
@@ -85,7 +88,7 @@ class Video:
         first = next(frames)  # what turns them is said with the frames
         frames.close()
         self.dropped = _dropped(first)
-        lies = _quarters(first) % 2 == 1
+        lies = _turns(first)[0] % 2 == 1
         self.width, self.height = (first.height, first.width) if lies else (first.width, first.height)
         self.pixel_aspect = 1 / aspect if lies else aspect
 
@@ -99,7 +102,9 @@ class Video:
         for i, frame in enumerate(self._decoded()):
             at = i / self.fps if frame.pts is None else float(frame.pts * frame.time_base)
             began = at if began is None else began
-            pixels = np.rot90(frame.to_ndarray(format="rgb24"), _quarters(frame))
+            quarters, mirrored = _turns(frame)
+            stored = frame.to_ndarray(format="rgb24")
+            pixels = np.rot90(stored[:, ::-1] if mirrored else stored, quarters)
             if pixels.shape[:2] != (self.height, self.width):
                 sizes = f"{self.width}x{self.height} to {pixels.shape[1]}x{pixels.shape[0]}"
                 raise ValueError(f"{self.path} changes its size after frame {i}, from {sizes}; cut it there, or scale it to one size")
@@ -135,9 +140,16 @@ class Video:
             raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}") from error
 
 
-def _quarters(frame) -> int:
-    """Quarter turns to the left that show a frame of PyAV's upright."""
-    return round(frame.rotation / 90)
+def _turns(frame) -> tuple[int, bool]:
+    """Quarter turns to the left that show a frame of PyAV's upright, and whether left and right are changed before, as of selfies."""
+    from av.sidedata.sidedata import Type
+
+    told = frame.side_data.get(Type.DISPLAYMATRIX)
+    if told is None:
+        return 0, False
+    a, b, _, c, d = np.frombuffer(bytes(told), np.int32)[:5].astype(float)
+    mirrored = bool(a * d < b * c)
+    return round(frame.rotation / 90) + 2 * mirrored, mirrored  # a mirrored frame's rotation is told as if top and bottom were changed
 
 
 def _dropped(frame) -> str:

@@ -128,9 +128,11 @@ class Edit:
         asked = bool(self.remove or self.shift or self.replace or self.retime)
         if not asked and not self.undo:
             raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
+        from scenes.alone import alone
         from scenes.usd_edit import undone
 
         with ExitStack() as stack:
+            stack.enter_context(alone(self.scene))
             gone = stack.enter_context(undone(self.scene, self.undo))
             warnings, said = self._changed() if asked else ([], [])
         for line in (*(_without(self.scene, edit) for edit in gone), *said):

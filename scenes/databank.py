@@ -15,9 +15,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
+from shlex import quote
 
 import torch
 
+from scenes.alone import alone
 from scenes.asset import Asset
 from scenes.atomic import atomic_file, atomic_folder
 from scenes.gaussians import Gaussians
@@ -53,7 +55,8 @@ class Databank:
         """All entries, by id. FileNotFoundError where there is no databank, ValueError where its index is corrupt."""
         index = self.path / "index.json"
         if not index.is_file():
-            fix = f"sidestep assets extract SCENE --databank {self.path}, or assets add, makes one; another is named by --databank"
+            makes = f"sidestep assets extract SCENE --databank {quote(str(self.path))}, or assets add, makes one"
+            fix = f"{makes}; another is named by --databank"
             raise FileNotFoundError(f"{self.path} is not a databank: it has no index.json; {fix}")
         try:
             data = json.loads(index.read_text(encoding="utf-8"))
@@ -88,6 +91,10 @@ class Databank:
 
         Of `asset.meta`, licence, attribution, source and views go into the index. Raises as `ready` does.
         """
+        with alone(self.path if self.path.is_dir() else self.path.absolute().parent):
+            return self._added(asset, thumb_png, half)
+
+    def _added(self, asset: Asset, thumb_png: bytes | None, half: bool) -> str:
         from scenes.usd_splats import save_asset, to_json
 
         asset.gaussians.validate(f"asset {asset.label!r}")

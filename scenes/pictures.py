@@ -31,7 +31,10 @@ def opened(file: str | os.PathLike | IO[bytes], name: str, fix: str) -> Iterator
 
 
 def rgb_of(picture: Image.Image) -> Image.Image:
-    """An opened picture as 8-bit RGB, as it is stored. 16-bit grey is scaled: PIL alone would make all of it that is not black white."""
+    """An opened picture as 8-bit RGB, as it is stored. 16-bit grey is scaled: PIL alone would make all of it that is not black white.
+    ValueError for floats, of which PIL would make black."""
+    if picture.mode.startswith("F"):
+        raise ValueError("its values are floats, of which nothing says what is white: store it with 8 or 16 bits")
     if picture.mode.startswith("I"):
         levels = np.asarray(picture).clip(0, 65535) / 257
         picture = Image.fromarray(np.round(levels).astype(np.uint8))

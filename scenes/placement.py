@@ -90,11 +90,13 @@ def read_waypoints(path: Path) -> list[Waypoint]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file") from error
-    rows = [(number, [cell.strip() for cell in line.split(",")]) for number, line in enumerate(lines, 1) if line.strip()]
+        raise ValueError(f"{path} is not a text file in UTF-8; save it as that") from error
+    rows = [(number, [cell.strip().strip('"') for cell in line.split(",")]) for number, line in enumerate(lines, 1) if line.strip()]
     header = rows[0][1] if rows else []
     if tuple(header) not in (COLUMNS, COLUMNS[:3]):
-        raise ValueError(f'{path} must begin with the header time_s,x_m,y_m or time_s,x_m,y_m,yaw_deg, got "{",".join(header)}"')
+        raise ValueError(
+            f'{path} must begin with the header time_s,x_m,y_m or time_s,x_m,y_m,yaw_deg, got "{",".join(header)}"{_other(header)}'
+        )
     points: list[Waypoint] = []
     for number, cells in rows[1:]:
         if len(cells) != len(header):
@@ -112,5 +114,14 @@ def read_waypoints(path: Path) -> list[Waypoint]:
             raise ValueError(f"{path}, line {number}: time_s must rise, but {cells[0]} follows {points[-1].time_us / 1e6:g}")
         points.append(point)
     if len(points) < 2:
-        raise ValueError(f"{path} has {len(points)} rows below its header; a trajectory needs at least 2")
+        fix = "what stands is put in by X,Y"
+        raise ValueError(f"{path} has {len(points)} row{'s' * (len(points) != 1)} below its header; a trajectory needs at least 2; {fix}")
     return points
+
+
+def _other(header: list[str]) -> str:
+    """The fix for a header that separates its columns by something else than commas."""
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if tuple(cell.strip() for cell in "".join(header).split(mark)) in (COLUMNS, COLUMNS[:3]):
+            return f"; separate the columns by commas, not by {name}, and write decimals with a point"
+    return ""

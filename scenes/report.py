@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields
 from pathlib import Path, PurePosixPath
+from shlex import quote
 
 import torch
 
@@ -228,7 +229,7 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
     for edit in scene.meta.get("edits", []):
         if edit.get("missing"):
             name = edit["name"]
-            fix = f"sidestep edit {where} --undo {name}"
+            fix = f"sidestep edit {quote(str(where))} --undo {name}"
             yield f"{where}: edit {name} is undone, but not tidied up: edits/{name}.usda was deleted; {fix} takes away the rest"
 
 

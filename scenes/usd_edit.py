@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 
 from pxr import Sdf, Usd, UsdVol, Vt
 
+from scenes.alone import alone
 from scenes.asset import Actor
 from scenes.atomic import atomic_file, atomic_folder, need_folder
 from scenes.edit import Edit, bared, check_edit, ghosts
@@ -46,7 +47,11 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     the layer's file undoes it. Raises FileExistsError where the edit exists, ValueError where a track does. On failure the
     scene stays as it was.
     """
-    scene = Path(scene)
+    with alone(scene):
+        _add(Path(scene), name, actors, meta, half)
+
+
+def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict, half: bool) -> None:
     origin = int(read_metadata(scene)["origin_us"])
     _sweep(scene)
     standing, taken = _prims(scene)
@@ -78,7 +83,11 @@ def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict
     An edit stands on what it found: of two that change the same actor, the later one counts.
     Raises as `add_edit` and `check_edit`.
     """
-    path = Path(path)
+    with alone(path):
+        _change(Path(path), name, scene, edit, meta, half)
+
+
+def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool) -> None:
     check_edit(edit, scene)
     origin, (prims, _) = int(read_metadata(path)["origin_us"]), _prims(path)
     changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
@@ -139,24 +148,25 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
     """
     scene = Path(scene)
     read_metadata(scene)
-    root, out = scene / "scene.usda", list[Undone]()
-    before = root.read_bytes()
-    need_folder(root)
-    _sweep(scene)
-    with TemporaryDirectory(prefix=ASIDE, dir=scene) as aside:
-        try:
-            gone: set[str] = set()
-            for name in names:
-                if name not in gone:
-                    out.append(_taken_out(scene, name, Path(aside)))
-                    gone |= {name, *out[-1].idle}
-            yield [replace(u, held={edit: tracks for edit, tracks in u.held.items() if edit not in gone}) for u in out]
-        except BaseException:
-            for path in Path(aside).iterdir():
-                path.rename(scene / "edits" / path.name)
-            with atomic_file(root) as partial:
-                partial.write_bytes(before)
-            raise
+    with alone(scene):
+        root, out = scene / "scene.usda", list[Undone]()
+        before = root.read_bytes()
+        need_folder(root)
+        _sweep(scene)
+        with TemporaryDirectory(prefix=ASIDE, dir=scene) as aside:
+            try:
+                gone: set[str] = set()
+                for name in names:
+                    if name not in gone:
+                        out.append(_taken_out(scene, name, Path(aside)))
+                        gone |= {name, *out[-1].idle}
+                yield [replace(u, held={edit: tracks for edit, tracks in u.held.items() if edit not in gone}) for u in out]
+            except BaseException:
+                for path in Path(aside).iterdir():
+                    path.rename(scene / "edits" / path.name)
+                with atomic_file(root) as partial:
+                    partial.write_bytes(before)
+                raise
 
 
 def _taken_out(scene: Path, name: str, aside: Path) -> Undone:

@@ -20,6 +20,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import torch
@@ -178,7 +179,7 @@ def _check_edits(stage: Usd.Stage, path: Path) -> None:
         below = layer.GetCompositionAssetDependencies() if layer else ()
         for file in (f for f in (path / sub, *(path / "edits" / s for s in below)) if not _says_something(f)):
             how, name = "damaged" if file.exists() else "missing", Path(sub).stem
-            fix = f"restore it, or undo the edit: sidestep edit {path} --undo {name}"
+            fix = f"restore it, or undo the edit: sidestep edit {quote(str(path))} --undo {name}"
             raise ValueError(f"{file} is {how}, so the edit {name} cannot be applied; {fix}")
 
 

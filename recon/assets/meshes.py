@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image
 
 from recon.assets.gltf_mesh import SUFFIXES as GLTF
 from recon.assets.gltf_mesh import load_gltf
@@ -23,6 +24,7 @@ from scenes.camera import Camera
 from scenes.gaussians import Gaussians, SplatModel
 from scenes.harmonics import sh_from_rgb
 from scenes.match import ASPHALT
+from scenes.pictures import rgb_of
 from scenes.poses import matrix_from_quat, quat_from_matrix
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
@@ -149,7 +151,7 @@ def _texture(material) -> np.ndarray:
     factor = getattr(material, "baseColorFactor", None)
     if image is None and not hasattr(material, "baseColorFactor"):
         return np.asarray(material.main_color, np.uint8).reshape(1, 1, 4)
-    texture = np.full((1, 1, 4), 255, np.uint8) if image is None else np.asarray(image.convert("RGBA")).copy()
+    texture = np.full((1, 1, 4), 255, np.uint8) if image is None else np.asarray(_rgba(image)).copy()
     if factor is not None and (np.asarray(factor) != 255).any():
         share = torch.from_numpy(np.asarray(factor, np.float32) / 255)
         rgba = torch.from_numpy(texture).float() / 255
@@ -158,6 +160,11 @@ def _texture(material) -> np.ndarray:
     if _is_opaque(material):
         texture[..., 3] = 255
     return texture
+
+
+def _rgba(image: Image.Image) -> Image.Image:
+    """A texture as 8-bit RGBA; grey of 16 bits is scaled (`rgb_of`)."""
+    return (rgb_of(image) if image.mode.startswith("I") else image).convert("RGBA")
 
 
 def splats_of_mesh(mesh: Mesh, count: int) -> Gaussians:

@@ -222,7 +222,7 @@ def test_ids_that_do_not_fit_are_refused(tmp_path, pictures, capsys):
     enhance_video(pictures, tmp_path / "same", Marking(), instances=folder)
     assert f"{folder} tells of no object" in capsys.readouterr().err
     np.save(folder / "1.npy", np.zeros((30, 50), np.int32))
-    refused(r"1.npy has the shape \[30, 50\], but its picture is 34 rows of 50")
+    refused(r"1.npy has ids of the shape \[30, 50\], but its picture is 34 rows of 50; resize them to 50x34 by nearest neighbour")
     np.save(folder / "1.npy", np.zeros((34, 50)))
     refused("1.npy holds float64; ids are whole numbers")
     np.save(folder / "1.npy", np.arange(34 * 50, dtype=np.int32).reshape(34, 50))

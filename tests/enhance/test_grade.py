@@ -146,6 +146,19 @@ def test_a_clip_is_given_the_colours_of_photos(tmp_path, source):
         assert psnr(read_image(tmp_path / "out" / f"{i}.png"), wanted) > psnr(altered(wanted), wanted) + 6
 
 
+def test_that_grey_photos_make_a_clip_grey_is_said(tmp_path, capsys):
+    rgb = torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(0))
+    grey = rgb[..., :1].expand(-1, -1, 3)
+    for name, picture in (("clip", rgb), ("grey", grey), ("both", grey)):
+        (tmp_path / name).mkdir()
+        write_image(tmp_path / name / "0.png", picture)
+    write_image(tmp_path / "both" / "1.png", rgb)
+    enhance_video(tmp_path / "clip", tmp_path / "a", like=tmp_path / "grey")
+    assert "grey holds grey photos alone, so" in capsys.readouterr().err
+    enhance_video(tmp_path / "clip", tmp_path / "b", like=tmp_path / "both")
+    assert "grey photos" not in capsys.readouterr().err
+
+
 def test_whole_frames_are_measured_graded_like_the_cameras_other_clips(tmp_path, monkeypatch):
     (tmp_path / "photos").mkdir()
     for i in range(4):

@@ -186,9 +186,12 @@ def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street,
     monkeypatch.setattr("enhance.pairs.open_recording", lambda *_: recording)
     monkeypatch.setattr("enhance.pairs.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
     save(street, tmp_path / "street")
+    (tmp_path / "other").mkdir()
     one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))
     with pytest.raises(ValueError, match="Did you mean left_camera"):
         one.run()
+    with pytest.raises(ValueError, match="other is neither a scene"):  # before the first scene's pairs, which may take hours
+        replace(one, cameras=None, scenes=(*one.scenes, tmp_path / "other"), data=(tmp_path, tmp_path)).run()
     with pytest.raises(ValueError, match="called img"):
         replace(one, cameras=None, photos=(tmp_path / "a" / "img", tmp_path / "b" / "img")).run()
     with pytest.raises(UsageError, match="--cameras names none"):
@@ -262,3 +265,14 @@ def test_a_gpu_that_is_not_there_is_refused_before_anything_is_loaded(tmp_path, 
             Enhancer.load("nowhere", device=device)
     with pytest.raises(ValueError, match="no CUDA device that torch can use"):
         reconstruct(None, tmp_path / "scene", device="cuda")
+
+
+def test_clips_of_two_drives_by_the_same_names_are_told_apart(street, recording, tmp_path):
+    config = PairConfig(width=96, frames=3, every=4)
+    folder = make_pairs(street, recording, tmp_path / "one", kinds=("clean",), config=config)
+    shutil.copytree(folder, tmp_path / "other")
+    assert PairSet(folder).digest() == PairSet(tmp_path / "other").digest()
+    for file in (tmp_path / "other" / "clean").glob("*.json"):
+        meta = json.loads(file.read_text())
+        file.write_text(json.dumps({**meta, "times_us": [t + 60_000_000 for t in meta["times_us"]]}))
+    assert PairSet(folder).digest() != PairSet(tmp_path / "other").digest()

@@ -17,7 +17,7 @@ from enhance.net import Net, NetConfig
 from enhance.run import TrainConfig, opened
 from enhance.shards import PairSet, to_bytes, write_shard
 from enhance.train import train
-from enhance.weights_file import load_net
+from enhance.weights_file import BUILTIN, load_net
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -110,6 +110,8 @@ def test_training_undoes_a_constant_error(pairs, tmp_path, device):
     assert by["clean", "identity"].mean("frame") == float("inf") and by["isp", "identity"].mean("warp error") > 0
     text = table(rows)
     assert text.count("\n") == 13 and "| clean | identity | - | - | equal |" in text
+    gained = by["underfit", "ours"].mean("region") - by["underfit", "identity"].mean("region")
+    assert f" | {gained:+.2f} | " in text, "of a single clip without an interval"
 
 
 def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_path):
@@ -249,6 +251,31 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
     rows = evaluate(pairs, Enhancer(Net(SMALL)), beside={"half": Told()})
     assert [r.method for r in rows] == [*METHODS, ALONE, ALL_TOLD, "half", *METHODS, PUT_IN, "half", *METHODS, "half"]
     assert all(r.mean("frame") < 20 for r in rows if r.method == "half") and "| isp | half |" in table(rows)
+
+
+def test_what_is_learnt_of_objects_is_kept_before_it_is_asked_what_changes_are_usual(pairs, tmp_path, monkeypatch):
+    """That takes minutes, says how far it is, can be stopped, and comes out the same where it begins anew."""
+    monkeypatch.setattr(sys.modules["enhance.train"], "USUAL", 60)
+    only = {"steps": 4, "config": QUICK, "start": "builtin", "only": ("objects",)}
+    whole = train(pairs, tmp_path / "whole", **only)
+
+    lines, now = [], sys.modules["enhance.train"].time
+    monkeypatch.setattr(now, "monotonic", iter(range(0, 10**9, 10)).__next__)
+
+    def stop(share, line):
+        lines.append(line)
+        if "looked at 3" in line:
+            assert opened(tmp_path / "halves" / "checkpoint.pt")["step"]["objects"] == 4
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(pairs, tmp_path / "halves", **only, progress=stop, save_every=10**6)
+    assert "of 60 objects for what changes are usual" in lines[-1]
+    monkeypatch.undo()
+    monkeypatch.setattr(sys.modules["enhance.train"], "USUAL", 60)
+    halves = train(pairs, tmp_path / "halves", **only, resume=True)
+    first, second = load_net(whole)[0].objects.usual, load_net(halves)[0].objects.usual
+    assert torch.equal(first, second) and not torch.equal(first, load_net(BUILTIN)[0].objects.usual)
 
 
 def test_a_longer_budget_begins_no_stage_anew_that_a_later_one_stands_on(pairs, tmp_path, capsys):

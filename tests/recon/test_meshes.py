@@ -186,6 +186,14 @@ def _textures(path: Path) -> np.ndarray:
     return np.array(colours)
 
 
+def test_a_texture_of_sixteen_bits_is_shown_as_eight(tmp_path):
+    """PIL alone makes all of it that is not black white."""
+    from PIL import Image
+
+    file = wide_box(tmp_path / "a.glb", 0.5, baseColorTexture=Image.fromarray(np.full((4, 4), 100 * 257, np.uint16)))
+    assert read_mesh(file).textures[0].reshape(-1, 4).tolist() == 16 * [[100, 100, 100, 255]]
+
+
 @pytest.mark.parametrize("textured", [False, True], ids=["no coordinates", "coordinates"])
 def test_a_plain_colour_of_gltf_is_linear(tmp_path, textured):
     box = trimesh.creation.box((4, 1.8, 1.5))

@@ -39,9 +39,20 @@ def test_a_video_comes_back_alike(tmp_path):
     assert all(psnr(frame, image) > 32 for frame in frames)  # so small an image loses most to 4:2:0
 
 
-@pytest.mark.parametrize(("matrix", "quarters"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
-def test_a_video_that_was_filmed_upright_is_read_upright(tmp_path, matrix, quarters):
-    """As phones write it: frames as the sensor lies, and how to turn them in the track's header."""
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((0, 1, -1, 0), lambda image: image.rot90(-1)),
+        ((0, -1, 1, 0), lambda image: image.rot90(1)),
+        ((-1, 0, 0, -1), lambda image: image.rot90(2)),
+        ((-1, 0, 0, 1), lambda image: image.flip(1)),  # mirrored, as selfies
+        ((1, 0, 0, -1), lambda image: image.flip(0)),
+        ((0, 1, 1, 0), lambda image: image.transpose(0, 1)),
+        ((0, -1, -1, 0), lambda image: image.transpose(0, 1).rot90(2)),
+    ],
+)
+def test_a_video_that_was_filmed_upright_is_read_upright(tmp_path, matrix, shown):
+    """As phones write it: frames as the sensor lies, and how to turn and mirror them in the track's header."""
     image = smooth_image(48, 64)
     with VideoWriter(tmp_path / "a.mp4", 10, 64, 48) as video:
         video.write(image)
@@ -52,7 +63,7 @@ def test_a_video_that_was_filmed_upright_is_read_upright(tmp_path, matrix, quart
     (tmp_path / "a.mp4").write_bytes(stored)
     back = read_video(tmp_path / "a.mp4")
     (frame,) = back
-    upright = image.rot90(quarters)
+    upright = shown(image)
     assert frame.shape == (back.height, back.width, 3) == upright.shape and psnr(frame, upright) > 32
 
 
@@ -60,6 +71,12 @@ def test_sixteen_bits_of_grey_are_shown_as_eight(tmp_path):
     grey = np.linspace(0, 65535, 256).round().astype(np.uint16).reshape(16, 16)
     Image.fromarray(grey).save(tmp_path / "a.png")
     assert (read_image(tmp_path / "a.png")[..., 1] * 255).flatten().tolist() == pytest.approx(range(256), abs=0.01)
+
+
+def test_floats_are_refused_and_not_shown_as_black(tmp_path):
+    Image.fromarray(np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4)).save(tmp_path / "a.tif")
+    with pytest.raises(ValueError, match="a.tif .*its values are floats, of which nothing says what is white: store it with 8 or 16 bits"):
+        read_image(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("picture", [np.int32, ">u2"], ids=["I", "I;16B"])

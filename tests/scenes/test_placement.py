@@ -52,7 +52,9 @@ def test_yaw_is_optional(tmp_path):
     [
         ("", "must begin with the header"),
         ("t,x,y\n0,1,2\n", 'got "t,x,y"'),
-        ("time_s,x_m,y_m\n0,1,2\n", "at least 2"),
+        ("time_s,x_m,y_m\n0,1,2\n", "1 row below its header; a trajectory needs at least 2; what stands is put in by X,Y"),
+        ("time_s;x_m;y_m\n0;1,5;2\n1;2,5;2\n", "by commas, not by semicolons, and write decimals with a point"),
+        ("time_s\tx_m\ty_m\n0\t1\t2\n", "by commas, not by tabs"),
         ("time_s,x_m,y_m\n0,1,2\n1,2\n", "line 3: 2 values for 3 columns"),
         ("time_s,x_m,y_m\n0,1,2\n1,far,2\n", 'line 3: x_m is "far"'),
         ("time_s,x_m,y_m\n0,1,2\n1,nan,2\n", "line 3: x_m"),
@@ -67,7 +69,12 @@ def test_a_wrong_csv_names_line_and_fix(tmp_path, text, says):
     assert "t.csv" in str(error.value)
 
 
+def test_quotes_as_r_and_pandas_write_them_are_read(tmp_path):
+    (tmp_path / "t.csv").write_text('"time_s","x_m","y_m"\n"0","10",3\n1,15,3\n')
+    assert read_waypoints(tmp_path / "t.csv") == [Waypoint(0, 10, 3, None), Waypoint(1_000_000, 15, 3, None)]
+
+
 def test_a_binary_file_is_no_csv(tmp_path):
     (tmp_path / "t.csv").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(ValueError, match="not a text file"):
+    with pytest.raises(ValueError, match="not a text file in UTF-8; save it as that"):
         read_waypoints(tmp_path / "t.csv")

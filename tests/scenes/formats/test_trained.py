@@ -51,6 +51,18 @@ def test_comments_of_brush_and_postshot_are_understood(tmp_path, comments, antia
     assert model_of(tmp_path / "a.ply").antialias == antialias and len(load(tmp_path / "a.ply")) == 20
 
 
+def test_an_axis_that_brush_calls_vertical_is_told_where_z_is_taken_to_be_up(tmp_path):
+    save(gaussians(), tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    assert not open_view(tmp_path / "a.ply")[1]
+    for axis, told in (("y", True), ("z", False)):
+        (tmp_path / "b.ply").write_bytes(data.replace(b"element", f"comment Vertical axis: {axis}\nelement".encode(), 1))
+        warnings = open_view(tmp_path / "b.ply")[1]
+        assert bool(warnings) is told
+        assert not told or "its vertical axis is y, and z is taken to point up; give --up=-y" in warnings[0]
+        assert not open_view(tmp_path / "b.ply", up="-y")[1]
+
+
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_spz_has_it_as_a_bit(tmp_path, version):
     path = tmp_path / "a.spz"

@@ -1,0 +1,78 @@
+"""Two at once change one folder: one waits for the other."""
+
+import os
+import threading
+import time
+
+import pytest
+from street import car
+
+from scenes import Databank, load, save
+from scenes.alone import alone
+from scenes.edit import Edit
+from scenes.usd_edit import add_change, undone
+
+fcntl = pytest.importorskip("fcntl")
+
+
+def asked(folder, then):
+    """A thread that asks for the folder, and calls `then` when it has it."""
+
+    def run():
+        with alone(folder):
+            then()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_who_asks_second_waits_until_the_first_is_done_even_if_that_fails(tmp_path):
+    said = []
+    with pytest.raises(KeyError), alone(tmp_path), alone(tmp_path):  # nested by one thread
+        other = asked(tmp_path, lambda: said.append("second"))
+        time.sleep(0.2)
+        said.append("first")
+        raise KeyError
+    other.join(5)
+    assert said == ["first", "second"]
+
+
+def test_another_process_waits_too(tmp_path):
+    with alone(tmp_path):
+        handle = os.open(tmp_path, os.O_RDONLY)  # as another process has it
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(handle)
+
+
+def test_a_folder_that_is_not_there_holds_nobody_up(tmp_path):
+    with alone(tmp_path / "new"):
+        assert not (tmp_path / "new").exists()
+
+
+def test_edits_and_assets_wait_for_who_holds_their_folder(street, tmp_path):
+    save(street, tmp_path / "s")
+    bank = Databank(tmp_path / "bank")
+    bank.add(car())
+    track = street.actors[0].track
+
+    def undo():
+        with undone(tmp_path / "s", ["gone"]):
+            pass
+
+    works = [
+        ("s", lambda: add_change(tmp_path / "s", "gone", street, Edit(remove=(track,)), {"kind": "edit"})),
+        ("s", undo),
+        ("bank", lambda: bank.add(car())),
+    ]
+    for folder, work in works:
+        with alone(tmp_path / folder):
+            thread = threading.Thread(target=work)
+            thread.start()
+            thread.join(0.3)
+            assert thread.is_alive()
+        thread.join(30)
+        assert not thread.is_alive()
+    assert len(load(tmp_path / "s").actors) == len(street.actors) and len(bank.entries()) == 2
