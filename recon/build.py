@@ -211,9 +211,12 @@ def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
         return log
     with Progress("movers", total=len(sweeps)) as steps:
         found = with_movers(log, sweeps, steps.step)
-    count = len(found.tracks)
-    print(f"{log.path} has no boxes: its lidar shows {count} thing{'s that move' if count != 1 else ' that moves'}", file=sys.stderr)
+    print(f"{log.path} has no boxes: its lidar shows {_things(len(found.tracks))}", file=sys.stderr)
     return _moved_by(log, found.tracks)
+
+
+def _things(count: int) -> str:
+    return f"{count} thing{'s that move' if count != 1 else ' that moves'}"
 
 
 def _moved_by(log: Log, tracks: Sequence[Track]) -> Log:
@@ -294,6 +297,8 @@ def begin(
         coefficients = (config.sh_degree + 1) ** 2
         known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
         start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), sparse, known)
+    if sparse is not None and not log.tracks:
+        print(f"{log.path} has neither boxes nor lidar: its pictures show {_things(len(start.tracks))} along the street", file=sys.stderr)
     return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
 
 
@@ -352,7 +357,8 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
     darkest = min([1.0, *(float(r.gains.min()) for r in rig.values() if r.gains is not None)])
     sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, 1 / darkest)))
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
-    meta = {**log.meta, "parked": parked, **(extra or {})}
+    movers = {"movers": "found in pictures"} if actors and not log.tracks else {}
+    meta = {**log.meta, **movers, "parked": parked, **(extra or {})}
     scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
     return replace(scene, sky=seen_sky(scene.to(fit.device), fit.openings.hidden))
 

@@ -16,9 +16,10 @@ from recon.fit.swept import Swept
 from recon.frames import Frames
 from recon.ground import estimate_ground
 from recon.log import Log, SparsePoints, Sweep, Track
+from recon.movers.traffic import traffic
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
-from recon.seeds.dense import cloud_from_pictures
+from recon.seeds.dense import agreeing, cloud_from_pictures, points_of
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
@@ -86,14 +87,17 @@ def prepare(
     sweeps = log.sweeps_within(span_us)
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
     told = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
+    if sparse is not None:
+        agreed = agreeing(log, frames, sparse, estimate_ground(sparse.xyz, driven))
+        if not log.tracks:
+            movers = list(traffic(log, frames, estimate_ground(points_of(agreed), driven)))
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
     taken = _began(sweeps, split.static_sweep)
     report("colouring points")
     if sparse is not None:
-        ground = estimate_ground(sparse.xyz, driven)
         gains = np.ones((len(frames.names), 3)) if told is None else told
-        cloud, *measured = cloud_from_pictures(log, frames, sparse, ground, movers, gains)
+        cloud, *measured = cloud_from_pictures(log, frames, sparse, agreed, movers, gains)
         ground = estimate_ground(cloud.xyz, driven)
         beyond = Cloud.cat([])
     else:
@@ -107,9 +111,9 @@ def prepare(
         cloud = Cloud(split.static[known], rgb[known])
         report("measuring depth")
         struck = by_lidar(log, frames, sweeps, split, movers)
-        beyond, agreed = beyond_lidar(log, frames, struck, ground, movers, gains)
+        beyond, by_pictures = beyond_lidar(log, frames, struck, ground, movers, gains)
         everything = struck.completed(by_lidar_of_movers(log, frames, sweeps, split))
-        measured = [everything, by_all_sweeps(log, frames, split, movers).without(agreed), agreed]
+        measured = [everything, by_all_sweeps(log, frames, split, movers).without(by_pictures), by_pictures]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values()))

@@ -1,6 +1,7 @@
 """A made-up drive of two cameras without lidar towards a wall: ground and wall painted with blotches, so that every depth is known; and
 sweeps that a lidar would add to it."""
 
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -26,6 +27,10 @@ BOARD, AHEAD, STRIDE = 1.6, 9.0, 0.5
 """Side of a painted board that crosses the street, how far ahead of the first camera, and its metres a picture."""
 
 
+Rear = Callable[[float], tuple[float, float]]
+"""At seconds, how far ahead of the first camera and to its left a board's right edge is."""
+
+
 def board_left(index: int) -> float:
     """Where the board's right edge is when picture `index` is taken, in metres to the left of the first camera."""
     return -3.0 + STRIDE * index
@@ -40,17 +45,18 @@ def depth_of(camera: Camera) -> torch.Tensor:
     return torch.minimum(ground, wall)
 
 
-def _picture(camera: Camera, blotches: torch.Tensor, board: float | None) -> Packed:
-    """Both painted with blotches of a third of a metre, and the board, brighter, if there is one."""
+def _picture(camera: Camera, blotches: torch.Tensor, boards: list[tuple[float, float, float]]) -> Packed:
+    """Both painted with blotches of a third of a metre, and boards, brighter, so far ahead, with their right lower corners so far left and
+    up."""
     rays, depth = world_directions(camera).double(), depth_of(camera)
     eye = camera.world_from_cam[:3, 3]
     at = eye + rays * depth[..., None]
     plane = torch.where((at[..., 2] < 1e-6)[..., None], at[..., :2], at[..., 1:] + 50)
     image = _painted(blotches, plane)
-    if board is not None:
-        at = eye + rays * ((AHEAD - eye[0]) / rays[..., 0])[..., None]
-        plane = at[..., 1:] - torch.tensor([board, 0.3])
-        hit = ((plane > 0) & (plane < BOARD)).all(-1) & (rays[..., 0] > 0) & (eye[0] < AHEAD)
+    for ahead, left, up in boards:
+        at = eye + rays * ((ahead - eye[0]) / rays[..., 0])[..., None]
+        plane = at[..., 1:] - torch.tensor([left, up])
+        hit = ((plane > 0) & (plane < BOARD)).all(-1) & (rays[..., 0] > 0) & (eye[0] < ahead)
         image = torch.where(hit[..., None], 0.5 + 0.5 * _painted(blotches, plane + 20), image)
     buffer = BytesIO()
     Image.fromarray((image * 255).byte().numpy()).save(buffer, "png")
@@ -62,16 +68,20 @@ def _painted(blotches: torch.Tensor, plane: torch.Tensor) -> torch.Tensor:
     return found[0].permute(1, 2, 0)
 
 
-def drive(steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bool = False) -> Log:
-    """The drive whose pictures are taken after so many metres each."""
+def drive(
+    steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bool = False, rears: Sequence[Rear] = (), step_us: int = 100_000
+) -> Log:
+    """The drive whose pictures are taken after so many metres each, `step_us` apart. rears: boards that stand on the ground."""
     blotches = torch.rand(1, 3, 600, 600, generator=torch.Generator().manual_seed(0))
-    lens, times = Pinhole(160, 160, 160, 90), torch.arange(len(steps)) * 100_000
+    lens, times = Pinhole(160, 160, 160, 90), torch.arange(len(steps)) * step_us
     bodies = torch.stack([translation(x, x / 12, HEIGHT) for x in np.cumsum(steps)])
     cameras = {}
     for name in names:
         poses = bodies @ yaw(CAMERAS[name]) @ inverse(CAM_FROM_FLU)
         views = [Camera(lens, *SIZE, pose) for pose in poses]
-        pictures = tuple(_picture(v, blotches, board_left(i) if board else None) for i, v in enumerate(views))
+        crossing = [[(AHEAD, board_left(i), 0.3)] if board else [] for i in range(len(views))]
+        going = [[(*rear(float(t) / 1e6), 0.0) for rear in rears] for t in times]
+        pictures = tuple(_picture(v, blotches, a + b) for v, a, b in zip(views, crossing, going, strict=True))
         cameras[name] = LogCamera(name, lens, *SIZE, pictures, times, poses)
     return Log("bare", Path("bare"), cameras, (), (), Trajectory(times, bodies), {}, names)
 

@@ -1,1 +1,1 @@
-"""What moves in a drive that has no boxes, found in its lidar."""
+"""What moves in a drive that has no boxes, found in its lidar, or in its pictures where it has none."""

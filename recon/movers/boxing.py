@@ -64,9 +64,10 @@ def label(size: np.ndarray) -> str:
     return "car" if size[0] < 6 else "truck"
 
 
-def smoothed(times: np.ndarray, places: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Places `[K, 2]` at rising seconds `at` of places `[T, 2]` seen at rising `times`, by least squares with `PUSH` and `OFF`; what is
-    farther off than three times that pulls no harder (Huber 1964)."""
+def smoothed(times: np.ndarray, places: np.ndarray, at: np.ndarray, told: np.ndarray | None = None) -> np.ndarray:
+    """Places `[K, 2]` at rising seconds `at` of places `[T, 2]` seen at rising `times`, by least squares with `PUSH`; what is farther off
+    than three times what is likely pulls no harder (Huber 1964). told: how surely each place is known, inverse covariances `[T, 2, 2]`;
+    `OFF` every way where None."""
     knots = np.union1d(times, at)
     seen = np.searchsorted(knots, times)
     bend = np.zeros((max(len(knots) - 2, 0), len(knots)))
@@ -74,15 +75,17 @@ def smoothed(times: np.ndarray, places: np.ndarray, at: np.ndarray) -> np.ndarra
         half = (before + after) / 2
         # the force that bends the way, over the time that it has: white noise of the size PUSH a second
         bend[i, i : i + 3] = np.array([1 / before, -1 / before - 1 / after, 1 / after]) / half * np.sqrt(half) / PUSH
+    told = np.broadcast_to(np.eye(2) / OFF**2, (len(times), 2, 2)) if told is None else told
+    calm = (bend.T @ bend + 1e-9 * np.eye(len(knots)))[:, :, None, None] * np.eye(2)
     weight = np.ones(len(times))
     for _ in range(4):
-        matrix = bend.T @ bend
-        np.add.at(matrix, (seen, seen), weight / OFF**2)
-        right = np.zeros((len(knots), 2))
-        np.add.at(right, seen, weight[:, None] * places / OFF**2)
-        found = np.linalg.solve(matrix + 1e-9 * np.eye(len(knots)), right)
-        miss = np.linalg.norm(found[seen] - places, axis=1)
-        weight = np.minimum(1, 3 * OFF / np.maximum(miss, 1e-9))
+        matrix, right = calm.copy(), np.zeros((len(knots), 2))
+        np.add.at(matrix, (seen, seen), weight[:, None, None] * told)
+        np.add.at(right, seen, weight[:, None] * np.einsum("tij,tj->ti", told, places))
+        flat = matrix.swapaxes(1, 2).reshape(right.size, right.size)
+        found = np.linalg.solve(flat, right.ravel()).reshape(right.shape)
+        off = found[seen] - places
+        weight = np.minimum(1, 3 / np.sqrt(np.maximum(np.einsum("ti,tij,tj->t", off, told, off), 1e-9)))
     return found[np.searchsorted(knots, at)]
 
 

@@ -85,14 +85,14 @@ class Depths:
 
 
 def cloud_from_pictures(
-    log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track], gains: np.ndarray
+    log: Log, frames: Frames, sparse: SparsePoints, found: Sequence[Depths], movers: list[Track], gains: np.ndarray
 ) -> tuple[Cloud, Measured]:
-    """Points `[N, 3]` with colours where training pictures agree how far it is, and these depths.
+    """Points `[N, 3]` with colours where training pictures agree how far it is, as was `found` (`agreeing`), and these depths.
 
     gains: the cameras' exposures `[C, 3]`. Sky stays empty, and what the boxes of `movers` may hide. ValueError where no picture shows a
     point.
     """
-    found = believed(log, frames, sparse, ground, movers)
+    found = [own.only(_clear(own, movers)) for own in found]
     cloud = Cloud.cat([own.cloud(gains) for own in found])
     if len(cloud.xyz) < len(sparse.xyz):
         cloud = Cloud.cat([cloud, *_points_themselves(log, frames, sparse, movers, gains)])
@@ -108,8 +108,18 @@ def measured_by(found: Sequence[Depths], weight: float) -> Measured:
 
 def believed(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground, movers: list[Track]) -> list[Depths]:
     """Depths on which pictures agree, NaN in all other pixels, in the sky, and where the boxes of `movers` may hide what is there."""
+    return [own.only(_clear(own, movers)) for own in agreeing(log, frames, sparse, ground)]
+
+
+def agreeing(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
+    """Depths on which pictures agree, NaN in all other pixels."""
     found = depths(log, frames, sparse, ground)
-    return [own.only(mask & _clear(own, movers)) for own, mask in zip(found, agreed(found), strict=True)]
+    return [own.only(mask) for own, mask in zip(found, agreed(found), strict=True)]
+
+
+def points_of(found: Sequence[Depths]) -> np.ndarray:
+    """All that is known of them, `[N, 3]` in the world."""
+    return np.concatenate([np.zeros((0, 3)), *(own.points()[np.isfinite(own.depth)] for own in found)])
 
 
 def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: list[Track], gains: np.ndarray) -> list[Cloud]:

@@ -6,6 +6,7 @@ Plane sweep over inverse depth (Collins 1996), likeness by normalised cross-corr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +70,7 @@ class Plate:
 
     def contrast(self) -> np.ndarray:
         """Standard deviation `[h, w]` of the grey levels in the squares that are compared, noise taken off, in parts of their mean."""
-        mean, spread = _moments(self.grey[None])
+        mean, spread = moments(self.grey[None])
         return ((spread.square() - FLAT * FLAT).clamp_min(0).sqrt() / (mean + GREY).clamp_min(1))[0].numpy()
 
     def rays(self) -> torch.Tensor:
@@ -143,7 +144,7 @@ def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> t
     rays = plate.rays().contiguous()
     motions = [torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float() for other in others]
     rays_there = [(rays @ motion[:3, :3].T).movedim(2, 0) for motion in motions]
-    mean, spread = _moments(plate.grey[None])
+    mean, spread = moments(plate.grey[None])
     costs = torch.empty(h, w, len(inverse_depths))
     for k, part in enumerate(inverse_depths.split(CHUNK)):
         best = second = torch.full((len(part), h, w), 2.0)
@@ -154,8 +155,8 @@ def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> t
             v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
             grid = torch.stack([u, v], -1).clamp_(-3, 3)
             shown = F.grid_sample(other.grey[None, None].expand(len(part), -1, -1, -1), grid, align_corners=False)[:, 0]
-            their_mean, their_spread = _moments(shown)
-            unlike = 1 - (_box(shown * plate.grey) - mean * their_mean) / (spread * their_spread)
+            their_mean, their_spread = moments(shown)
+            unlike = 1 - (box_means(shown * plate.grey) - mean * their_mean) / (spread * their_spread)
             unlike = torch.where((torch.maximum(u.abs(), v.abs()) < 1) & (z > 0.1 * part[:, None, None]), unlike, UNSEEN)
             second = torch.minimum(second, torch.maximum(unlike, best))
             best = torch.minimum(unlike, best)
@@ -163,7 +164,7 @@ def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> t
     return costs
 
 
-def _box(maps: torch.Tensor) -> torch.Tensor:
+def box_means(maps: torch.Tensor) -> torch.Tensor:
     """Means over squares of `WINDOW` of maps `[N, h, w]`."""
     half = WINDOW // 2
     for axis in (1, 2):
@@ -176,10 +177,10 @@ def _box(maps: torch.Tensor) -> torch.Tensor:
     return maps.mul_(1 / WINDOW**2)
 
 
-def _moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Means and standard deviations over squares, the latter with noise."""
-    mean = _box(maps)
-    return mean, (_box(maps * maps) - mean * mean).clamp_min(0).add(FLAT * FLAT).sqrt()
+    mean = box_means(maps)
+    return mean, (box_means(maps * maps) - mean * mean).clamp_min(0).add(FLAT * FLAT).sqrt()
 
 
 def _pin(cost: torch.Tensor, plate: Plate, points: np.ndarray, step: float) -> None:
@@ -208,3 +209,30 @@ def _smoothed(cost: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
                 path = lines[i] + (reach - least)
                 sums[i] += path
     return total
+
+
+def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], rows: slice, depth: float | torch.Tensor) -> torch.Tensor:
+    """1 - correlation `[N, rows, w]` of a plate's rows, at a depth z or depths `[h, w]`, with others' where what they show has moved by any
+    of N ways `[N, 3]` in the world; the mean of each side, of the better one, since the other may not see it."""
+    own = plate.grey[None, rows]
+    local = plate.rays()[rows].movedim(-1, 0) * (depth if isinstance(depth, float) else depth[rows])
+    mean, spread = moments(own)
+    h, w = plate.grey.shape
+    of_sides = []
+    for side in sides:
+        total = count = torch.zeros(())
+        for other, ways in side:
+            there = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
+            moved = torch.from_numpy(ways @ other.cam_from_world[:3, :3].T).float() + there[:3, 3]
+            x, y, z = (there[:3, :3] @ local.flatten(1)).reshape(local.shape)[:, None] + moved.T[:, :, None, None]
+            behind = 1 / z.clamp_min(1e-3)
+            u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
+            v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
+            grid = torch.stack([u, v], -1).clamp_(-3, 3)
+            shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
+            their_mean, their_spread = moments(shown)
+            cost = 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread)
+            seen = (torch.maximum(u.abs(), v.abs()) < 1) & (z > 0.5)
+            total, count = total + torch.where(seen, cost, 0.0), count + seen
+        of_sides.append(torch.where(count > 0, total / count.clamp_min(1), UNSEEN))
+    return torch.stack(of_sides).amin(0)

@@ -16,7 +16,7 @@ from recon.frames import load_frames
 from recon.gains import picture_gains
 from recon.ground import estimate_ground
 from recon.readers.gauge import find_gauge, up_from_cameras
-from recon.seeds.dense import cloud_from_pictures
+from recon.seeds.dense import agreeing, cloud_from_pictures
 from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert
@@ -83,7 +83,8 @@ def test_metres_given_twice_or_to_a_log_that_has_them_are_refused(workspace, dri
 def test_points_stand_where_their_pictures_show_them(workspace):
     log = open_log(workspace, metres_per_unit=1 / UNIT)
     frames = load_frames(log, ["camera"], ALL, (96, 54), 0)
-    cloud, _ = cloud_from_pictures(log, frames, log.points, estimate_ground(log.points.xyz, log.ego), [], np.ones((2, 3)))
+    seen = agreeing(log, frames, log.points, estimate_ground(log.points.xyz, log.ego))
+    cloud, _ = cloud_from_pictures(log, frames, log.points, seen, [], np.ones((2, 3)))
     assert len(cloud.xyz) > 1000
     height = cloud.xyz[:, 2] + HEIGHT  # the road is flat and everything else above it
     assert np.quantile(height, 0.02) > -0.15 and (np.abs(height) < 0.15).mean() > 0.2

@@ -7,7 +7,7 @@ from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import SparsePoints, Track
 from recon.seeds import dense, stereo
-from recon.seeds.dense import DUG, _chosen, agreed, cloud_from_pictures, companions, depths, ground_depth
+from recon.seeds.dense import DUG, _chosen, agreed, agreeing, cloud_from_pictures, companions, depths, ground_depth
 from recon.seeds.stereo import plate_of
 from recon.seeds.triangulate import triangulated
 from scenes.camera import Camera
@@ -77,7 +77,7 @@ def test_what_moves_is_no_seed_and_what_stands_behind_it_is(plain, crossed):
     def beside(made):
         """How many seeds stand where the board was when any picture was taken, and how many on the wall."""
         log, frames, points, ground = made
-        cloud, _ = cloud_from_pictures(log, frames, points, ground, [], np.ones((2, 3)))
+        cloud, _ = cloud_from_pictures(log, frames, points, agreeing(log, frames, points, ground), [], np.ones((2, 3)))
         x, y, z = cloud.xyz.T
         path = (y > board_left(0)) & (y < board_left(len(STEPS)) + BOARD)
         board = path & (np.abs(x - AHEAD) < 0.5) & (z > 0.4) & (z < 1.8)
@@ -92,13 +92,14 @@ def test_seeds_keep_off_movers_and_the_sky(plain):
     log, frames, points, ground = plain
     ahead = translation(10.0, 0.0, 0.0).expand(9, 4, 4)
     car = Track("veh_1", "car", True, np.array([4.0, 2.0, 1.5]), np.arange(9) * 100_000, ahead, np.zeros(9), ())
-    free, kept = (cloud_from_pictures(log, frames, points, ground, movers, np.ones((2, 3)))[0] for movers in ([], [car]))
+    seen = agreeing(log, frames, points, ground)
+    free, kept = (cloud_from_pictures(log, frames, points, seen, movers, np.ones((2, 3)))[0] for movers in ([], [car]))
     assert 0.3 * len(free.xyz) < len(kept.xyz) < len(free.xyz) - 100
     assert (free.rgb >= 0).all() and (free.rgb <= 1).all() and free.xyz[:, 2].min() > -1
     for view in frames.views:
         view.sky[: len(view.sky) // 3] = True
     try:
-        assert cloud_from_pictures(log, frames, points, ground, [], np.ones((2, 3)))[0].xyz[:, 2].max() < free.xyz[:, 2].max() - 1
+        assert cloud_from_pictures(log, frames, points, seen, [], np.ones((2, 3)))[0].xyz[:, 2].max() < free.xyz[:, 2].max() - 1
     finally:
         for view in frames.views:
             view.sky[:] = False
@@ -209,5 +210,6 @@ def test_pictures_far_apart_and_few_begin_with_what_there_is():
         log = drive(steps, ("front",))
         frames = load_frames(log, ["front"], ALL, SIZE, 0)
         points = _exact(log, frames)
-        cloud, _ = cloud_from_pictures(log, frames, points, estimate_ground(points.xyz, log.ego), [], np.ones((2, 3)))
+        seen = agreeing(log, frames, points, estimate_ground(points.xyz, log.ego))
+        cloud, _ = cloud_from_pictures(log, frames, points, seen, [], np.ones((2, 3)))
         assert len(cloud.xyz) >= 300, steps

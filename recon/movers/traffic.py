@@ -1,0 +1,182 @@
+"""Traffic that pictures alone show: what moves along the street, followed from picture to picture, as boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+
+from recon.frames import Frames
+from recon.log import Log, Track
+from recon.movers.boxing import CAR, smoothed
+from recon.movers.sighting import Sighting, sightings
+from recon.seeds.stereo import Plate, plate_of
+from recon.tracks import named, upright
+from render.progress import Progress
+from scenes.ground import Ground
+
+GAPS_US = (200_000, 500_000)
+"""Before and after a picture, about when others were taken that it is compared with: within the first a car that comes is still in view,
+and must be there at all; by the second one that drives ahead has not become larger, though we drove on."""
+
+NEARLY = 0.6
+"""Part by which these may differ from that."""
+
+STRIDE = 1.0
+"""Metres between places of the body that tell where the street leads."""
+
+GATE = (1.0, 0.2), (0.6, 0.03), 5.0
+"""Metres, and parts of the distance, that a thing may be off where its speed takes it, along the street and across; and m/s that its speed
+may be."""
+
+LOST_US = 500_000
+"""How long after it was seen last a thing is given up."""
+
+PACE = 8
+"""Pictures over which its place and speed are taken."""
+
+FEWEST, SHARE = 6, 0.6
+"""Pictures that must show a thing for it to be believed, and the part of those taken meanwhile that must."""
+
+CLEARLY = 0.12, 0.08
+"""By how much it must look more alike than what stands still, and the ground before it than if it went on there, in half of them."""
+
+WENT = 3.0
+"""Metres that it must go."""
+
+KEPT, AT_LEAST = 0.5, 1.0
+"""Part of the speed that pictures tell, and metres a second at least, by which its places may have it go otherwise: what does not go where
+it seems to is something else."""
+
+OFF = 0.08, 0.012
+"""Parts of their distance by which places are off, along the line of sight and across."""
+
+BEYOND_US = 700_000
+"""How long before its first picture and after its last one it goes on, at the picture's border or far away."""
+
+SAME = (1.3, 1.0), 0.4
+"""Lengths and widths of a box within which another's middle belongs to the same thing, and the part of its time in which that must be."""
+
+HIGH = 1.55
+"""Metres up of a car, whose sizes all are taken to have: before a street that is far away nobody sees where its roof ends."""
+
+
+def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
+    """What moves along the street in the training pictures of the first camera of `frames`, as tracks at their moments.
+
+    Nothing where pictures do not follow one another soon (`GAPS_US`), or the recording car never goes, and nobody knows where the street
+    leads.
+    """
+    views = sorted(frames.of(0), key=lambda v: v.time_us)
+    times = np.array([v.time_us for v in views])
+    plates = [plate_of(v.image, frames.camera(log, v)) for v in views]
+    eyes = np.array([p.eye()[:2] for p in plates])
+    path = way_of(log.ego.world_from_body[:, :3, 3].numpy())
+    if len(path) < 2 or len(times) < FEWEST:
+        return ()
+    paces = np.linalg.norm(np.gradient(eyes, times / 1e6, axis=0), axis=1)
+    seen = []
+    with Progress("traffic", total=len(views)) as steps:
+        for i, plate in enumerate(plates):
+            seen.append(sightings(plate, int(times[i]), around(i, plates, times), ground, path, float(paces[i])))
+            steps.step()
+    return named(boxes(seen, times, eyes, ground), log.ego)
+
+
+def way_of(places: np.ndarray) -> np.ndarray:
+    """Those of places `[T, 3]` in the plane `[N, 2]` that are a `STRIDE` from the last one each."""
+    way = [places[0, :2]]
+    for place in places[1:, :2]:
+        if np.linalg.norm(place - way[-1]) > STRIDE:
+            way.append(place)
+    return np.array(way)
+
+
+def boxes(seen: list[list[Sighting]], times: np.ndarray, eyes: np.ndarray, ground: Ground) -> list[Track]:
+    """Tracks of what was seen in pictures at `times` `[T]` from `eyes` `[T, 2]`."""
+    followed = [f for f in follow(seen) if believed(f, times)]
+    made: list[Track] = []
+    for one in sorted(followed, key=lambda f: -sum(s.worth for s in f)):
+        track = boxed(one, times, eyes, ground)
+        if not any(_within(track, other) > SAME[1] for other in made):
+            made.append(track)
+    return made
+
+
+def around(i: int, plates: list[Plate], times: np.ndarray) -> list[list[tuple[Plate, int]]]:
+    """The plates before one, and those after it, that it is compared with, and their times."""
+    sides = []
+    for later in (-1, 1):
+        off = [np.abs(later * (times - times[i]) - gap) / gap for gap in GAPS_US]
+        if off[0].min() < NEARLY:
+            chosen = dict.fromkeys(int(o.argmin()) for o in off if o.min() < NEARLY)
+            sides.append([(plates[j], int(times[j])) for j in chosen])
+    return sides
+
+
+def follow(seen: list[list[Sighting]]) -> list[list[Sighting]]:
+    """Sightings of pictures in time order, by thing (assignment by least total distance, Kuhn 1955)."""
+    things: list[list[Sighting]] = []
+    for found in seen:
+        live = [t for t in things if found and found[0].time_us - t[-1].time_us <= LOST_US]
+        cost = np.array([[_apart(thing, s) for s in found] for thing in live]).reshape(len(live), len(found))
+        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < 3]
+        for i, j in pairs:
+            live[i].append(found[j])
+        taken = {j for _, j in pairs}
+        things += [[s] for j, s in enumerate(found) if j not in taken]
+    return things
+
+
+def _apart(thing: list[Sighting], s: Sighting) -> float:
+    """How far a sighting is from where a thing should be: the sum of what it is off in parts of what is allowed; 9 where that is more."""
+    last = thing[-PACE:]
+    speed = float(np.mean([k.speed for k in last]))
+    place = np.mean([k.place + k.along * speed * (s.time_us - k.time_us) / 1e6 for k in last], axis=0)
+    off = s.place - place
+    along, across = abs(off @ s.along), abs(off[1] * s.along[0] - off[0] * s.along[1])
+    parts = [along / (GATE[0][0] + GATE[0][1] * s.away), across / (GATE[1][0] + GATE[1][1] * s.away), abs(s.speed - speed) / GATE[2]]
+    return sum(parts) if max(parts) < 1 else 9.0
+
+
+def believed(thing: list[Sighting], times: np.ndarray) -> bool:
+    """Whether it is seen often enough, goes far enough, and goes where its speed takes it."""
+    between = ((times >= thing[0].time_us) & (times <= thing[-1].time_us)).sum()
+    if len(thing) < max(FEWEST, SHARE * between) or (np.median([(s.worth, s.grounded) for s in thing], axis=0) < CLEARLY).any():
+        return False
+    seconds = np.array([s.time_us for s in thing]) / 1e6
+    seconds -= seconds.mean()
+    steps = np.array([(s.place - thing[0].place) @ thing[0].along for s in thing])
+    told = float(np.median([s.speed for s in thing]))
+    went = float(np.polyfit(seconds, steps, 1)[0])
+    return bool(abs(told) * np.ptp(seconds) > WENT and abs(went - told) < max(KEPT * abs(told), AT_LEAST))
+
+
+def boxed(thing: list[Sighting], times: np.ndarray, eyes: np.ndarray, ground: Ground) -> Track:
+    """The box of a thing, a car's, at those of the pictures' `times` at which it is there."""
+    own = np.array([s.time_us for s in thing])
+    at = (times >= own[0] - BEYOND_US) & (times <= own[-1] + BEYOND_US)
+    stamps, places = times[at], np.stack([s.place for s in thing])
+    sight = places - eyes[np.searchsorted(times, own)]
+    away = np.linalg.norm(sight, axis=1)
+    axes = np.stack([sight, sight[:, ::-1] * [-1, 1]], 1) / away[:, None, None]
+    told = np.einsum("tki,tkj,tk->tij", axes, axes, 1 / np.outer(away, OFF) ** 2)
+    face = smoothed(own / 1e6, places, stamps / 1e6, told)
+    street = np.stack([np.interp(stamps, own, [s.along[k] for s in thing]) for k in (0, 1)], 1)
+    # what is seen of it is the end that looks at us; it may go past us after that
+    beyond = np.sign(np.median((street * (face - eyes[at])).sum(1)))
+    middle = face + street * beyond * CAR[0] / 2
+    ahead = street * np.sign(np.median([s.speed for s in thing]))
+    base = np.column_stack([middle, ground.height(torch.from_numpy(middle)).numpy()])
+    poses = upright(base, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])))
+    size = np.array([*CAR, HIGH])
+    return Track("", "car", True, size, stamps, poses, np.full(len(stamps), -1), (f"seen at {base[0].round(1).tolist()}",))
+
+
+def _within(track: Track, other: Track) -> float:
+    """Part of a track's time in which its middle lies in or beside the other's box."""
+    _, mine, its = np.intersect1d(track.times_us, other.times_us, return_indices=True)
+    back = torch.linalg.inv(other.world_from_box[its]).numpy()
+    place = track.world_from_box[mine, :3, 3].numpy()
+    local = np.einsum("nij,nj->ni", back[:, :2, :3], place) + back[:, :2, 3]
+    return float((np.abs(local) < other.size[:2] * SAME[0]).all(1).sum()) / len(track.times_us)
