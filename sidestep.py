@@ -25,7 +25,7 @@ from recon.commands import Assets, Recon
 from render.outputs import check_scene_outputs
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
-from scenes.opening import UsageError, check_device, fresh, open_scene, open_view, warn
+from scenes.opening import UsageError, check_device, fresh, open_scene, open_view
 from scenes.options import (
     Angle,
     Axis,
@@ -48,6 +48,7 @@ from scenes.options import (
     written,
 )
 from scenes.placement import Placement
+from scenes.warnings import warn
 
 if TYPE_CHECKING:
     from render.record import Stages

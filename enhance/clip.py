@@ -22,8 +22,8 @@ from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
 from render.video import Video, VideoWriter, odd_warning, read_video
-from scenes.opening import warn
 from scenes.scene import Scene
+from scenes.warnings import warn
 
 GUIDES = ("flow_prev", "instance", "need", "reference")
 """What an enhancer may go by beside the picture."""

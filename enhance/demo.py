@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scenes.atomic import atomic_folder
-from scenes.opening import fresh, open_scene, warn
+from scenes.opening import fresh, open_scene
 from scenes.options import Output, Overwrite
 from scenes.placement import parse_placement
+from scenes.warnings import warn
 
 if TYPE_CHECKING:
     import torch

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from scenes.opening import UsageError, dropped, fresh, open_scene, open_splats, warn
+from scenes.opening import UsageError, dropped, fresh, open_scene, open_splats
 from scenes.options import AnyPath, Flag, Name, Overwrite, Replacement, Retiming, ScenePath, Shift, Track
+from scenes.warnings import warn
 
 if TYPE_CHECKING:
     from scenes.usd_edit import Undone

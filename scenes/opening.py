@@ -1,9 +1,7 @@
-"""What several sub-commands do: refuse what stands, open a scene, warn."""
+"""What several sub-commands do: refuse what stands, open a scene."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -112,8 +110,3 @@ def _refuse(gaussians: Gaussians, where: str) -> Gaussians:
 
 def _kind(thing: Asset | Gaussians | Scene) -> str:
     return {"Asset": "an asset", "Gaussians": "splats"}[type(thing).__name__]
-
-
-def warn(lines: Sequence[str]) -> None:
-    for line in lines:
-        print(f"sidestep: warning: {line}", file=sys.stderr)

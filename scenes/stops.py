@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenes.opening import warn
+from scenes.warnings import warn
 
 
 class Stops:

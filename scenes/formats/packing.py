@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from scenes.gaussians import SH_COUNTS, Gaussians
-from scenes.opening import warn
+from scenes.warnings import warn
 
 LOGIT_LIMIT = 15.0  # opacities of 0 and 1 have no finite logit; here they are this far from it
 FLAT = -13.8  # log scale of an axis along which a splat has no extent at all: a micrometre
