@@ -13,6 +13,7 @@ from scenes.deformation import Lattice
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.ground import Ground
 from scenes.harmonics import brighter
+from scenes.lenses import Orthographic
 from scenes.names import unknown
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory, all_at
@@ -62,9 +63,9 @@ class Scene:
 
     def model_for(self, camera: Camera) -> SplatModel:
         """The scene's model for pictures of a camera, larger or smaller ones than the splats were fitted to: those of the rig's camera that
-        sees most nearly as wide an angle."""
-        fitted = [c for c in self.rig.values() if c.fitted]
-        if not fitted:
+        sees most nearly as wide an angle. As it is without perspective."""
+        fitted = [c for c in self.rig.values() if c.fitted and not isinstance(c.lens, Orthographic)]
+        if not fitted or isinstance(camera.lens, Orthographic):
             return self.model
         focal = max(camera.lens.focal())
         same = min(fitted, key=lambda c: abs(math.log(max(c.lens.focal()) / c.width * camera.width / focal)))

@@ -112,7 +112,8 @@ def _cut(asset: Asset, scene: Scene, view: _View, world_from_asset: torch.Tensor
     cut = _framed(looking_at(middle, eye, 1, 1), size, focal)
     cut = replace(cut, time_us=shot.time_us)
     there = replace(cut, world_from_cam=world_from_asset @ cut.world_from_cam)
-    frame, alone = render_frame(scene, there, ("depth", "instance")), rasterize(asset.gaussians, cut, ("alpha",), model=asset.model)
+    frame = render_frame(scene, there, ("depth", "instance"))
+    alone = rasterize(asset.gaussians, cut, ("alpha",), model=scene.model_for(there))
     assert frame.depth is not None and frame.instance is not None and isinstance(alone, Frame) and alone.alpha is not None
     rays = camera_rays(cut)
     points = (rays * frame.depth.cpu()[..., None]) @ cut.world_from_cam[:3, :3].T.float() + eye.float()

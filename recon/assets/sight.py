@@ -21,7 +21,7 @@ NEAREST = 0.5
 """Metres of the eye from the middle of a box at least: nearer, a camera is inside."""
 
 WIDTH = 160
-"""Pixels across the pictures in which is looked up what hides an object."""
+"""Pixels across the pictures in which is looked up what hides an object, at most."""
 
 BEFORE = 0.3
 """Metres that something must stand before the skin of a box to hide it, so that the object itself does not."""
@@ -68,7 +68,8 @@ class Views:
         """A camera as it stood, and its depth `[H, W]`, inf where nothing is."""
         if (name, time_us) not in self._seen:
             camera = self.scene.camera(name, time_us)
-            small = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+            width = min(WIDTH, camera.width)
+            small = camera.resized(width, max(1, round(width * camera.height / camera.width)))
             depth = render_frame(self.scene, small, ("median_depth",)).median_depth
             assert depth is not None
             self._seen[name, time_us] = small, depth.cpu()

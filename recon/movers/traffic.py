@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
@@ -12,12 +14,16 @@ from recon.movers.boxing import CAR, smoothed
 from recon.movers.sighting import Sighting, sightings
 from recon.seeds.stereo import Plate, plate_of
 from recon.tracks import named, upright
+from recon.view import View
 from render.progress import Progress
 from scenes.ground import Ground
 
 GAPS_US = (200_000, 500_000)
 """Before and after a picture, about when others were taken that it is compared with: within the first a car that comes is still in view,
 and must be there at all; by the second one that drives ahead has not become larger, though we drove on."""
+
+SOON_US = 80_000
+"""How soon after a picture the next is looked at, at most: a video's thirty a second would tell no more."""
 
 NEARLY = 0.6
 """Part by which these may differ from that."""
@@ -67,7 +73,7 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
     Nothing where pictures do not follow one another soon (`GAPS_US`), or the recording car never goes, and nobody knows where the street
     leads.
     """
-    views = sorted(frames.of(0), key=lambda v: v.time_us)
+    views = spaced(sorted(frames.of(0), key=lambda v: v.time_us))
     times = np.array([v.time_us for v in views])
     plates = [plate_of(v.image, frames.camera(log, v)) for v in views]
     eyes = np.array([p.eye()[:2] for p in plates])
@@ -81,6 +87,15 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
             seen.append(sightings(plate, int(times[i]), around(i, plates, times), ground, path, float(paces[i])))
             steps.step()
     return named(boxes(seen, times, eyes, ground), log.ego)
+
+
+def spaced(views: Sequence[View]) -> list[View]:
+    """Those of views in time order that are `SOON_US` apart."""
+    kept = list(views[:1])
+    for view in views[1:]:
+        if view.time_us - kept[-1].time_us >= SOON_US:
+            kept.append(view)
+    return kept
 
 
 def way_of(places: np.ndarray) -> np.ndarray:

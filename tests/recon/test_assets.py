@@ -137,6 +137,12 @@ def test_what_was_extracted_before_is_kept_and_not_doubled(parked_street, tmp_pa
     assert set(anew) - set(ids), "a car of another fit is another one"
 
 
+@pytest.fixture
+def sharp_street(parked_street):
+    """Fitted to pictures as large as its photos are."""
+    return replace(parked_street, rig={name: camera.resized(384, 216) for name, camera in parked_street.rig.items()})
+
+
 def _shots(scene):
     """What the scene's cameras see, twice as bright as it is: its photos, in other light."""
 
@@ -147,11 +153,11 @@ def _shots(scene):
     return [Shot(c, partial(taken, c)) for c in cameras]
 
 
-def test_assets_keep_photos_of_themselves_alone(parked_street):
+def test_assets_keep_photos_of_themselves_alone(sharp_street):
     """Of the mover and of the parked car: each photo shows the asset where its own splats are, and nothing where they are not."""
-    shots, found = _shots(parked_street), {c.track: c for c in candidates(parked_street)}
+    shots, found = _shots(sharp_street), {c.track: c for c in candidates(sharp_street)}
     for track in ("veh_1", "veh_7"):
-        photos = found[track].photos(parked_street, shots)
+        photos = found[track].photos(sharp_street, shots)
         assert photos, track
         asset = found[track].asset
         for photo in photos:
@@ -173,19 +179,19 @@ def test_photos_of_one_direction_are_few_and_apart(parked_street):
     assert max(sectors.values()) == 1  # all were taken within a second
 
 
-def test_what_hides_an_object_is_no_photo_of_it(parked_street):
-    (parked,) = [c for c in candidates(parked_street) if c.track == "veh_7"]
+def test_what_hides_an_object_is_no_photo_of_it(sharp_street):
+    (parked,) = [c for c in candidates(sharp_street) if c.track == "veh_7"]
     wall = box((0.3, 6.0, 4.0), (0.9, 0.9, 0.2))
     wall = replace(wall, means=wall.means + torch.tensor([5.5, 3.5, 0.0]))
-    background = replace(parked_street.background, gaussians=Gaussians.cat([parked_street.background.gaussians, wall]))
-    hidden = replace(parked_street, background=background)
+    background = replace(sharp_street.background, gaussians=Gaussians.cat([sharp_street.background.gaussians, wall]))
+    hidden = replace(sharp_street, background=background)
     front = [s for s in _shots(hidden) if s.camera.world_from_cam[0, 3] < 5]
     photos = parked.photos(hidden, front)
     for photo in photos:  # from beside the wall some of it may be seen, but never the wall
         pixels = torch.from_numpy(photo.read())
         yellow = (pixels[..., 0] > 200) & (pixels[..., 1] > 200) & (pixels[..., 2] < 150)
         assert yellow.sum() < 0.02 * (pixels[..., 3] == 255).sum()
-    assert len(photos) < len(parked.photos(parked_street, front))
+    assert len(photos) < len(parked.photos(sharp_street, front))
 
 
 def test_what_bends_on_its_way_has_no_photos(parked_street):

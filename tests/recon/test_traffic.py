@@ -10,7 +10,7 @@ from recon.frames import load_frames
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.sighting import Sighting
-from recon.movers.traffic import around, believed, boxes, traffic
+from recon.movers.traffic import around, believed, boxes, spaced, traffic
 from recon.seeds import stereo
 from scenes.ground import Ground
 
@@ -62,6 +62,17 @@ def test_nothing_is_found_where_nothing_moves():
 def test_pictures_that_follow_one_another_late_and_a_car_that_never_goes_tell_nothing():
     assert found(lambda seconds: (9 + 7.5 * seconds, -0.5), step_us=500_000) == ()
     assert found(lambda seconds: (9 + 7.5 * seconds, -0.5), steps=[0.0] * 9) == ()
+
+
+def test_of_a_fast_video_every_few_pictures_are_looked_at():
+    class At:
+        def __init__(self, time_us):
+            self.time_us = time_us
+
+    times = [view.time_us for view in spaced([At(33_333 * k) for k in range(31)])]
+    assert np.diff(times).min() >= 80_000 and np.diff(times).max() <= 100_000 and times[0] == 0
+    assert [view.time_us for view in spaced([At(100_000 * k) for k in range(5)])] == [0, 100_000, 200_000, 300_000, 400_000]
+    assert spaced([]) == []
 
 
 def sighted(time_us: int, x: float, speed: float, y: float = 0.0) -> Sighting:
