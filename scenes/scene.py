@@ -18,6 +18,9 @@ from scenes.names import unknown
 from scenes.sky import Sky
 from scenes.trajectory import Trajectory, all_at
 
+ALIKE = 0.1
+"""Part by which angles of view may differ that are taken for the same."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -63,13 +66,15 @@ class Scene:
 
     def model_for(self, camera: Camera) -> SplatModel:
         """The scene's model for pictures of a camera, larger or smaller ones than the splats were fitted to: those of the rig's camera that
-        sees most nearly as wide an angle. As it is without perspective."""
+        sees most nearly as wide an angle. As it is without perspective, and for larger ones of another angle: what they show was fitted to
+        from elsewhere, nearer by."""
         fitted = [c for c in self.rig.values() if c.fitted and not isinstance(c.lens, Orthographic)]
         if not fitted or isinstance(camera.lens, Orthographic):
             return self.model
-        focal = max(camera.lens.focal())
-        same = min(fitted, key=lambda c: abs(math.log(max(c.lens.focal()) / c.width * camera.width / focal)))
-        return self.model.at_scale(float(focal / max(same.lens.focal())))
+        focal, narrow = max(camera.lens.focal()), max(camera.lens.focal()) / camera.width
+        angle, same = min(((abs(math.log(max(c.lens.focal()) / c.width / narrow)), c) for c in fitted), key=lambda pair: pair[0])
+        scale = float(focal / max(same.lens.focal()))
+        return self.model.at_scale(scale if angle < ALIKE else min(scale, 1.0))
 
     def frame_times(self, name: str) -> torch.Tensor:
         """When the named camera took its frames, int64 `[F]`; the body's times where the log does not say."""

@@ -84,6 +84,14 @@ def test_a_camera_of_nobodys_is_as_that_of_the_rig_that_sees_as_wide_an_angle(dr
     assert drive.model_for(own).smoothing == pytest.approx(0.1 * 15 / 16)
 
 
+def test_a_larger_picture_of_another_angle_is_drawn_as_trained(drive, camera):
+    """Of what a telephoto lens shows from afar other cameras were near."""
+    focal = 3 * max(camera.lens.focal())
+    assert drive.model_for(replace(camera, lens=Pinhole(focal, focal, 320, 180))) == drive.model
+    small = replace(camera, lens=Pinhole(focal / 6, focal / 6, 53, 30), width=107, height=60)
+    assert drive.model_for(small).dilation == pytest.approx(0.3 / 4)
+
+
 def test_a_smoothing_below_none_is_refused():
     with pytest.raises(ValueError, match="smoothing must be at least 0 px.2 and finite"):
         SplatModel(smoothing=-0.1)
