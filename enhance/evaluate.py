@@ -212,8 +212,8 @@ def _told(shards: Sequence[Shard]) -> list[Frame]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips, where
-    there are several."""
+    """The rows in Markdown; gains over identity in the region with their 95 percent interval over clips, where there are
+    several."""
     measures = ["PSNR in the region", "gain, dB (95 %)", "PSNR of the frame", "SSIM region / frame", "features", "warp error", "sharpness"]
     names = ["damage", "method", *measures, "ms"]
     lines = [f"| {' | '.join(names)} |", "|" + len(names) * "---|"]

@@ -44,7 +44,6 @@ STRIDE = 8
 OFTEN = 0.9
 """Part of the photos whose excess of grain over others is usual."""
 
-
 GREY = 2 / 255
 """Most by which a grey photo's channels differ."""
 

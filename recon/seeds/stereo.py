@@ -70,7 +70,7 @@ class Plate:
 
     def contrast(self) -> np.ndarray:
         """Standard deviation `[h, w]` of the grey levels in the squares that are compared, noise taken off, in parts of their mean."""
-        mean, spread = moments(self.grey[None])
+        mean, spread = _moments(self.grey[None])
         return ((spread.square() - FLAT * FLAT).clamp_min(0).sqrt() / (mean + GREY).clamp_min(1))[0].numpy()
 
     def rays(self) -> torch.Tensor:
@@ -144,24 +144,33 @@ def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> t
     rays = plate.rays().contiguous()
     motions = [torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float() for other in others]
     rays_there = [(rays @ motion[:3, :3].T).movedim(2, 0) for motion in motions]
-    mean, spread = moments(plate.grey[None])
+    mean, spread = _moments(plate.grey[None])
     costs = torch.empty(h, w, len(inverse_depths))
     for k, part in enumerate(inverse_depths.split(CHUNK)):
         best = second = torch.full((len(part), h, w), 2.0)
         for other, motion, turned in zip(others, motions, rays_there, strict=True):
             x, y, z = (turned[axis] + part[:, None, None] * motion[axis, 3] for axis in range(3))
-            behind = 1 / z.clamp_min(1e-3)
-            u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
-            v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
-            grid = torch.stack([u, v], -1).clamp_(-3, 3)
-            shown = F.grid_sample(other.grey[None, None].expand(len(part), -1, -1, -1), grid, align_corners=False)[:, 0]
-            their_mean, their_spread = moments(shown)
-            unlike = 1 - (box_means(shown * plate.grey) - mean * their_mean) / (spread * their_spread)
-            unlike = torch.where((torch.maximum(u.abs(), v.abs()) < 1) & (z > 0.1 * part[:, None, None]), unlike, UNSEEN)
-            second = torch.minimum(second, torch.maximum(unlike, best))
-            best = torch.minimum(unlike, best)
+            cost, inside = _compared(plate.grey, mean, spread, other, x, y, z)
+            cost = torch.where(inside & (z > 0.1 * part[:, None, None]), cost, UNSEEN)
+            second = torch.minimum(second, torch.maximum(cost, best))
+            best = torch.minimum(cost, best)
         costs[..., CHUNK * k : CHUNK * k + len(part)] = (best if len(others) < 3 else (best + second) / 2).permute(1, 2, 0)
     return costs
+
+
+def _compared(
+    own: torch.Tensor, mean: torch.Tensor, spread: torch.Tensor, other: Plate, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """1 - correlation of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]` before it, and whether
+    these are in its view."""
+    h, w = other.grey.shape
+    behind = 1 / z.clamp_min(1e-3)
+    u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
+    v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
+    grid = torch.stack([u, v], -1).clamp_(-3, 3)
+    shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
+    their_mean, their_spread = _moments(shown)
+    return 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
 
 
 def box_means(maps: torch.Tensor) -> torch.Tensor:
@@ -177,7 +186,7 @@ def box_means(maps: torch.Tensor) -> torch.Tensor:
     return maps.mul_(1 / WINDOW**2)
 
 
-def moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Means and standard deviations over squares, the latter with noise."""
     mean = box_means(maps)
     return mean, (box_means(maps * maps) - mean * mean).clamp_min(0).add(FLAT * FLAT).sqrt()
@@ -216,8 +225,7 @@ def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], ro
     of N ways `[N, 3]` in the world; the mean of each side, of the better one, since the other may not see it."""
     own = plate.grey[None, rows]
     local = plate.rays()[rows].movedim(-1, 0) * (depth if isinstance(depth, float) else depth[rows])
-    mean, spread = moments(own)
-    h, w = plate.grey.shape
+    mean, spread = _moments(own)
     of_sides = []
     for side in sides:
         total = count = torch.zeros(())
@@ -225,14 +233,8 @@ def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], ro
             there = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
             moved = torch.from_numpy(ways @ other.cam_from_world[:3, :3].T).float() + there[:3, 3]
             x, y, z = (there[:3, :3] @ local.flatten(1)).reshape(local.shape)[:, None] + moved.T[:, :, None, None]
-            behind = 1 / z.clamp_min(1e-3)
-            u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
-            v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
-            grid = torch.stack([u, v], -1).clamp_(-3, 3)
-            shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
-            their_mean, their_spread = moments(shown)
-            cost = 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread)
-            seen = (torch.maximum(u.abs(), v.abs()) < 1) & (z > 0.5)
+            cost, inside = _compared(own, mean, spread, other, x, y, z)
+            seen = inside & (z > 0.5)
             total, count = total + torch.where(seen, cost, 0.0), count + seen
         of_sides.append(torch.where(count > 0, total / count.clamp_min(1), UNSEEN))
     return torch.stack(of_sides).amin(0)

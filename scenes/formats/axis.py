@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from scenes.formats import COMPRESSED_PLY, PLY, found
+from scenes.formats.ply import last_comment
 
 _COMMENT = re.compile(rb"^comment[ \t]+vertical axis:[ \t]*([xyz])\b", re.MULTILINE | re.IGNORECASE)
 
@@ -15,9 +16,7 @@ def axis_warning(path: Path) -> list[str]:
     of the axis is up. The file was read before, and is whole."""
     if found(path) not in (PLY, COMPRESSED_PLY):
         return []
-    with open(path, "rb") as file:
-        said = _COMMENT.findall(file.read(1 << 16).partition(b"\nend_header")[0])
-    axis = said[-1].decode().lower() if said else "z"
+    axis = (last_comment(path, _COMMENT) or b"z").decode().lower()
     if axis == "z":
         return []
     return [f"{path} says that its vertical axis is {axis}, and z is taken to point up; give --up=-{axis}, as most have it, or --up={axis}"]

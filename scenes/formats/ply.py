@@ -10,6 +10,7 @@ infinite. It maps the file: what the header claims is checked against its size b
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,6 +119,13 @@ def save_ply(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = Fa
     with atomic_file(path) as partial, open(partial, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(torch.cat(parts, 1).numpy().astype("<f4", copy=False).data)
+
+
+def last_comment(path: Path, pattern: re.Pattern[bytes]) -> bytes | None:
+    """What the last comment line of a whole file says that a pattern of one group finds; None where none does."""
+    with open(path, "rb") as file:
+        said = pattern.findall(file.read(1 << 16).partition(b"\nend_header")[0])
+    return said[-1] if said else None
 
 
 def read_header(path: Path) -> tuple[str, list[Element], int]:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from scenes.formats import COMPRESSED_PLY, PLY, SOG, SPZ, USD, found
+from scenes.formats.ply import last_comment
 from scenes.gaussians import SplatModel
 
 _COMMENT = re.compile(
@@ -36,6 +37,5 @@ def model_of(path: Path) -> SplatModel:
 
 
 def _commented(path: Path) -> bool:
-    with open(path, "rb") as file:
-        said = _COMMENT.findall(file.read(1 << 16).partition(b"\nend_header")[0])
-    return bool(said) and said[-1].lower().endswith((b"mip", b"1"))
+    said = last_comment(path, _COMMENT)
+    return said is not None and said.lower().endswith((b"mip", b"1"))

@@ -26,27 +26,31 @@ def camera(drive):
     return drive.camera("front_camera", int(drive.frame_times("front_camera")[40]))
 
 
+@pytest.fixture(scope="module")
+def unaware(drive):
+    """The same, of which nobody knows what it was fitted to."""
+    return replace(drive, rig={name: replace(c, fitted=False) for name, c in drive.rig.items()})
+
+
 def shown(scene: Scene, camera, size: tuple[int, int]) -> torch.Tensor:
     return render_frame(scene, camera.resized(*size)).rgb.clamp(0, 1)
 
 
 @pytest.mark.parametrize(("shrink", "least", "at_most_plain"), [(2, 32, 28), (4, 31, 25), (8, 29, 23)])
-def test_a_smaller_picture_is_what_the_fitted_one_shows_in_each_of_its_pixels(drive, camera, shrink, least, at_most_plain):
+def test_a_smaller_picture_is_what_the_fitted_one_shows_in_each_of_its_pixels(drive, unaware, camera, shrink, least, at_most_plain):
     """Against the mean of the fitted size's pixels; splats widened by as many pixels as there are far from it."""
     width, height = camera.width // shrink, camera.height // shrink
     whole = shown(drive, camera, (camera.width, camera.height))
     mean = torch.nn.functional.adaptive_avg_pool2d(whole.permute(2, 0, 1)[None], (height, width))[0].permute(1, 2, 0)
-    unaware = replace(drive, rig={name: replace(c, fitted=False) for name, c in drive.rig.items()})
     assert psnr(shown(drive, camera, (width, height)), mean) > least
     assert psnr(shown(unaware, camera, (width, height)), mean) < at_most_plain
 
 
-def test_a_larger_picture_has_no_gaps_between_splats(drive, camera):
+def test_a_larger_picture_has_no_gaps_between_splats(drive, unaware, camera):
     """Three times as large, its pixels' means are the fitted picture, whose splats reached as far into each other."""
     whole = shown(drive, camera, (camera.width, camera.height))
     large = shown(drive, camera, (3 * camera.width, 3 * camera.height))
     mean = torch.nn.functional.avg_pool2d(large.permute(2, 0, 1)[None], 3)[0].permute(1, 2, 0)
-    unaware = replace(drive, rig={name: replace(c, fitted=False) for name, c in drive.rig.items()})
     thin = torch.nn.functional.avg_pool2d(shown(unaware, camera, (3 * camera.width, 3 * camera.height)).permute(2, 0, 1)[None], 3)[0]
     assert psnr(mean, whole) > psnr(thin.permute(1, 2, 0), whole) + 3
 
