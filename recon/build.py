@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +70,9 @@ metres a second), and are fitted as a drive's."""
 
 DROP = 0.2
 """Part of the splats that a step leaves out where photos stand steps apart."""
+
+DARK = 0.05
+"""Part of the light below which no camera's exposure is taken to fall: an affine one may say anything of colours that it never met."""
 
 
 def reconstruct(
@@ -353,14 +356,23 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         for t in log.tracks
         if not t.moving and t.name.startswith("veh")
     ]
-    # the darkest picture clips what is brighter than this
-    darkest = min([1.0, *(float(r.gains.min()) for r in rig.values() if r.gains is not None)])
-    sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, 1 / darkest)))
+    sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, brightest(rig.values()))))
     background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
     movers = {"movers": "found in pictures"} if actors and not log.tracks else {}
     meta = {**log.meta, **movers, "parked": parked, **(extra or {})}
     scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
     return replace(scene, sky=seen_sky(scene.to(fit.device), fit.openings.hidden))
+
+
+def brightest(rig: Iterable[RigCamera]) -> float:
+    """What a scene may show at most, in the colours of its first camera: the darkest picture that any camera took shows it as 1, and clips
+    what is brighter."""
+    most = 1.0
+    for camera in rig:
+        gain, offset = camera.exposure[:, :3].sum(1), camera.exposure[:, 3]
+        frames = torch.ones(1, 3) if camera.gains is None else camera.gains
+        most = max(most, float(((1 / frames - offset) / gain.clamp_min(DARK)).max()))
+    return most
 
 
 def middle_pose(track: Track) -> torch.Tensor:

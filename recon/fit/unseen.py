@@ -86,7 +86,8 @@ def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground:
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
     """Give splats at whose colours pictures have `pulled`, bool `[N]`, but which none shows to `SEEN`, by the largest `part` `[N]` of each
     in any picture, the colours of their group's nearest others, in place. Returns which these are, bool `[N]`; of groups without any other
-    none.
+    none. These colours do not turn with the view: how others look from where they were seen says nothing of a place that nobody saw, and a
+    mean of harmonics turns white and brown to yellow there.
 
     What is hidden of the street, pulled at or not, takes the middle colour of the street around, channel by channel, cell by cell.
     """
@@ -102,7 +103,8 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
         mine = known & (group == i)
         if mine.sum() >= NEIGHBOURS:
             which = pulled & hidden & (group == i) & ~unknown
-            _colour(splats, which, means[mine], sh[mine], NEIGHBOURS, lambda found, share: (found * share).sum(1))
+            steady = torch.cat([sh[mine, :1], torch.zeros_like(sh[mine, 1:])], 1)
+            _colour(splats, which, means[mine], steady, NEIGHBOURS, lambda found, share: (found * share).sum(1))
             unknown |= which
     return unknown
 

@@ -14,7 +14,7 @@ from PIL import Image
 from recon import open_log, reconstruct, stopped_early
 from recon.actors import split_points
 from recon.align import moved
-from recon.build import _span, begin, choose
+from recon.build import _span, assemble, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
 from recon.fit.config import FitConfig
@@ -33,7 +33,7 @@ from render.compare import psnr
 from render.rays import world_directions
 from scenes import Scene, load
 from scenes.poses import inverse, translation
-from scenes.sky import sample_equirect
+from scenes.sky import sample_equirect, srgb_from_linear
 from scenes.trajectory import Trajectory
 from tests.bench.presets import random_splats
 
@@ -343,6 +343,23 @@ def test_at_night_a_sky_that_nothing_shows_does_not_shine(own_drive):
     start, fit = begin(log, names, span, SIZE, CONFIG, 4)
     assert max(float(v.image.float().mean()) for v in fit.training) / 255 < 0.1
     assert start.sky.max() < 0.15
+
+
+def test_a_sky_as_bright_as_the_darkest_camera_tells_is_kept(drive):
+    """The sun is white in every picture but in those of a camera that is exposed half as long."""
+    log = open_log(drive)
+    names, span = choose(log)
+    start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    with torch.no_grad():
+        fit.sky.fill_(1.9)
+        fit.exposures[:, :, :3] = torch.eye(3)
+    assert float(srgb_from_linear(assemble(fit, start, log).sky.linear).max()) == pytest.approx(1, abs=1e-3)
+    with torch.no_grad():
+        fit.exposures[-1, :, :3] = 0.5 * torch.eye(3)
+    scene = assemble(fit, start, log)
+    camera = scene.camera(names[-1], span[0])
+    upwards = translation(*camera.world_from_cam[:3, 3].tolist())
+    assert float(render_frame(scene, replace(camera, world_from_cam=upwards)).rgb.median()) == pytest.approx(0.95, abs=0.01)
 
 
 def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive):
