@@ -23,6 +23,7 @@ from recon.seeds.dense import agreeing, cloud_from_pictures, points_of
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
+from recon.seeds.shade import shade
 from recon.seeds.standing import by_all_sweeps
 from recon.skies import SkyPicture, like_sky
 from recon.view import View
@@ -125,7 +126,8 @@ def prepare(
         points, index = split.actors.get(track.name, (np.zeros((0, 3)), np.zeros(0, np.int64)))
         made = _actor(log, frames, track, points, _began(sweeps, index), gains, sh_count, min(most, MOST_OF_ONE))
         if len(made):
-            groups.append(made)
+            below = shade(track, ground, sh_count) if track.label not in LIMBED else Gaussians.empty(sh_count)
+            groups.append(Gaussians.cat([made, below]))
             tracks.append(track)
             middle = track.world_from_box[:, :3, 3].numpy()
             near = max(2.0, float(path.query(middle)[0].min()) - float(track.size[0]) / 2)

@@ -1,0 +1,43 @@
+"""The shade that a mover takes along: what it keeps from the ground below and beside it, which no splat of a road that it drives over can
+show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from recon.log import Track
+from scenes.gaussians import Gaussians
+from scenes.ground import Ground
+from scenes.harmonics import sh_from_rgb
+
+SPACING, WIDE = 0.4, 0.6
+"""Metres between its splats, and the standard deviation of one along the ground, in spacings."""
+
+BESIDE = 0.8
+"""Metres beyond the box that it reaches."""
+
+ABOVE, THICK = 0.02, 0.01
+"""Metres above the ground in which it lies, and its thickness: it must be drawn over the road."""
+
+BLACK, LOGIT = 0.02, -2.2
+"""Its colour and the logit of its opacity. What the pictures do not hold up fades (`FADE` in `recon/fit/fit.py`)."""
+
+
+def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
+    """Flat, dark, thin splats in a track's frame, on the ground under its box and around it."""
+    at = track.world_from_box[:, :3, 3]
+    height = float((ground.height(at[:, :2].float()).double() - at[:, 2]).median()) + ABOVE
+    half = track.size[:2] / 2 + BESIDE
+    x, y = (np.linspace(-h, h, max(2, round(2 * h / SPACING) + 1)) for h in half)
+    xy = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+    n = len(xy)
+    sh = torch.zeros(n, sh_count, 3)
+    sh[:, 0] = sh_from_rgb(BLACK)
+    return Gaussians(
+        torch.from_numpy(np.column_stack([xy, np.full(n, height)])).float(),
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        torch.tensor([WIDE * SPACING, WIDE * SPACING, THICK]).log().repeat(n, 1),
+        torch.full((n,), LOGIT),
+        sh,
+    )
