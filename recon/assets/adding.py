@@ -18,10 +18,13 @@ from scenes.formats.axis import loaded_axis
 from scenes.formats.trained import model_of
 from scenes.gaussians import Gaussians
 from scenes.report import validate
-from scenes.sizes import odd_size
+from scenes.sizes import SHEET, odd_size
 
 OUTLIERS = 0.002
 """Part of the opacity of splats, on either side of an axis, that their box leaves out: floaters are not part of a thing."""
+
+THINNEST = 1e-3
+"""Metres that every side of an asset's box has, if its splats lie in a plane."""
 
 OFF = 0.12
 """Part of an asset's size by which its splats' box may differ from it before it counts as misplaced."""
@@ -64,7 +67,11 @@ def add_splats(
     low, high = solid_box(upright)
     base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
     asset = Asset(
-        replace(upright, means=upright.means - base), (high - low).double(), label, model_of(file), {**share, "source": file.name}
+        replace(upright, means=upright.means - base),
+        (high - low).double().clamp_min(THINNEST),
+        label,
+        model_of(file),
+        {**share, "source": file.name},
     )
     _check_size(file, label, asset.size.tolist(), scale or metres, force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
@@ -149,9 +156,9 @@ def _misplaced(asset: Asset) -> str:
         where = " to ".join("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (low, high))
         size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
         return f"has splats at {where} m, {out:.2f} m outside its box of {size}: its origin or axes are wrong"
-    filled = [(hi - lo) / v for lo, hi, v in zip(low, high, (length, width, height), strict=True)]
-    if min(filled[0], filled[2]) < 0.5:
-        return f"has splats that fill {min(filled[0], filled[2]):.0%} of its box: its scale or axes are wrong"
+    filled = [(high[i] - low[i]) / size for i, size in ((0, length), (2, height)) if size > SHEET]
+    if min(filled, default=1.0) < 0.5:
+        return f"has splats that fill {min(filled):.0%} of its box: its scale or axes are wrong"
     return ""
 
 

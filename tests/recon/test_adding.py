@@ -99,6 +99,22 @@ def test_things_in_the_middle_of_their_class_are_not_odd(label):
     assert odd_size(label, [(a * b) ** 0.5 for a, b in SIZES[label]]) == ""
 
 
+@pytest.mark.parametrize("size", [(0.002, 0.75, 2.5), (0.75, 1e-3, 0.75)])
+def test_a_sheet_is_no_odd_sign_but_a_tiny_or_a_flat_lying_one_is(size):
+    assert odd_size("sign", size) == odd_size("board", size) == ""
+    assert "in millimetres" in odd_size("sign", [1000 * v for v in size])
+    assert "in kilometres" in odd_size("sign", [v / 1000 for v in size]) and odd_size("car", [0.002, 1.8, 1.5])
+    assert "on its side" in odd_size("sign", (0.75, 2.0, 1e-3))
+
+
+def test_splats_in_a_plane_become_a_sign(tmp_path):
+    """Whose box has some thickness all the same, and in which nothing is missing."""
+    flat = box((1.0, 0.8, 2.0), (0.8, 0.2, 0.1))
+    save(replace(flat, means=flat.means * torch.tensor([0.0, 1.0, 1.0])), tmp_path / "sign.ply")
+    id, said = add_splats(tmp_path / "bank", tmp_path / "sign.ply", "sign", None, "z", "x", {})
+    assert "0.00 m long, 0.80 m wide, 2.00 m high" in said and check_databank(tmp_path / "bank") == []
+
+
 def test_a_class_is_known_however_it_is_written():
     assert "a Car has" in odd_size("Car", [24, 11, 8.6]) and odd_size("CAR", [4.5, 1.8, 1.5]) == ""
 
