@@ -169,9 +169,9 @@ class Databank:
         ValueError where a file has its name, where the index is corrupt, or is lost and an asset's own entry is corrupt; PermissionError
         where it takes no files.
         """
-        if self.path.is_file():
+        if (file := next((f for f in (self.path, *self.path.parents) if f.is_file()), None)) is not None:
             fix = "give another name with --databank"
-            raise ValueError(f"{self.path} is a file; a databank is a folder, and made where there is none: {fix}")
+            raise ValueError(f"{file} is a file; a databank is a folder, and made where there is none: {fix}")
         there = next(folder for folder in (self.path, *self.path.absolute().parents) if folder.is_dir())
         if not os.access(there, os.W_OK | os.X_OK):
             raise PermissionError(f"{there} takes no files of yours; give another databank with --databank")
