@@ -118,7 +118,8 @@ class Render:
     camera: OneOfRig = None
     """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file."""
     up: Axis = None
-    """Of a file's splats, the axis that points up: x, -x, y, ...; z where left out, and -y of most that were trained from photos."""
+    """Of a file's splats, the axis that points up: x, -x, y, ...; where left out y in .glb and .spz, what a USD file says, else z; -y of
+    most that were trained from photos."""
     lateral_shift: Length = 0.0
     """Metres to the left of the recorded path, as 2m; -2m is to the right."""
     insert: UseAppendAction[tuple[Insertion, ...]] = ()

@@ -16,12 +16,12 @@ from enhance.grade import Grade, Graded
 from enhance.object_ids import ObjectIds
 from enhance.pictures import Pictures, PictureWriter
 from enhance.step import Steps, frame_of
-from recon.readers.photos import PHOTOS
 from render.frame_types import Frame
 from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
 from render.video import Video, VideoWriter, odd_warning, read_video
+from scenes.pictures import PICTURES
 from scenes.scene import Scene
 from scenes.warnings import warn
 
@@ -96,7 +96,7 @@ def enhance_video(
     the whole clip is graded before (`Grade.read`). Without any of them our own network leaves a clip as it is; it warns where no frame was
     changed. Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
-    if Path(source).is_file() and Path(source).suffix.lower() in PHOTOS:
+    if Path(source).is_file() and Path(source).suffix.lower() in PICTURES:
         raise ValueError(f"{source} is one picture; put it into a folder, and give that")
     clip = Pictures(source) if Path(source).is_dir() else read_video(source)
     if Path(out).exists() and Path(out).samefile(source):

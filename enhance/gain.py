@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch.nn import functional as F
@@ -19,15 +19,25 @@ CLIPS = 32
 
 
 @torch.no_grad()
-def repair_gain(net: Net, rendered: Sequence[Shard]) -> list[float]:
+def repair_gain(net: Net, rendered: Sequence[Shard], progress: Callable[[int, int], None] | None = None) -> list[float]:
     """By how many dB `Net.repair` brings clips' middle frames nearer to their targets, the mean over kinds: alone, and beside what photos
-    say. 0 where there are no clips."""
+    say. 0 where there are no clips. `progress` is called with how many clips were looked at, and of how many."""
     by_kind = defaultdict(list)
     for shard in rendered:
         by_kind[shard.meta["kind"]].append(shard)
-    means = [[_gains(net, shard) for shard in spread(shards, CLIPS)] for shards in by_kind.values()]
-    if not means:
+    if not by_kind:
         return [0.0, 0.0]
+    chosen = {kind: spread(shards, CLIPS) for kind, shards in by_kind.items()}
+    count = sum(map(len, chosen.values()))
+    means: list[list[list[float]]] = []
+    done = 0
+    for shards in chosen.values():
+        means.append([])
+        for shard in shards:
+            means[-1].append(_gains(net, shard))
+            done += 1
+            if progress is not None:
+                progress(done, count)
     return torch.stack([torch.tensor(of_kind).mean(0) for of_kind in means]).mean(0).tolist()
 
 

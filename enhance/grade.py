@@ -22,9 +22,10 @@ from enhance.colour_map import SAME, Colours, Map
 from enhance.grain import Excess, Grain, without
 from enhance.objects import LUMA
 from enhance.past import LONG, alike
-from enhance.samples import PHOTO_SUFFIXES, frames_of, shrunk
+from enhance.samples import frames_of, shrunk
 from enhance.step import Steps, check_rgb, checked
 from render.frame_types import Frame
+from scenes.pictures import PICTURES
 
 GRID = (12, 20)
 """Blocks, down and across, whose ranks of brightness are compared."""
@@ -85,8 +86,8 @@ class Grade:
         photos = (shrunk(photo, width) for photo in frames_of(Path(source), STRIDE, MOST))
         first = next(photos, None)
         if first is None:
-            below = next((f.parent for f in sorted(Path(source).rglob("*")) if f.suffix.lower() in PHOTO_SUFFIXES), None)
-            raise ValueError(f"{source} holds no photos ({', '.join(PHOTO_SUFFIXES)})" + (f"; {below} does" if below else ""))
+            below = next((f.parent for f in sorted(Path(source).rglob("*")) if f.suffix.lower() in PICTURES), None)
+            raise ValueError(f"{source} holds no photos ({', '.join(PICTURES)})" + (f"; {below} does" if below else ""))
         return cls(chain([first], photos))
 
     def nearest(self, ranks: torch.Tensor, but: int | None = None) -> tuple[Colours, Grain]:

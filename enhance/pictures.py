@@ -4,29 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 
 from recon.readers.order import recorded
-from recon.readers.photos import PHOTOS
 from render.video import CONTAINERS, read_image, write_image
 from scenes.atomic import atomic_folder
-from scenes.pictures import dropped_of, opened
+from scenes.pictures import PICTURES, dropped_of, opened
 
 
 class Pictures:
     """The pictures of a folder, in the order of the numbers in their names; iterate over `timed` for rgb `[H, W, 3]` float32 0..1.
 
     width, height: pixels; count: how many there are; dropped: what is not read of which picture, in words, or ''.
-    ValueError where there are none, or one is of another size.
+    ValueError where there are none, two have one name but for its end, or one is of another size.
     """
 
     def __init__(self, folder: str | Path):
         self.path = Path(folder)
-        self.files = in_order(self.path, PHOTOS)
+        self.files = in_order(self.path, PICTURES)
         if not self.files:
-            raise ValueError(f"{folder} holds no pictures ({', '.join(PHOTOS)}), and is no video")
+            raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)}), and is no video")
+        for one, other in pairwise(sorted(self.files)):
+            if one.stem == other.stem:
+                raise ValueError(f"{folder} holds {one.name} and {other.name}, which would both become {one.stem}.png; take one out")
         self.count = len(self.files)
         self.height, self.width = read_image(self.files[0]).shape[:2]
         self.dropped = next((f"of {file.name} {what}" for file in self.files if (what := _dropped(file))), "")

@@ -17,6 +17,7 @@ from enhance.object_samples import Objects, ObjectSampler
 from enhance.shade_samples import Grounds, ShadeSampler
 from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
 from render.video import read_image, read_video
+from scenes.pictures import PICTURES
 from scenes.spread import spread
 
 KIND_WEIGHTS = {"underfit": 0.4, "sparse": 0.3, "cycle": 0.2, "crossref": 0.1}
@@ -26,7 +27,6 @@ PLACED = ("relight", "shadow", "reinsert")
 PHOTOGRAPHED = 0.4  # how often a right picture is one of the further photos, where there are some
 MASK_KNOWN = 0.5  # how often training tells the network where the instances are
 REFERENCED = 0.5  # how often a rendered frame comes as photos beside it have bettered it
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Photos:
                     raise ValueError(f"{path} holds a picture of {frame.shape[1]}x{frame.shape[0]} pixels, too small to tell; leave it out")
                 self.frames.append((shrunk(frame, width) * 255).round().to(torch.uint8).numpy())
             if len(self.frames) == before:
-                raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PHOTO_SUFFIXES)} or a video")
+                raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PICTURES)} or a video")
 
     def crop(self, rng: np.random.Generator, size: int) -> torch.Tensor:
         """A crop `[3, size, size]` of one photo, as it is or shrunk."""
@@ -188,9 +188,9 @@ def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:
 def frames_of(path: Path, stride: int, most: int | None = None) -> Iterator[torch.Tensor]:
     """Of a picture that, of a folder its pictures, `most` of them spread over all, of a video every `stride`-th frame: `[H, W, 3]`."""
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in PHOTO_SUFFIXES)
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
         yield from map(read_image, files if most is None else spread(files, most))
-    elif path.suffix.lower() in PHOTO_SUFFIXES:
+    elif path.suffix.lower() in PICTURES:
         yield read_image(path)
     else:
         yield from islice(read_video(path), 0, None, stride)

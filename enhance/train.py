@@ -156,7 +156,7 @@ def train(
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
     data |= {"further": origin} if origin is not None else {}
     made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
-    save_net(run.average, weights, {**(about or {}), **made, **_gain(run, pair_set, origin)})
+    save_net(run.average, weights, {**(about or {}), **made, **_gain(run, pair_set, origin, report)})
     return weights
 
 
@@ -178,7 +178,7 @@ def _stages(only: Sequence[str] | None, usual: Sequence[str], sampler: Sampler) 
     return [stage for stage in dict.fromkeys(only or usual) if stage not in lacking]
 
 
-def _gain(run: Run, pairs: PairSet | None, origin: dict | None) -> dict[str, object]:
+def _gain(run: Run, pairs: PairSet | None, origin: dict | None, report: _Reporter) -> dict[str, object]:
     """What repairing is worth, for the header: measured anew where the repairing was trained and something is held out to judge it by, else
     what was known of the weights begun with. Where there were none, training clips judge it."""
     # on clips that were trained on a network gains a whole dB by knowing the place
@@ -191,7 +191,11 @@ def _gain(run: Run, pairs: PairSet | None, origin: dict | None) -> dict[str, obj
                 f"nothing of these pairs is held out to judge the repairing by: {_works(origin[REPAIR_GAIN])}, as before", file=sys.stderr
             )
         return {REPAIR_GAIN: origin[REPAIR_GAIN]} if REPAIR_GAIN in origin else {}
-    gains = repair_gain(run.average, held_out or rendered)
+
+    def looked_at(count: int, of: int) -> None:
+        report("enhancer", f"looked at {count} of {of} clips for what the repairing gains")
+
+    gains = repair_gain(run.average, held_out or rendered, looked_at)
     if trained:
         where = "clips that are held out" if held_out else "the clips it was trained on, since none is held out"
         print(f"on {where} the repairing gains {gains[0]:.2f} dB, and {gains[1]:.2f} beside photos: {_works(gains)}", file=sys.stderr)

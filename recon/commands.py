@@ -157,10 +157,10 @@ class Add:
     scale: Ratio = None
     """Metres a unit of the file."""
     up: Axis = None
-    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats z in .glb, what a USD file says, else -y, as cameras
-    have it."""
+    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats y in .glb and .spz, what a USD file says, else -y, as
+    cameras have it."""
     forward: Axis = None
-    """The axis that points forward: a mesh's is z, as in glTF; of splats -y in .glb, x in USD with z up, and else z."""
+    """The axis that points forward: a mesh's is z, as in glTF; of splats -z in .spz, x in USD with z up, and else z."""
     licence: str = ""
     """Its licence, as "CC BY 3.0"."""
     attribution: str = ""

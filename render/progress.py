@@ -28,7 +28,7 @@ class Progress:
         self.bar = self.stream.isatty()
         self.start = self.said = time.monotonic()
         self._first: tuple[float, int] | None = None  # when the first step was done, which may compile kernels for minutes, and the count
-        self._said_count = -1
+        self._told: tuple[int, str] | None = None
 
     def __enter__(self) -> Progress:
         return self
@@ -74,8 +74,8 @@ class Progress:
             filled = round(BAR_WIDTH * min(1.0, self.done / self.total)) if self.total else 0
             bar = f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] " if self.total else ""
             self.stream.write(f"\r\x1b[K{bar}{self.line()}")
-        elif self.done != self._said_count:
-            self._said_count = self.done
+        elif self._told != (self.done, self.note):
+            self._told = self.done, self.note
             self.stream.write(self.line() + "\n")
         self.stream.flush()
 

@@ -21,22 +21,32 @@ def alone(folder: str | os.PathLike) -> Iterator[None]:
     except ImportError:  # Windows
         yield
         return
-    if not Path(folder).is_dir():
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        about = os.fstat(handle)
-        key = (about.st_dev, about.st_ino, threading.get_ident())
-        if key in _HELD:
-            yield
-            return
-        with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        _HELD.add(key)
+    while Path(folder).is_dir():
+        handle = os.open(folder, os.O_RDONLY)
         try:
-            yield
+            about = os.fstat(handle)
+            key = (about.st_dev, about.st_ino, threading.get_ident())
+            if key in _HELD:
+                yield
+                return
+            with suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+            if not _is_at(about, folder):
+                continue  # who held it took it away, and what stands there now is another
+            _HELD.add(key)
+            try:
+                yield
+            finally:
+                _HELD.discard(key)
+            return
         finally:
-            _HELD.discard(key)
-    finally:
-        os.close(handle)
+            os.close(handle)
+    yield
+
+
+def _is_at(about: os.stat_result, folder: str | os.PathLike) -> bool:
+    """Whether a folder that was opened still stands where it stood."""
+    try:
+        return os.path.samestat(about, os.stat(folder))
+    except FileNotFoundError:
+        return False

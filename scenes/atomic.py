@@ -76,7 +76,9 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
 
 
 def need_folder(path: Path) -> None:
-    """Raise FileNotFoundError unless the folder that `path` would stand in exists, PermissionError unless it takes files."""
+    """Raise FileNotFoundError unless the folder that `path` would stand in exists, PermissionError unless it takes files, and
+    NotADirectoryError where it would stand in a file."""
+    _need_no_file(path.parent, path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     _need_access(path.parent, path)
@@ -84,10 +86,16 @@ def need_folder(path: Path) -> None:
 
 def made_folder(path: Path) -> Path:
     """The folder `path`, made with those that it stands in where they are missing. PermissionError where it, or the one that it would be
-    made in, takes no files."""
+    made in, takes no files; NotADirectoryError where one of them is a file."""
+    _need_no_file(path, path)
     _need_access(next(folder for folder in (path, *path.absolute().parents) if folder.is_dir()), path)
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def _need_no_file(folder: Path, path: Path) -> None:
+    if (file := next((above for above in (folder, *folder.parents) if above.is_file()), None)) is not None:
+        raise NotADirectoryError(f"cannot write {path}: {file} is a file, not a folder; give another name")
 
 
 def _need_access(folder: Path, path: Path) -> None:

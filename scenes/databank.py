@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from shlex import quote
@@ -91,13 +91,32 @@ class Databank:
 
         Of `asset.meta`, licence, attribution, source and views go into the index. Raises as `ready` does.
         """
-        with alone(self.path if self.path.is_dir() else self.path.absolute().parent):
+        asset.gaussians.validate(f"asset {asset.label!r}")
+        self.ready()  # before a folder is made
+        with self._held():
             return self._added(asset, thumb_png, half)
+
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """Hold the databank's folder, which is made where there is none, and taken away again where nothing came into it."""
+        made = False
+        while True:
+            made |= not self.path.exists()
+            self.path.mkdir(parents=True, exist_ok=True)
+            with alone(self.path):
+                if not self.path.is_dir():
+                    continue  # who made it, and held it, failed
+                try:
+                    yield
+                finally:
+                    if made:
+                        with suppress(OSError):
+                            self.path.rmdir()
+                return
 
     def _added(self, asset: Asset, thumb_png: bytes | None, half: bool) -> str:
         from scenes.usd_splats import save_asset, to_json
 
-        asset.gaussians.validate(f"asset {asset.label!r}")
         entries = self.ready()
         kind = slug(asset.label)
         folder = self.path / "assets" / kind
@@ -119,7 +138,7 @@ class Databank:
             thumb=None if thumb_png is None else str(home / "thumb.png"),
         )
         told = to_json({**asdict(entry), "meta": meta}, "the asset's meta")
-        new = [f for f in (folder, folder.parent, self.path) if not f.exists()]
+        new = [f for f in (folder, folder.parent) if not f.exists()]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with atomic_folder(self.path / home) as partial:
@@ -150,9 +169,9 @@ class Databank:
         ValueError where a file has its name, where the index is corrupt, or is lost and an asset's own entry is corrupt; PermissionError
         where it takes no files.
         """
-        if self.path.is_file():
+        if (file := next((f for f in (self.path, *self.path.parents) if f.is_file()), None)) is not None:
             fix = "give another name with --databank"
-            raise ValueError(f"{self.path} is a file; a databank is a folder, and made where there is none: {fix}")
+            raise ValueError(f"{file} is a file; a databank is a folder, and made where there is none: {fix}")
         there = next(folder for folder in (self.path, *self.path.absolute().parents) if folder.is_dir())
         if not os.access(there, os.W_OK | os.X_OK):
             raise PermissionError(f"{there} takes no files of yours; give another databank with --databank")

@@ -64,9 +64,10 @@ def open_scene(path: Path, drop_invalid: bool = False) -> tuple[Scene, list[str]
 
 
 def open_view(path: Path, drop_invalid: bool = False, up: str | None = None) -> tuple[Scene, list[str]]:
-    """As `open_scene`; of splats or an asset a scene with the camera `orbit`, which circles them: their axis `up` points up, z if None."""
+    """As `open_scene`; of splats or an asset a scene with the camera `orbit`, which circles them. up: the axis of the file that points up,
+    if None z, or what the format or the file says."""
     from scenes.files import kind_of
-    from scenes.formats.axis import axis_warning
+    from scenes.formats.axis import axis_warning, loaded_axis
     from scenes.formats.trained import model_of
     from scenes.orbit import around
 
@@ -76,7 +77,7 @@ def open_view(path: Path, drop_invalid: bool = False, up: str | None = None) -> 
         return open_scene(path, drop_invalid)
     thing, warnings = open_splats(path, drop_invalid)
     warnings += axis_warning(path) if up is None else []
-    return around(thing, str(path), up or "z", model_of(path)), warnings
+    return around(thing, str(path), loaded_axis(path, up) if up else "z", model_of(path)), warnings
 
 
 def open_splats(path: Path, drop_invalid: bool = False) -> tuple[Asset | Gaussians, list[str]]:

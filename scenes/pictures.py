@@ -10,6 +10,9 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+"""Suffixes of what is taken for a picture; whatever else is one file is taken for a video."""
+
 ORIENTATION, TURNED = 0x0112, range(2, 9)
 """EXIF's tag that says how a picture is to be turned, and its values that turn or mirror it."""
 

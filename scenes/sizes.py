@@ -22,7 +22,9 @@ SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
 """Length, width and height in metres, least and most, of what goes by that name; generous. Other classes are only held to ANYTHING."""
 
 ANYTHING = (0.01, 40.0)
-AXES = ("length", "width", "height")
+
+SHEET = 0.02
+"""Metres below which a side may be where the other two are as they should: what is flat, as a sign, is in no wrong unit for that."""
 
 
 def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
@@ -30,8 +32,7 @@ def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
     scale: by which the size was multiplied already."""
     told = " x ".join(f"{v:.3g}" for v in size)
     ranges = SIZES.get(slug(label), (ANYTHING,) * 3)
-    wrong = [axis for axis, v, r in zip(AXES, size, ranges, strict=True) if not r[0] <= v <= r[1]]
-    if not wrong:
+    if _fits(size, ranges):
         return ""
     low, high = (" x ".join(f"{r[i]:g}" for r in ranges) for i in (0, 1))
     said = f"is {told} m long, wide and high, but a {label} has {low} to {high} m"
@@ -49,4 +50,5 @@ def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
 
 
 def _fits(size: Sequence[float], ranges: Sequence[tuple[float, float]]) -> bool:
-    return all(r[0] <= v <= r[1] for v, r in zip(size, ranges, strict=True))
+    out = [(v, low) for v, (low, high) in zip(size, ranges, strict=True) if not low <= v <= high]
+    return not out or (len(out) == 1 and out[0][0] < out[0][1] <= SHEET)

@@ -20,14 +20,13 @@ from pxr import Usd, UsdGeom, UsdVol, Vt
 from scenes.asset import Asset
 from scenes.asset_photos import load_photos, photos_beside
 from scenes.formats.packing import log_scales_from, logits_from, opacities_from, scales_from, unit
-from scenes.formats.transform import moved
+from scenes.formats.transform import Z_FROM_Y_UP, moved
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 from scenes.usd import array, new_stage, open_stage, own_data, set_own_data
 
 EXTENT_SIGMAS = 3.0
 _SPLATS = "ParticleField3DGaussianSplat"
 _HALF_MAX = 65504.0
-_Z_FROM_Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # as glTF's is turned
 Clean = Callable[[Gaussians, str], Gaussians]
 
 
@@ -45,8 +44,8 @@ def load_gaussians(path: Path, clean: Clean = Gaussians.checked) -> Gaussians:
         prim = only_splats(stage.GetPseudoRoot(), path)
         transform = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
         up, metres = _authored_axes(stage, path)
-        upright = torch.eye(4, dtype=torch.float64)
-        upright[:3, :3] = metres * (_Z_FROM_Y_UP if up == "y" else upright[:3, :3])
+        upright = Z_FROM_Y_UP.clone() if up == "y" else torch.eye(4, dtype=torch.float64)
+        upright[:3, :3] *= metres
         return clean(moved(read_splats(prim), upright @ torch.tensor(np.array(transform).T), path), str(path))  # USD's vectors are rows
 
 

@@ -13,14 +13,18 @@ from render.progress import Progress
 from scenes.asset import Asset
 from scenes.databank import Databank
 from scenes.files import load
-from scenes.formats import GLB, PLY, USD, found
+from scenes.formats import GLB, PLY, SPZ, USD, found
+from scenes.formats.axis import loaded_axis
 from scenes.formats.trained import model_of
 from scenes.gaussians import Gaussians
 from scenes.report import validate
-from scenes.sizes import odd_size
+from scenes.sizes import SHEET, odd_size
 
 OUTLIERS = 0.002
 """Part of the opacity of splats, on either side of an axis, that their box leaves out: floaters are not part of a thing."""
+
+THINNEST = 1e-3
+"""Metres that every side of an asset's box has, if its splats lie in a plane."""
 
 OFF = 0.12
 """Part of an asset's size by which its splats' box may differ from it before it counts as misplaced."""
@@ -56,36 +60,40 @@ def add_splats(
         raise ValueError(f"{file} holds no plain splats; assets and scenes are opened as they are")
     if not len(splats):
         raise ValueError(f"{file} holds no splats")
-    own_up, own_forward, loaded, metres = own_axes(file)
-    up, forward = (name if name is None else loaded.get(name, name) for name in (up, forward))
-    upright = turned_upright(splats, scale / metres if scale else 1.0, up or own_up, forward or own_forward)
+    own_up, own_forward, metres = own_axes(file)
+    up, forward = up or own_up, forward or own_forward
+    turn_to_asset(up, forward)  # refuses them by the names that they have in the file
+    upright = turned_upright(splats, scale / metres if scale else 1.0, loaded_axis(file, up), loaded_axis(file, forward))
     low, high = solid_box(upright)
     base = torch.tensor([float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2, float(low[2])])
     asset = Asset(
-        replace(upright, means=upright.means - base), (high - low).double(), label, model_of(file), {**share, "source": file.name}
+        replace(upright, means=upright.means - base),
+        (high - low).double().clamp_min(THINNEST),
+        label,
+        model_of(file),
+        {**share, "source": file.name},
     )
     _check_size(file, label, asset.size.tolist(), scale or metres, force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
 
 
-def own_axes(file: Path) -> tuple[str, str, dict[str, str], float]:
-    """Of splats as they were loaded from a file the axes up and forward by its format, those that axes of the file became where they were
-    turned, and the metres of its unit that they were multiplied by.
+def own_axes(file: Path) -> tuple[str, str, float]:
+    """Of a file of splats the axes up and forward by its format, and the metres of the unit that it names, by which its splats were
+    multiplied when they were loaded.
 
-    glTF faces +z with y up, and is turned to z up when it is loaded; so is a USD stage that says y up, and one that names its unit is in
-    metres then; z up faces x as robots do. All others stand as cameras see them: y down, z ahead.
+    glTF faces +z with y up, as does a USD stage that says y up; SPZ looks along -z with y up; a stage that says z up faces x, as robots do.
+    All others stand as cameras see them: y down, z ahead.
     """
     form = found(file)
-    if form is GLB:
-        return "z", "-y", {}, 1.0
+    if form in (GLB, SPZ):
+        return "y", "z" if form is GLB else "-z", 1.0
     if form is USD:
         from scenes.usd_splats import stage_axes
 
         said, metres = stage_axes(file)
-        if said == "y":
-            return "z", "-y", {"y": "z", "-y": "-z", "z": "-y", "-z": "y"}, metres
-        return ("z", "x", {}, metres) if said == "z" else ("-y", "z", {}, metres)
-    return "-y", "z", {}, 1.0
+        up, forward = {"y": ("y", "z"), "z": ("z", "x")}.get(said or "", ("-y", "z"))
+        return up, forward, metres
+    return "-y", "z", 1.0
 
 
 def turned_upright(splats: Gaussians, scale: float, up: str, forward: str) -> Gaussians:
@@ -148,9 +156,9 @@ def _misplaced(asset: Asset) -> str:
         where = " to ".join("(" + ", ".join(f"{v:.2f}" for v in corner) + ")" for corner in (low, high))
         size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
         return f"has splats at {where} m, {out:.2f} m outside its box of {size}: its origin or axes are wrong"
-    filled = [(hi - lo) / v for lo, hi, v in zip(low, high, (length, width, height), strict=True)]
-    if min(filled[0], filled[2]) < 0.5:
-        return f"has splats that fill {min(filled[0], filled[2]):.0%} of its box: its scale or axes are wrong"
+    filled = [(high[i] - low[i]) / size for i, size in ((0, length), (2, height)) if size > SHEET]
+    if min(filled, default=1.0) < 0.5:
+        return f"has splats that fill {min(filled):.0%} of its box: its scale or axes are wrong"
     return ""
 
 

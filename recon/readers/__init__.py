@@ -83,7 +83,7 @@ LAYOUTS = {
     "KITTI raw": "oxts/ and image_02/",
     "KITTI odometry": "calib.txt and times.txt",
     "COLMAP": "cameras.bin, images.bin and points3D.bin",
-    "a folder of photos": "three .jpg or .png at least",
+    "a folder of photos": "three .jpg, .png or .tif at least",
 }
 
 

@@ -20,9 +20,9 @@ from recon.log import FETCH, Log, Packed
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.order import recorded
 from recon.readers.sfm import solve
-from scenes.pictures import is_turned, opened, rgb_of, swaps_sides
+from scenes.pictures import PICTURES, is_turned, opened, rgb_of, swaps_sides
 
-PHOTOS = (".jpg", ".jpeg", ".png")
+PHOTOS = tuple(suffix for suffix in PICTURES if suffix != ".webp")  # which COLMAP does not read
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
 FEWEST = 3
 """Pictures that a world can be made of."""

@@ -1,7 +1,8 @@
 """Splat files: one module a format, one registry. Each module has `load_*(path, clean)` and `save_*(path, gaussians)`.
 
-Splats keep the numbers of their file: PLY, compressed PLY, SPZ, .splat and SOG name no axes that all tools agree on, so nothing is
-turned. GLB does (glTF is Y up), so its splats are turned to this project's Z up on the way in, and its node turns them back.
+Splats keep the numbers of their file: PLY, compressed PLY, .splat and SOG name no axes that all tools agree on, so nothing is turned.
+GLB and SPZ do (both are Y up by their texts), so their splats are turned to this project's Z up on the way in; GLB's node turns them
+back, and SPZ, which has none, gets other numbers.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""Which axis of a file's splats its header calls vertical."""
+"""Which axes a file's splats stand along, as far as it or its format says."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from scenes.formats import COMPRESSED_PLY, PLY, found
+from scenes.formats import COMPRESSED_PLY, GLB, PLY, SPZ, USD, found
 from scenes.formats.ply import last_comment
 
 _COMMENT = re.compile(rb"^comment[ \t]+vertical axis:[ \t]*([xyz])\b", re.MULTILINE | re.IGNORECASE)
+_Z_FROM_Y_UP = {"y": "z", "-y": "-z", "z": "-y", "-z": "y"}
 
 
 def axis_warning(path: Path) -> list[str]:
@@ -20,3 +21,18 @@ def axis_warning(path: Path) -> list[str]:
     if axis == "z":
         return []
     return [f"{path} says that its vertical axis is {axis}, and z is taken to point up; give --up=-{axis}, as most have it, or --up={axis}"]
+
+
+def is_y_up(path: Path) -> bool:
+    """Whether a file's splats are turned from y up to z up when they are loaded: those of GLB and SPZ, and of USD that says so."""
+    form = found(path)
+    if form is not USD:
+        return form in (GLB, SPZ)
+    from scenes.usd_splats import stage_axes
+
+    return stage_axes(path)[0] == "y"
+
+
+def loaded_axis(path: Path, axis: str) -> str:
+    """Where an axis of a file, as "-y", points once its splats are loaded."""
+    return _Z_FROM_Y_UP.get(axis, axis) if is_y_up(path) else axis

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from scenes.formats.packing import parsed
+from scenes.formats.transform import Z_FROM_Y_UP
 from scenes.poses import matrix_from_quat
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -42,9 +43,7 @@ def read_glb(path: Path) -> tuple[dict, np.ndarray]:
 
 def primitives(path: Path, tree: dict) -> Iterator[tuple[dict, torch.Tensor]]:
     """The scene's primitives, each with its float64 transform `[4, 4]` to Z up. A node may stand in the tree once."""
-    z_from_y = torch.eye(4, dtype=torch.float64)
-    z_from_y[1:3, 1:3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-    todo = [(i, z_from_y) for i in item(tree, "scenes", tree.get("scene", 0)).get("nodes", [])]
+    todo = [(i, Z_FROM_Y_UP) for i in item(tree, "scenes", tree.get("scene", 0)).get("nodes", [])]
     seen = set()
     while todo:
         index, above = todo.pop()

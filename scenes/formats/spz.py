@@ -4,6 +4,7 @@ Positions 24-bit fixed point; opacities a byte; colours a byte each, 0.15 of the
 byte each, 1/16 from -10; rotations the largest of xyzw, 2 bits, and sign and 9 bits of each other term (version 2: xyz, a byte each);
 harmonics a byte each, 1/128 about 0 (of degree 4, which version 4 knows, those of degree 3 are kept). Versions 2 and 3 are one gzip
 stream behind a header of 16 bytes; version 4 has a plain header of 32 bytes, a table of sizes and a Zstandard stream for each block.
+Splats stand y up and look along -z, "RUB" in its text, and are turned to z up when they are read, and back when they are written.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from scenes.formats.packing import (
     stored,
     unit,
 )
+from scenes.formats.transform import Z_FROM_Y_UP, moved
 from scenes.gaussians import SH_COUNTS, Gaussians
 
 _MAGIC = b"NGSP"
@@ -45,12 +47,13 @@ _LEVEL = 12  # of zstd, as in its writer
 
 
 def load_spz(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Gaussians:
-    """The splats of an SPZ file. ValueError where it is not one or not whole; `clean` answers for the values."""
-    return clean(unpacked(Path(path).read_bytes(), str(path)), str(path))
+    """The splats of an SPZ file, z up. ValueError where it is not one or not whole; `clean` answers for the values."""
+    path = Path(path)
+    return clean(moved(unpacked(path.read_bytes(), str(path)), Z_FROM_Y_UP, path), str(path))
 
 
 def unpacked(data: bytes, path: str) -> Gaussians:
-    """The splats of an SPZ file's bytes, with whatever values they have; errors name `path`."""
+    """The splats of an SPZ file's bytes in the file's own axes, with whatever values they have; errors name `path`."""
     if data.startswith(_GZIP):
         version, n, k, fraction, blocks = _read_gzip(path, data)
     elif data.startswith(_MAGIC):
@@ -80,12 +83,12 @@ def antialiased(path: Path) -> bool:
 
 
 def save_spz(path: str | os.PathLike, gaussians: Gaussians, version: int = 4, antialias: bool = False) -> None:
-    """Write splats as version 2, 3 or 4. Positions get fewer bits after the point where metres need more before it. antialias: how they
-    were trained.
+    """Write splats that are z up as version 2, 3 or 4, y up. Positions get fewer bits after the point where metres need more before it.
+    antialias: how they were trained.
 
     ValueError where a position is beyond 8388 km, which 24 bits cannot hold.
     """
-    g, k = stored(gaussians), gaussians.sh.shape[1]
+    g, k = stored(moved(gaussians, Z_FROM_Y_UP.T, Path(path))), gaussians.sh.shape[1]
     largest = float(np.abs(g["means"]).max(initial=0))
     fraction = next((bits for bits in range(_FRACTION, -1, -1) if largest * 2**bits <= 2**23 - 1), None)
     if fraction is None:

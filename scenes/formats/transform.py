@@ -13,6 +13,9 @@ from scenes.poses import matrix_from_quat, quat_from_matrix, quat_product
 
 _PART = 1 << 18
 
+Z_FROM_Y_UP = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+"""Turns what is y up, as glTF and SPZ have it, to this project's z up."""
+
 
 def moved(gaussians: Gaussians, pose: torch.Tensor, path: Path) -> Gaussians:
     """Splats under a float64 `[4, 4]`; the same object where it does nothing. ValueError where it makes them flat, or is not finite."""

@@ -142,6 +142,10 @@ def test_a_folder_of_pictures_becomes_one(tmp_path, pictures, capsys):
     with pytest.raises(ValueError, match="f11.png is 50x20, f8.png 50x34"):
         enhance_video(pictures, tmp_path / "other", Marking())
     assert not (tmp_path / "other").exists()
+    (pictures / "f11.png").unlink()
+    Image.new("RGB", (50, 34)).save(pictures / "f9.tif")
+    with pytest.raises(ValueError, match=r"f9.png and f9.tif, which would both become f9.png"):
+        enhance_video(pictures, tmp_path / "other", Marking())
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="holds no pictures"):
         enhance_video(tmp_path / "empty", tmp_path / "other", Marking())

@@ -48,3 +48,6 @@ def test_kinds_count_alike_however_many_clips_they_have():
     good, bad = shard(given, better), shard(given, given - (better - given), "underfit")
     few, many = (repair_gain(net, [good, *[bad] * n])[0] for n in (1, 5))
     assert abs(few - many) < 1e-4
+    told = []
+    repair_gain(net, [good, bad, bad], lambda done, of: told.append((done, of)))
+    assert told == [(1, 3), (2, 3), (3, 3)]

@@ -173,6 +173,15 @@ def test_whole_frames_are_measured_graded_like_the_cameras_other_clips(tmp_path,
     assert np.mean(graded.gain(identity)) > 5 and ("clean", GRADED) in rows and ("isp", GRADED) not in rows
 
 
+@pytest.mark.parametrize("suffix", [".tif", ".TIFF", ".bmp", ".webp"])
+def test_one_photo_of_whatever_kind_is_a_picture_and_no_video(tmp_path, suffix):
+    photo = tmp_path / f"a{suffix}"
+    Image.new("RGB", (40, 30), (200, 10, 10)).save(photo)
+    assert len(Grade.read(photo, 40).ranks) == len(Grade.read(tmp_path, 40).ranks) == 1
+    with pytest.raises(ValueError, match="is one picture; put it into a folder"):
+        enhance_video(photo, tmp_path / "out.mp4")
+
+
 def test_photos_that_are_not_there_are_refused_before_anything_is_written(tmp_path):
     (tmp_path / "clip").mkdir()
     (tmp_path / "empty").mkdir()

@@ -32,18 +32,22 @@ def test_splats_of_any_axes_and_unit_become_an_asset(tmp_path):
     assert Databank(tmp_path / "bank").entry(id).thumb and check_databank(tmp_path / "bank") == []
 
 
-@pytest.mark.parametrize(("name", "up", "units"), [("car.glb", None, 1.0), ("z.usda", "Z", 1.0), ("y.usda", "Y", 100.0)])
+@pytest.mark.parametrize(
+    ("name", "up", "units"), [("car.glb", None, 1.0), ("car.spz", None, 1.0), ("z.usda", "Z", 1.0), ("y.usda", "Y", 100.0)]
+)
 def test_splats_in_files_that_say_which_axis_is_up_need_no_axes(tmp_path, name, up, units):
-    """A car that faces as its format has it: glTF along z with y up; USD along x with z up, and along z with y up."""
+    """A car that faces as its format has it: glTF along z with y up, SPZ along -z; USD along x with z up, and along z with y up."""
     upright, file = box((4.2, 1.8, 1.5), (0.8, 0.2, 0.1)), tmp_path / name
     turn = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) if up is None else torch.eye(3)
+    turn = turn.T if name == "car.spz" else turn
     turn = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]) if up == "Y" else turn
     grown = upright.log_scales + torch.tensor(units).log()
     save(replace(upright, means=units * upright.means @ turn.T, log_scales=grown), file)
     if up == "Y":
         text = file.read_text().replace('upAxis = "Z"', 'upAxis = "Y"').replace("metersPerUnit = 1", "metersPerUnit = 0.01")
         file.write_text(text)
-    axes = [(None, None, None)] if up is None else [(None, None, None), (1 / units, up.lower(), {"Z": "x", "Y": "z"}[up])]
+    own = (up or "Y").lower(), {"car.spz": "-z", "z.usda": "x"}.get(name, "z")
+    axes = [(None, None, None), (1 / units, *own)]
     for scale, up_axis, forward in axes:  # what is said once more, of the file as it is, changes nothing
         id, _ = add_splats(tmp_path / "bank", file, "car", scale, up_axis, forward, {})
         torch.testing.assert_close(Databank(tmp_path / "bank").load(id).gaussians.means, upright.means, atol=2e-3, rtol=0)
@@ -93,6 +97,22 @@ def test_a_wrong_size_or_axis_is_refused_with_its_cause(tmp_path, scale, up, for
 @pytest.mark.parametrize("label", SIZES)
 def test_things_in_the_middle_of_their_class_are_not_odd(label):
     assert odd_size(label, [(a * b) ** 0.5 for a, b in SIZES[label]]) == ""
+
+
+@pytest.mark.parametrize("size", [(0.002, 0.75, 2.5), (0.75, 1e-3, 0.75)])
+def test_a_sheet_is_no_odd_sign_but_a_tiny_or_a_flat_lying_one_is(size):
+    assert odd_size("sign", size) == odd_size("board", size) == ""
+    assert "in millimetres" in odd_size("sign", [1000 * v for v in size])
+    assert "in kilometres" in odd_size("sign", [v / 1000 for v in size]) and odd_size("car", [0.002, 1.8, 1.5])
+    assert "on its side" in odd_size("sign", (0.75, 2.0, 1e-3))
+
+
+def test_splats_in_a_plane_become_a_sign(tmp_path):
+    """Whose box has some thickness all the same, and in which nothing is missing."""
+    flat = box((1.0, 0.8, 2.0), (0.8, 0.2, 0.1))
+    save(replace(flat, means=flat.means * torch.tensor([0.0, 1.0, 1.0])), tmp_path / "sign.ply")
+    id, said = add_splats(tmp_path / "bank", tmp_path / "sign.ply", "sign", None, "z", "x", {})
+    assert "0.00 m long, 0.80 m wide, 2.00 m high" in said and check_databank(tmp_path / "bank") == []
 
 
 def test_a_class_is_known_however_it_is_written():

@@ -17,6 +17,15 @@ def test_elsewhere_than_a_terminal_lines_are_plain():
     assert out.getvalue() == "fit 3/3  0 s  28.1 dB\n"
 
 
+def test_work_that_only_its_note_tells_of_is_told_too(monkeypatch):
+    monkeypatch.setattr("render.progress.PLAIN_SECONDS", 0.0)
+    out = io.StringIO()
+    with Progress("train", 1000, stream=out) as steps:
+        for note in ("step 3", "looked at 1 of 2 clips", "looked at 2 of 2 clips"):
+            steps.step(1000 - steps.done, note)
+    assert [line.split("  ")[-1] for line in out.getvalue().splitlines()] == ["step 3", "looked at 1 of 2 clips", "looked at 2 of 2 clips"]
+
+
 def test_what_an_earlier_run_and_the_first_step_did_says_nothing_of_the_time_left(monkeypatch):
     steps = Progress("fit", 100, stream=io.StringIO())
     steps.resume(90)

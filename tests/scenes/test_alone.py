@@ -76,3 +76,40 @@ def test_edits_and_assets_wait_for_who_holds_their_folder(street, tmp_path):
         thread.join(30)
         assert not thread.is_alive()
     assert len(load(tmp_path / "s").actors) == len(street.actors) and len(bank.entries()) == 2
+
+
+def test_who_waited_for_a_folder_that_was_taken_away_and_made_anew_holds_the_new_one(tmp_path):
+    folder = tmp_path / "bank"
+    folder.mkdir()
+    held = threading.Event()
+    with alone(folder):
+        other = asked(folder, held.set)
+        other.join(0.2)
+        folder.rmdir()
+        folder.mkdir()
+        handle = os.open(folder, os.O_RDONLY)
+        fcntl.flock(handle, fcntl.LOCK_EX)  # as a third has it
+    other.join(0.3)
+    assert not held.is_set()
+    os.close(handle)
+    other.join(5)
+    assert held.is_set()
+
+
+def test_assets_added_at_once_to_a_databank_that_is_not_there_yet_are_all_in_it(tmp_path, monkeypatch):
+    """The second begins when the first has made the folder and not yet the index; it waits, and takes the next number."""
+    bank, begun, ids = Databank(tmp_path / "new" / "bank"), threading.Event(), []
+    added = Databank._added
+
+    def slowly(self, *about):
+        begun.set()
+        time.sleep(0.3)
+        return added(self, *about)
+
+    monkeypatch.setattr(Databank, "_added", slowly)
+    first = threading.Thread(target=lambda: ids.append(bank.add(car())))
+    first.start()
+    assert begun.wait(30)
+    ids.append(bank.add(car()))
+    first.join(30)
+    assert sorted(ids) == ["car/0001", "car/0002"] == [e.id for e in bank.entries()]

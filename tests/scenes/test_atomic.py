@@ -84,6 +84,15 @@ def test_writing_into_a_missing_folder_names_it(tmp_path):
         pass
 
 
+def test_writing_into_a_file_as_if_it_were_a_folder_names_it(tmp_path):
+    (tmp_path / "f").write_text("")
+    with pytest.raises(NotADirectoryError, match="b: .*/f is a file, not a folder"), atomic_file(tmp_path / "f/a/b"):
+        pass
+    for path in (tmp_path / "f", tmp_path / "f" / "g"):
+        with pytest.raises(NotADirectoryError, match="/f is a file, not a folder; give another name"):
+            made_folder(path)
+
+
 def test_half_of_a_state_that_a_killed_run_left_goes_with_the_next(tmp_path):
     kill = "import os, sys; from scenes.atomic import atomic_file\nwith atomic_file(sys.argv[1]): os.kill(os.getpid(), 9)"
     for name in ("checkpoint.pt", "s[1].fit", "checkpoint_2.pt"):

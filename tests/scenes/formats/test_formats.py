@@ -19,7 +19,7 @@ BOUNDS = {
     ".usdc": (0, 1e-4, 2e-7, 1e-6, 0),
     ".usda": (0, 1e-4, 2e-7, 1e-6, 0),
     ".glb": (0, 1e-4, 2e-7, 1e-6, 0),
-    ".spz": (3e-4, 0.3, 0.032, 0.0021, 0.0705),  # steps of 2^-12 m, 1/16, 1/16 of a coefficient
+    ".spz": (3e-4, 0.3, 0.032, 0.0021, 0.25),  # steps of 2^-12 m, 1/16, 1/16 of a coefficient, turned beyond degree 1: of several
     ".splat": (0, 1.1, 2e-7, 0.0021, 0.0071),  # a byte a term, 1/510 of a colour
     ".sog": (0.005, 1.1, 0.08, 0.0021, 0.02),  # 16 bits of a logarithm; a byte a term; 256 scales and coefficients
 }

@@ -14,6 +14,8 @@ from randomized import gaussians
 from scenes import load, save
 from scenes.formats.codebook import codebook, nearest, palette
 from scenes.formats.spz import load_spz, save_spz
+from scenes.formats.transform import Z_FROM_Y_UP
+from scenes.poses import matrix_from_quat
 
 C0 = 0.28209479177387814
 
@@ -104,18 +106,21 @@ def test_an_spz_file_is_what_niantics_page_says(tmp_path):
         (tmp_path / "a.spz").write_bytes(data)
         g = load(tmp_path / "a.spz")
         dc = [(v / 255 - 0.5) / 0.15 for v in blocks["colour"]]
-        assert g.means[0].tolist() == [1.5, -2.25, 0.0] and g.log_scales[0].tolist() == [0.0, -10.0, 255 / 16 - 10]
+        assert g.means[0].tolist() == [1.5, 0.0, -2.25] and g.log_scales[0].tolist() == [0.0, -10.0, 255 / 16 - 10]  # y up is z up here
         assert g.logit_opacities[0].sigmoid() == pytest.approx(0.2) and g.sh[0, 0].tolist() == pytest.approx(dc, rel=1e-6)
-        assert g.sh[0, 1:].flatten().tolist() == [0, -1, 127 / 128, -0.5, 0.5, 0, 0, 0, 0]
-        wanted = torch.tensor([xyzw[3], *xyzw[:3]])
-        assert (g.quats[0] - wanted).abs().max() < (0.01 if version == 2 else 0.002)
+        # of degree 1 they are those of -y, z and -x: the file's (0, -1, 127 / 128), (-0.5, 0.5, 0), 0, where y is z and z is -y here
+        assert g.sh[0, 1:].flatten().tolist() == pytest.approx([-0.5, 0.5, 0, 0, 1, -127 / 128, 0, 0, 0], abs=1e-6)
+        wanted = Z_FROM_Y_UP[:3, :3].float() @ matrix_from_quat(torch.tensor([xyzw[3], *xyzw[:3]]))
+        assert (matrix_from_quat(g.quats[0]) - wanted).abs().max() < (0.02 if version == 2 else 0.004)
 
 
 def test_harmonics_of_degree_4_in_an_spz_file_are_left_out_and_told(tmp_path, capsys):
     rest = b"".join(bytes([i] * 3) for i in range(24))
     (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0) + bytes(20) + rest))
     g = load(tmp_path / "a.spz")
-    assert g.sh[0, 1:, 0].tolist() == [(i - 128) / 128 for i in range(15)]
+    kept = torch.tensor([(i - 128) / 128 for i in range(15)])
+    # turned within each degree, those beyond 3 left out before
+    assert all(g.sh[0, a:b, 0].norm() == pytest.approx(float(kept[a - 1 : b - 1].norm())) for a, b in ((1, 4), (4, 9), (9, 16)))
     assert "a.spz has harmonics of degree 4; those beyond degree 3 are left out" in capsys.readouterr().err
 
 
@@ -126,7 +131,8 @@ def test_spz_versions_hold_the_same_splats(tmp_path):
         save_spz(tmp_path / "a.spz", g, version)
         found.append(load_spz(tmp_path / "a.spz"))
     for other in found[:2]:
-        assert all(torch.equal(getattr(other, f), getattr(found[2], f)) for f in ("means", "log_scales", "logit_opacities", "sh"))
+        assert all(torch.equal(getattr(other, f), getattr(found[2], f)) for f in ("means", "log_scales", "logit_opacities"))
+        assert (other.sh - found[2].sh).abs().max() < 1e-6  # the last bits of turning them are not told
         assert ((other.quats * found[2].quats).sum(1).abs() > 0.99).all()  # version 2 has a byte a term, and w from the rest
     assert torch.equal(found[1].quats, found[2].quats)
 

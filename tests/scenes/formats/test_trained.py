@@ -4,6 +4,7 @@ import gzip
 import struct
 
 import pytest
+import torch
 from randomized import asset, gaussians
 
 from scenes import SplatModel, load, save
@@ -61,6 +62,15 @@ def test_an_axis_that_brush_calls_vertical_is_told_where_z_is_taken_to_be_up(tmp
         assert bool(warnings) is told
         assert not told or "its vertical axis is y, and z is taken to point up; give --up=-y" in warnings[0]
         assert not open_view(tmp_path / "b.ply", up="-y")[1]
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.spz", "a.ply"])
+def test_the_axis_that_is_said_to_be_up_is_the_files_own(tmp_path, name):
+    """GLB and SPZ are y up by their texts, and stand upright where that is said once more; a PLY file's z is taken to be up."""
+    save(gaussians(), tmp_path / name)
+    poses = {up: open_view(tmp_path / name, up=up)[0].background.world_from_local for up in (None, "y", "z")}
+    same, other = ("z", "y") if name == "a.ply" else ("y", "z")
+    assert torch.equal(poses[same], poses[None]) and not torch.allclose(poses[other], poses[None])
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
