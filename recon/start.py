@@ -26,6 +26,7 @@ from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_co
 from recon.seeds.shade import shade
 from recon.seeds.standing import by_all_sweeps
 from recon.skies import SkyPicture, like_sky
+from recon.tracks import LIMBED
 from recon.view import View
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed

@@ -25,7 +25,7 @@ LONGEST = 12.0
 BOX_MARGIN = 0.25
 """Metres beyond its box that an actor's splat may stand."""
 
-SHADE_MARGIN, LOW = 1.2, 0.15
+SHADE_MARGIN, LOW = 2.0, 0.15
 """The same of what lies lower than so many metres above its base: its shade."""
 
 
@@ -135,7 +135,8 @@ def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -
     half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)
     half = half.to(group.device)[group]
     beside = torch.where(means[:, 2:] < LOW, SHADE_MARGIN, BOX_MARGIN)
-    return (means[:, :2].abs() <= half[:, :2] + beside).all(1) & (means[:, 2] <= half[:, 2] + BOX_MARGIN) & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
+    inside = (means[:, :2].abs() <= half[:, :2] + beside).all(1) & (means[:, 2] <= half[:, 2] + BOX_MARGIN)
+    return inside & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
 
 
 def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:

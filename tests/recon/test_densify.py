@@ -74,6 +74,15 @@ def test_splats_of_an_actor_that_leave_its_box_are_dropped_and_the_background_is
     assert after.sizes == [50, 19, 10]
 
 
+def test_the_shade_of_an_actor_reaches_farther_than_it_does():
+    s = splats()
+    beside = float(BOXES[0][0]) / 2 + 1.0
+    s.fields["means"][50], s.fields["means"][51] = torch.tensor([beside, 0, 0.02]), torch.tensor([beside, 0, 0.5])
+    after, _ = grow(s, {}, Growth.none(len(s)), 80, 1, BOXES)
+    assert after.sizes == [50, 19, 10]
+    assert (after.fields["means"] == s.fields["means"][50]).all(1).any()
+
+
 def test_a_split_keeps_the_place_and_halves_the_length():
     s = Splats.of([some(1)], [torch.ones(1)])
     s.fields["log_scales"] = torch.tensor([[0.0, -2.0, -3.0]])
