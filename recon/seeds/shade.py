@@ -15,8 +15,8 @@ SPACING, WIDE = 0.4, 0.6
 """Metres between its splats, and the standard deviation of one along the ground, in spacings."""
 
 BESIDE = 1.6
-"""Metres beyond the box that it reaches: under a low sun that is short, but what is farther is half lit. With half of it the road beside cars
-that pass drive 002's left camera comes to 33.2 dB, with this to 33.7, and to 31.3 without any."""
+"""Metres beyond the box that it reaches: under a low sun that is short, but what is farther is half lit. With half of it the road beside
+cars that pass drive 002's left camera comes to 33.2 dB, with this to 33.7, and to 31.3 without any."""
 
 ABOVE, THICK = 0.02, 0.01
 """Metres above the ground in which it lies, and its thickness: it must be drawn over the road."""
