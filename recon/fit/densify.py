@@ -139,6 +139,15 @@ def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -
     return inside & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
 
 
+def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
+    """Indices int64 `[M]` of actors' splats beside their boxes: their shade, which lies where and as it was laid. Left to themselves such
+    splats stand up, and pass from the recorded path for what is behind them."""
+    first = splats.sizes[0]
+    sizes = torch.tensor(np.array([s[:2] for s in boxes]).reshape(-1, 2) / 2 + BOX_MARGIN, dtype=torch.float32)
+    half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:]), dim=0).to(splats.reach.device)
+    return first + (splats.fields["means"].detach()[first:, :2].abs() > half).any(1).nonzero()[:, 0]
+
+
 def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
     """The world direction `[N, 3]` of each splat's `axis`th axis."""
     from scenes.poses import matrix_from_quat

@@ -7,6 +7,7 @@ import torch
 from recon import open_log
 from recon.assets.cleaning import lies_on_road
 from recon.build import begin, choose
+from recon.fit.densify import beside
 from recon.log import Track
 from recon.seeds.shade import ABOVE, BESIDE, shade
 from recon.tracks import LIMBED
@@ -68,3 +69,19 @@ def test_vehicles_take_it_along_from_the_start(drive):
         half = torch.from_numpy(start.tracks[i].size[:2]).float() / 2
         beside = (group.means[:, :2].abs() > half + 0.5).any(1)
         assert beside.sum() > 10 and group.means[beside, 2].abs().max() < 0.15
+
+
+def test_it_lies_as_it_was_laid(drive):
+    """Only how dark it is, and of which colour, is fitted: what stands up beside a car would pass for what is behind it."""
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    which = beside(fit.splats, fit.motion.boxes)
+    before = {name: field[which].clone() for name, field in fit.splats.fields.items()}
+    for _ in range(5):
+        fit.step()
+    after = {name: field[which] for name, field in fit.splats.fields.items()}
+    assert len(which) > 20
+    assert torch.equal(before["means"], after["means"]) and torch.equal(before["quats"], after["quats"])
+    assert torch.equal(before["log_scales"][:, :2], after["log_scales"][:, :2]), "its thickness is what cameras can tell, at least"
+    assert not torch.equal(before["logits"], after["logits"]) and not torch.equal(before["sh"], after["sh"])
