@@ -16,7 +16,7 @@ SPACING, WIDE = 0.4, 0.6
 
 BESIDE = 1.6
 """Metres beyond the box that it reaches: under a low sun that is short, but what is farther is half lit. With half of it the road beside
-cars that pass drive 002's left camera comes to 33.2 dB, with this to 33.7, and to 31.3 without any."""
+cars that pass drive 002's left camera comes to 33.2 dB, with this to 33.6, and to 31.3 without any."""
 
 ABOVE, THICK = 0.02, 0.01
 """Metres above the ground in which it lies, and its thickness: it must be drawn over the road."""
@@ -26,7 +26,8 @@ BLACK, LOGIT = 0.02, -2.2
 
 
 def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
-    """Flat, dark, thin splats in a track's frame, on the ground under its box and around it."""
+    """Flat, dark, thin splats in a track's frame, on the ground under its box and around it, where the fit leaves them
+    (`beside` in `recon/fit/densify.py`)."""
     at = track.world_from_box[:, :3, 3]
     height = float((ground.height(at[:, :2].float()).double() - at[:, 2]).median()) + ABOVE
     half = track.size[:2] / 2 + BESIDE
