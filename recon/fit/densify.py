@@ -144,7 +144,7 @@ def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
     splats stand up, and pass from the recorded path for what is behind them."""
     first = splats.sizes[0]
     sizes = torch.tensor(np.array([s[:2] for s in boxes]).reshape(-1, 2) / 2 + BOX_MARGIN, dtype=torch.float32)
-    half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:]), dim=0).to(splats.reach.device)
+    half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:], dtype=torch.int64), dim=0).to(splats.reach.device)
     return first + (splats.fields["means"].detach()[first:, :2].abs() > half).any(1).nonzero()[:, 0]
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.fit.densify import Growth, grow, kept
+from recon.fit.densify import Growth, beside, grow, kept
 from recon.fit.model import Splats
 from scenes.gaussians import Gaussians
 
@@ -81,6 +81,13 @@ def test_the_shade_of_an_actor_reaches_farther_than_it_does():
     after, _ = grow(s, {}, Growth.none(len(s)), 80, 1, BOXES)
     assert after.sizes == [50, 19, 10]
     assert (after.fields["means"] == s.fields["means"][50]).all(1).any()
+
+
+def test_shade_is_what_stands_beside_the_boxes_of_actors():
+    s = splats()
+    s.fields["means"][[3, 55, 61]] = torch.tensor([5.0, 0, 0])
+    assert beside(s, BOXES).tolist() == [55, 61]
+    assert beside(Splats.of([some(4)], [torch.ones(4)]), []).tolist() == [], "a street without actors"
 
 
 def test_a_split_keeps_the_place_and_halves_the_length():
