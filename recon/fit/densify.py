@@ -134,8 +134,8 @@ def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -
     """Mask of splats that stand in their actor's box; the background has none."""
     half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)
     half = half.to(group.device)[group]
-    beside = torch.where(means[:, 2:] < LOW, SHADE_MARGIN, BOX_MARGIN)
-    inside = (means[:, :2].abs() <= half[:, :2] + beside).all(1) & (means[:, 2] <= half[:, 2] + BOX_MARGIN)
+    margin = torch.where(means[:, 2:] < LOW, SHADE_MARGIN, BOX_MARGIN)
+    inside = (means[:, :2].abs() <= half[:, :2] + margin).all(1) & (means[:, 2] <= half[:, 2] + BOX_MARGIN)
     return inside & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
 
 
@@ -146,6 +146,15 @@ def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
     sizes = torch.tensor(np.array([s[:2] for s in boxes]).reshape(-1, 2) / 2 + BOX_MARGIN, dtype=torch.float32)
     half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:], dtype=torch.int64), dim=0).to(splats.reach.device)
     return first + (splats.fields["means"].detach()[first:, :2].abs() > half).any(1).nonzero()[:, 0]
+
+
+def hold_shade(shown: Splats, boxes: list[np.ndarray]) -> None:
+    """Take from actors' splats beside their boxes the gradients that would move, turn or stretch them."""
+    shade = beside(shown, boxes)
+    for name in ("means", "quats", "log_scales"):
+        gradient = shown.fields[name].grad
+        if gradient is not None:
+            gradient[shade] = 0
 
 
 def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:

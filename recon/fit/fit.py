@@ -11,7 +11,7 @@ import torch
 
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, beside, grow, joined, kept
+from recon.fit.densify import Growth, grow, hold_shade, joined, kept
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
@@ -176,11 +176,7 @@ class Fit:
         colours = shown.fields["sh"].grad
         if self.guessed is not None and colours is not None:
             colours.mul_(~self.guessed[which, None, None])
-        shade = beside(shown, self.motion.boxes)
-        for name in ("means", "quats", "log_scales"):
-            gradient = shown.fields[name].grad
-            if gradient is not None:
-                gradient[shade] = 0
+        hold_shade(shown, self.motion.boxes)
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self.flat_ground.press(self.splats, which, self.descent, rates, self._settled(), camera.world_from_cam.detach()[:3, 3])

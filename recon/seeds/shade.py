@@ -27,7 +27,7 @@ BLACK, LOGIT = 0.02, -2.2
 
 def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
     """Flat, dark, thin splats in a track's frame, on the ground under its box and around it, where the fit leaves them
-    (`beside` in `recon/fit/densify.py`)."""
+    (`hold_shade` in `recon/fit/densify.py`)."""
     at = track.world_from_box[:, :3, 3]
     height = float((ground.height(at[:, :2].float()).double() - at[:, 2]).median()) + ABOVE
     half = track.size[:2] / 2 + BESIDE
