@@ -21,7 +21,7 @@ from tyro.conf import UseAppendAction, subcommand
 from enhance.commands import Enhance, Pairs, Train
 from enhance.demo import Demo
 from enhance.doctor import Doctor
-from recon.commands import Assets, Recon
+from recon.commands import ACTIONS, Assets, Recon
 from render.outputs import check_scene_outputs
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
@@ -217,11 +217,14 @@ COMMANDS = {
 
 def parse(words: list[str]) -> Any:
     """The command that the words say; prints help or what is wrong and exits where they say none."""
-    if words and words[0] in COMMANDS:
-        # tyro builds the one command that is asked for: building all takes most of the time of an error
-        return tyro.cli(COMMANDS[words[0]], prog=f"sidestep {words[0]}", args=words[1:])
+    program, commands = "sidestep", dict[str, Any](COMMANDS)
+    if len(words) > 1 and words[0] == "assets" and not words[1].startswith("-"):
+        program, commands, words = "sidestep assets", ACTIONS, words[1:]
     if words and not words[0].startswith("-"):
-        fail(unknown("command", words[0], "sidestep", COMMANDS), 2)
+        if words[0] not in commands:
+            fail(unknown("command", words[0], program, commands), 2)
+        # tyro builds the one command that is asked for, whose help its errors name: building all takes most of the time of an error
+        return tyro.cli(commands[words[0]], prog=f"{program} {words[0]}", args=words[1:])
     choices: Any = Union[tuple(Annotated[c, subcommand(name)] for name, c in COMMANDS.items())]  # noqa: UP007 - made at run time
     return tyro.cli(choices, prog="sidestep", description=DESCRIPTION, args=words)
 

@@ -9,7 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from scenes.opening import check_device
-from scenes.options import AngleOrNone, Axis, FitSize, Flag, FrontNames, LengthOrNone, Output, Overwrite, Ratio, ScenePath, Time, TimeOrAll
+from scenes.options import (
+    AngleOrNone,
+    Axis,
+    FitSize,
+    Flag,
+    FrontNames,
+    Label,
+    LengthOrNone,
+    Output,
+    Overwrite,
+    Ratio,
+    ScenePath,
+    Time,
+    TimeOrAll,
+)
 from scenes.stops import stopped_saying
 
 if TYPE_CHECKING:
@@ -152,7 +166,7 @@ class Add:
 
     file: Positional[Annotated[Path, arg(metavar="FILE")]]
     """Mesh, as car.glb, or splats, as car.ply."""
-    label: str
+    label: Label
     """What it is: car, pickup, van, truck, bus, motorcycle, bicycle, pedestrian, cone, sign, tree, or a name of its own."""
     scale: Ratio = None
     """Metres a unit of the file."""
@@ -197,6 +211,9 @@ class Check:
         if problems:
             raise ValueError(f"{self.databank} has {len(problems)} problem{'s' * (len(problems) > 1)}")
         print(f"{len(entries)} assets in {self.databank}, all whole, of their class's size, and upright")
+
+
+ACTIONS = {"extract": Extract, "add": Add, "list": List, "show": Show, "check": Check}
 
 
 @dataclass

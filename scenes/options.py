@@ -10,18 +10,21 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from scenes import units
+from scenes.axes import AXES
 from scenes.opening import scene_folder
 from scenes.placement import Placement, parse_at, parse_path, parse_placement
 
 
-def written(parse: Callable[[str], Any], metavar: str, default: str) -> Any:
-    """How tyro reads a value that is written with a unit or in a form of ours; `default` is what --help shows for its default."""
+def written(parse: Callable[[str], Any], metavar: str, default: str, choices: tuple[str, ...] | None = None) -> Any:
+    """How tyro reads a value that is written with a unit or in a form of ours; `default` is what --help shows for its default. choices: all
+    that there are, which may begin with a dash."""
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
         is_instance=lambda value: True,
         str_from_instance=lambda value: [default],
+        choices=choices,
     )
 
 
@@ -65,6 +68,12 @@ def _of_track(text: str, parse: Callable[[str], Any], example: str) -> tuple[str
     return track, parse(value)
 
 
+def _label(text: str) -> str:
+    if not text.strip():
+        raise ValueError("a label names what the thing is; write car, cone, or a name of its own")
+    return text
+
+
 def names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
@@ -87,7 +96,7 @@ Way = Annotated[str, written(parse_path, "straight|lane", "straight")]
 FileOrNone = Annotated[Path | None, written(Path, "FILE", "none")]
 FolderOrNone = Annotated[Path | None, written(Path, "FOLDER", "none")]
 OneOfRig = Annotated[str | None, written(str, "NAME", "first")]
-Axis = Annotated[str | None, written(str, "AXIS", "usual")]
+Axis = Annotated[str | None, written(str, "AXIS", "usual", AXES)]
 WeightsOrNone = Annotated[str | None, written(str, "builtin|FILE", "none")]
 Insertion = Annotated[Placement, written(parse_placement, "ID@X,Y[,yaw=A][,speed=V][,path=lane]", "none")]
 Shift = Annotated[
@@ -96,6 +105,7 @@ Shift = Annotated[
 Replacement = Annotated[tuple[str, str], written(lambda text: _of_track(text, str, "veh_4=car/0003"), "ACTOR=ID", "none")]
 Retiming = Annotated[tuple[str, int], written(lambda text: _of_track(text, units.duration_us, "veh_5=+0.5s"), "ACTOR=TIME", "none")]
 Track = Annotated[str, written(str, "NAME", "none")]
+Label = Annotated[str, written(_label, "NAME", "none")]
 Name = Annotated[str | None, written(str, "NAME", "edit, edit_2, ...")]
 Output = Annotated[Path, arg(aliases=("-o",))]
 Overwrite = FlagCreatePairsOff[Annotated[bool, arg(aliases=("-w",))]]

@@ -349,6 +349,15 @@ def test_nan_is_dropped_and_counted_when_asked(door, spoiled):
     assert "dropped 2 splats" in out and "is valid" in out
 
 
+def test_a_usage_error_names_the_help_of_its_own_command(door):
+    for words in (["--label", ""], ["--label", "car", "--scale", "x"], ["--label", "car", "--up", "q"]):
+        errors = door(["assets", "add", "car.glb", *words], 2)[1]
+        assert "sidestep assets add --help" in errors and words[-2] in errors
+    assert "names what the thing is" in door(["assets", "add", "car.glb", "--label", " "], 2)[1]
+    assert "Did you mean add?" in door(["assets", "ad"], 2)[1]
+    assert "extract" in door(["assets"], 2)[1] + door(["assets", "--help"])[0]
+
+
 def test_splats_are_converted_and_told_how_faithfully(door, tmp_path):
     out, _ = door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.spz")])
     assert "a.spz: " in out and "bytes each; off by at most" in out

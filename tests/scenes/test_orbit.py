@@ -3,7 +3,7 @@ import torch
 from randomized import asset, gaussians
 
 from scenes import Gaussians
-from scenes.axes import AXES
+from scenes.axes import AXES, axis
 from scenes.orbit import AWAY, CAMERA, around
 
 
@@ -40,7 +40,7 @@ def test_an_asset_keeps_its_model_and_nothing_is_refused():
 
 @pytest.mark.parametrize("up", AXES)
 def test_whichever_axis_points_up_stands_upright_in_the_picture(up):
-    head = torch.from_numpy(AXES[up]) * 3
+    head = torch.from_numpy(axis(up, "up")) * 3
     g = gaussians(400)
     g.means[:200] = head.float() + 0.05 * g.means[:200]
     scene = around(g, "a.ply", up)
