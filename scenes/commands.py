@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 from tyro.conf import Positional, UseAppendAction, arg
 
 from scenes.opening import UsageError, dropped, fresh, open_scene, open_splats
-from scenes.options import AnyPath, Flag, Name, Overwrite, Replacement, Retiming, ScenePath, Shift, Track
+from scenes.options import AnyPath, Axis, Flag, Name, Overwrite, Replacement, Retiming, ScenePath, Shift, Track
 from scenes.warnings import warn
 
 if TYPE_CHECKING:
@@ -73,6 +73,9 @@ class Convert:
     """Splat file or asset to read."""
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
     """File to write; its suffix says the format: .ply, .compressed.ply, .usdc, .usda, .glb, .spz, .splat or .sog."""
+    up: Axis = None
+    """Which axis of the source points up: x, -x, y, ...; -y of most that were trained from photos. It is turned to z, in .glb and .spz to
+    y; where left out it is y in .glb and .spz, what a USD file says, else taken to be z."""
     drop_invalid: Flag = False
     """Leave out splats with values that are not finite, and count them, instead of refusing the file."""
     overwrite: Overwrite = False
@@ -80,28 +83,39 @@ class Convert:
 
     def run(self) -> None:
         fresh(self.target, self.overwrite)
-        from scenes.convert import convert
+        from scenes.asset import Asset
+        from scenes.convert import convert, stood_up
+        from scenes.formats.axis import axis_warning, said_up
         from scenes.formats.trained import model_of
 
         thing, warnings = open_splats(self.source, self.drop_invalid)
-        warn(warnings)
-        if turned := _turned(self.source):
-            print(turned)
+        if self.up is not None:
+            if isinstance(thing, Asset):
+                raise UsageError(f"--up is for files of splats; {self.source} is an asset, whose z is up")
+            thing = stood_up(thing, self.source, self.up)
+        said = self.up or said_up(self.source)
+        turned = _turned(self.source, self.target, said)
+        warn([*warnings, *(axis_warning(self.source) if said is None and turned else [])])
+        for line in turned:
+            print(line)
         print(f"wrote {self.target}: {convert(thing, self.target, self.overwrite, model_of(self.source))}")
 
 
-def _turned(source: Path) -> str:
-    """What is done to the splats of a USD stage that says another axis up than z, or another unit than the metre, as a sentence, or ""."""
-    from scenes.formats import USD, found
+def _turned(source: Path, target: Path, up: str | None) -> list[str]:
+    """How splats are turned and scaled on their way from a file whose axis `up` is, None where nobody says, to another, as sentences."""
+    from scenes.formats import GLB, SPZ, USD, found, named
 
-    if found(source) is not USD:
-        return ""
-    from scenes.usd_splats import stage_axes
+    after = "y" if named(target) in (GLB, SPZ) else "z"
+    metres = 1.0
+    if found(source) is USD:
+        from scenes.usd_splats import stage_axes
 
-    up, metres = stage_axes(source)
-    done = ["turned from y up to z up"] if up == "y" else []
+        metres = stage_axes(source)[1]
+    taken = f"{source} does not say which of its axes points up, as {target} will; z is taken to, and --up names another, as --up=-y"
+    done = [f"turned from {up} up to {after} up"] if up not in (None, after) else []
     done += [f"scaled from units of {metres:g} m to metres"] if metres != 1 else []
-    return f"{source} is {' and '.join(done)}, as all files are that Sidestep writes" if done else ""
+    lines = [taken] if up is None and named(target) in (GLB, SPZ, USD) else []
+    return [*lines, f"{source} is {' and '.join(done)}"] if done else lines
 
 
 @dataclass

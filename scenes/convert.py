@@ -8,8 +8,11 @@ from pathlib import Path
 import torch
 
 from scenes.asset import Asset
+from scenes.axes import upright
 from scenes.files import load, save
 from scenes.formats import USD, named
+from scenes.formats.axis import loaded_axis
+from scenes.formats.transform import moved
 from scenes.gaussians import SH_COUNTS, Gaussians, SplatModel
 
 
@@ -42,6 +45,13 @@ class Fidelity:
             most = "nothing"
         lost = "" if self.lost_degree is None else f"; harmonics of degree {self.lost_degree} are left out"
         return f"{size}; off by at most {most}{lost}"
+
+
+def stood_up(gaussians: Gaussians, path: Path, up: str) -> Gaussians:
+    """The loaded splats of a file, turned so that its axis `up`, as "-y", is z. ValueError where it is no axis."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(upright(loaded_axis(path, up)))
+    return moved(gaussians, pose, path)
 
 
 def convert(thing: Asset | Gaussians, target: Path, overwrite: bool = False, model: SplatModel | None = None) -> Fidelity:

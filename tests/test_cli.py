@@ -19,6 +19,7 @@ import torch
 
 from render.video import VideoWriter, read_video
 from scenes import Databank, Gaussians, Placed, SplatModel, load, save
+from scenes.convert import stood_up
 from scenes.usd_splats import save_gaussians
 
 REPOSITORY = Path(__file__).parents[1]
@@ -380,6 +381,21 @@ def test_a_stage_that_is_y_up_is_converted_to_z_up_and_that_is_said(door, tmp_pa
     assert "y.usda is turned from y up to z up and scaled from units of 0.01 m to metres" in out and "off by at most nothing" in out
     x, y, z = (0.01 * plain).unbind(1)
     torch.testing.assert_close(load(target).means, torch.stack([x, -z, y], 1), rtol=1e-5, atol=1e-6)
+
+
+def test_splats_whose_up_is_said_stand_upright_in_files_that_have_one(door, tmp_path):
+    car, lying = made.car().gaussians, tmp_path / "lying.ply"
+    save(stood_up(car, lying, "-y"), lying)  # what was its z is its x now
+    for name, said in (("a.glb", "x up to y up"), ("a.spz", "x up to y up"), ("a.usdc", "x up to z up"), ("a.ply", "x up to z up")):
+        assert f"turned from {said}" in door(["convert", str(lying), str(tmp_path / name), "--up", "x"])[0]
+        heights = load(tmp_path / name).means[:, 2]
+        torch.testing.assert_close(heights.sort().values, car.means[:, 2].sort().values, rtol=0, atol=1e-3)
+        plain = door(["convert", str(lying), str(tmp_path / name), "-w"])[0]
+        assert ("does not say which of its axes points up" in plain) == (name != "a.ply")
+    assert "turned from y up to z up" in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])[0]
+    assert "an asset, whose z is up" in door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "c.ply"), "--up", "y"], 2)[1]
+    lying.write_bytes(lying.read_bytes().replace(b"element", b"comment Vertical axis: y\nelement", 1))
+    assert "its vertical axis is y" in door(["convert", str(lying), str(tmp_path / "c.spz")])[1]
 
 
 def test_splats_alone_are_rendered_from_around(door, tmp_path):

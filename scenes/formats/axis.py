@@ -23,16 +23,19 @@ def axis_warning(path: Path) -> list[str]:
     return [f"{path} says that its vertical axis is {axis}, and z is taken to point up; give --up=-{axis}, as most have it, or --up={axis}"]
 
 
-def is_y_up(path: Path) -> bool:
-    """Whether a file's splats are turned from y up to z up when they are loaded: those of GLB and SPZ, and of USD that says so."""
+def said_up(path: Path) -> str | None:
+    """The axis that is up by a file's format or by what it says itself: "y" of GLB and SPZ, whose splats, as those of USD that says so, are
+    turned from it to z up when they are loaded; None where neither says."""
     form = found(path)
+    if form in (GLB, SPZ):
+        return "y"
     if form is not USD:
-        return form in (GLB, SPZ)
+        return None
     from scenes.usd_splats import stage_axes
 
-    return stage_axes(path)[0] == "y"
+    return stage_axes(path)[0]
 
 
 def loaded_axis(path: Path, axis: str) -> str:
     """Where an axis of a file, as "-y", points once its splats are loaded."""
-    return _Z_FROM_Y_UP.get(axis, axis) if is_y_up(path) else axis
+    return _Z_FROM_Y_UP.get(axis, axis) if said_up(path) == "y" else axis
