@@ -30,9 +30,7 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
         partial.chmod(0o666 & ~_umask())  # mkstemp's 0600 would outlive the rename
         os.replace(partial, path)
     except OSError as error:
-        # a full disk is told with the name that the user knows; where a write fails, and not the opening, Python names no file
-        if error.filename == str(partial) or (error.filename is None and error.errno in FULL):
-            error.filename = str(path)
+        _name(error, partial, path)
         raise
     finally:
         partial.unlink(missing_ok=True)
@@ -71,8 +69,20 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
                 shutil.rmtree(old.parent, ignore_errors=True)
         else:
             os.rename(partial, path)
+    except OSError as error:
+        _name(error, partial, path)
+        raise
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _name(error: OSError, partial: Path, path: Path) -> None:
+    """Tell of an error, as a full disk, with the name that the user knows: what stood in `partial` was to stand in `path`. Where a write
+    fails, and not the opening, Python names no file."""
+    if error.filename is None and error.errno in FULL:
+        error.filename = str(path)
+    elif error.filename is not None and Path(error.filename).is_relative_to(partial):
+        error.filename = str(path / Path(error.filename).relative_to(partial))
 
 
 def need_folder(path: Path) -> None:

@@ -5,6 +5,7 @@ Everything that is only Sidestep's own (the splat model, labels, original names)
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -38,7 +39,8 @@ def new_stage(path: Path, default_prim: str) -> Iterator[Usd.Stage]:
             stage.SetDefaultPrim(stage.GetPrimAtPath(f"/{default_prim}"))
             stage.GetRootLayer().Save()
         except Tf.ErrorException as error:
-            raise OSError(f"cannot write {path}: {first_line(error)}") from error
+            # with the file's name apart: where it stands in a folder that is not whole yet, that gives its own
+            raise OSError(errno.EIO, first_line(error), str(path)) from error
 
 
 @contextmanager

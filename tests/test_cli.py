@@ -492,12 +492,24 @@ def test_a_stopped_render_leaves_no_half_file_under_the_final_name(desk, tmp_pat
         assert "sidestep: interrupted" in errors
 
 
-def test_a_full_disk_leaves_no_half_file(desk, tmp_path):
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["render", "{}/street", "--size", "320x180", "-o", "out.mp4"], "out.mp4: File too large"),
+        (["render", "{}/street", "--size", "64x36", "-o", "out.mp4", "--outputs", "depth"], "out.mp4: File too large"),  # beside the frames
+        (["convert", "{}/bank/assets/car/0001/asset.usdc", "a.splat"], "a.splat: File too large"),
+        (["assets", "add", "{}/car.ply", "--label", "car", "--up=z", "--forward=x"], "databank/assets/car/0001/asset.usdc: "),
+    ],
+    ids=["video", "arrays", "splats", "asset"],
+)
+def test_a_full_disk_leaves_no_half_file_and_is_told(desk, tmp_path, words, told):
     """A limit on the size of files stands in for the disk: the write fails in the middle."""
+    if not (desk / "car.ply").exists():
+        save(made.car().gaussians, desk / "car.ply")
     code = "import resource, sys, signal, sidestep; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
     code += "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); sidestep.main(sys.argv[1:])"
-    words = ["render", str(desk / "street"), "--camera", "front_camera", "--size", "320x180", "-o", "out.mp4"]
+    words = [word.format(desk) for word in words]
     run = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, env=environment(), capture_output=True, text=True)
     assert run.returncode == 1, run.stderr
-    assert "Traceback" not in run.stderr
+    assert "Traceback" not in run.stderr and f"sidestep: {told}" in run.stderr
     assert os.listdir(tmp_path) == []
