@@ -175,8 +175,13 @@ def read_state(path: Path) -> dict:
         told = [line.strip() for line in str(error).splitlines() if "global" in line.lower()]
         why = told[0] if told else "it is no checkpoint, or damaged"
         raise ValueError(f"{path} does not open as tensors alone: {why}; fetch it again, or re-save its state dicts alone") from error
-    except (RuntimeError, EOFError, KeyError, ValueError, zipfile.BadZipFile, UnicodeDecodeError) as error:
-        why = (str(error).strip().splitlines() or ["it ends too early"])[0].split(". ")[0]
+    except (OSError, MemoryError):
+        raise
+    except (
+        Exception
+    ) as error:  # torch runs a pickle as a program, and damaged bytes end it in any way: by an empty stack, struct.error, ...
+        told = str(error).strip().splitlines() if isinstance(error, RuntimeError | zipfile.BadZipFile) else []
+        why = told[0].split(". ")[0] if told else "it is damaged, ends too early, or is something else"
         raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, not tensors by name; give {KNOWN}")

@@ -1,6 +1,7 @@
 """The public models: read strictly, and the same as their unmodified graphs."""
 
 import io
+import random
 
 import made_public as made
 import pytest
@@ -209,6 +210,24 @@ def test_what_is_missing_unknown_or_misshapen_is_named(parts, tmp_path):
     del vae["decoder.middle.3.gamma"]
     vae["encoder.conv1.bias"] = vae["encoder.conv1.bias"] * torch.nan
     broken(parts, tmp_path, "encoder.conv1.bias holds values that are not finite")
+
+
+def test_damage_that_leads_the_unpickler_astray_is_refused(tmp_path):
+    """Bytes of a stack machine: what is popped from an empty stack, or asked of a memo that has nothing, is no ValueError of its own."""
+    damaged, whole = tmp_path / "a.pkl", io.BytesIO()
+    torch.save({"a": torch.rand(3, 4)}, whole, _use_new_zipfile_serialization=False)
+    draw = random.Random(0)
+    kinds = set()
+    for _ in range(200):
+        data = bytearray(whole.getvalue())
+        data[draw.randrange(80)] = draw.randrange(256)
+        damaged.write_bytes(draw.choice([data, b"\x80\x02" + bytes(draw.choices(b"}]q(.KXuabeslt)0N\x85\x86R", k=12))]))
+        try:
+            read_state(damaged)
+        except ValueError as error:
+            assert str(error).startswith(str(damaged)), error
+            kinds.add(type(error.__cause__))
+    assert IndexError in kinds
 
 
 def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer, tmp_path):
