@@ -177,9 +177,8 @@ def read_state(path: Path) -> dict:
         raise ValueError(f"{path} does not open as tensors alone: {why}; fetch it again, or re-save its state dicts alone") from error
     except (OSError, MemoryError):
         raise
-    except (
-        Exception
-    ) as error:  # torch runs a pickle as a program, and damaged bytes end it in any way: by an empty stack, struct.error, ...
+    except Exception as error:
+        # torch runs a pickle as a program, which damaged bytes end in any way: by an empty stack, an index, struct's own error
         told = str(error).strip().splitlines() if isinstance(error, RuntimeError | zipfile.BadZipFile) else []
         why = told[0].split(". ")[0] if told else "it is damaged, ends too early, or is something else"
         raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from enhance.net import Net
 from enhance.precision import channels_last
 from enhance.prior import Time
 from enhance.shards import KINDS
-from scenes.state import save_state
+from scenes.state import load_state, save_state
 
 STAGES = ("autoencoder", "prior", "objects", "shade", "enhancer")
 FURTHER = STAGES[2:]
@@ -195,10 +194,10 @@ class Run:
 def opened(path: Path) -> dict:
     """What `Run.save` wrote; ValueError where a file is nothing of the kind."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = load_state(path)
         TrainConfig(**state["config"])
         return state
-    except (LookupError, RuntimeError, EOFError, TypeError, ValueError, OSError, pickle.UnpicklingError) as error:
+    except (LookupError, TypeError, ValueError, OSError) as error:
         raise _broken(path, error) from error
 
 

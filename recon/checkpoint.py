@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +18,7 @@ from recon.start import Start
 from scenes.camera import RigCamera
 from scenes.ground import Ground
 from scenes.lenses import LENSES
-from scenes.state import save_state
+from scenes.state import load_state, save_state
 from scenes.trajectory import Trajectory
 
 VERSION = 15
@@ -41,9 +40,9 @@ def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:
     if not path.is_file():
         raise FileNotFoundError(f"nothing to resume: {path} does not exist; run without --resume")
     try:
-        data = torch.load(path, map_location="cpu", weights_only=True)  # it may go on where there is no GPU
+        data = load_state(path)
         version, saved = data["version"], data["options"]
-    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError) as problem:
+    except (LookupError, TypeError, ValueError) as problem:
         raise ValueError(f"{path} is not a fit that can go on ({problem}); delete it and run without --resume") from None
     if version != VERSION:
         raise ValueError(f"{path} is of version {version}, and this is {VERSION}; delete it and run without --resume")

@@ -1,4 +1,4 @@
-"""States of long work on disk: tensors and plain values, which `torch.load(..., weights_only=True)` reads back."""
+"""States of long work on disk: tensors and plain values."""
 
 from __future__ import annotations
 
@@ -8,6 +8,17 @@ from pathlib import Path
 import torch
 
 from scenes.atomic import atomic_file, clear_partials
+
+
+def load_state(path: Path) -> dict:
+    """What `save_state` wrote, on the CPU, since it may go on where there is no GPU. ValueError where it is something else, or damaged."""
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:
+        # damaged bytes end torch's unpickler in any way, and what it says of them is to load them as code
+        raise ValueError("it is damaged, or something else") from error
 
 
 def save_state(path: Path, state: dict) -> None:

@@ -500,3 +500,14 @@ def test_a_fit_stopped_early_gives_scenes_that_get_better(drive, tmp_path, monke
     assert stopped_early(log, tmp_path / "early", shares=(0.1, 0.5, 1.0), size=SIZE, config=short) == paths
     with pytest.raises(ValueError, match="shares"):
         stopped_early(log, tmp_path / "early", shares=(0.0,))
+
+
+@pytest.mark.parametrize("damaged", [b"", b"\x80\x02.", b"\x80\x02X\x02\x00\x00\x00\xff\xff.", bytes(100)])
+def test_a_damaged_checkpoint_is_refused_with_the_fix(tmp_path, damaged):
+    """Bytes at which torch's unpickler finds its stack empty, or text that is none, too."""
+    path = tmp_path / "s1.fit"
+    path.write_bytes(damaged)
+    with pytest.raises(
+        ValueError, match=r"s1\.fit is not a fit that can go on \(it is damaged, or something else\); delete it and run without --resume"
+    ):
+        load_checkpoint(path, {})
