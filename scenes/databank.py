@@ -52,8 +52,11 @@ class Databank:
         self.path = Path(path)
 
     def entries(self) -> list[Entry]:
-        """All entries, by id. FileNotFoundError where there is no databank, ValueError where its index is corrupt."""
+        """All entries, by id. FileNotFoundError where there is no databank, NotADirectoryError where there is a file, ValueError where its
+        index is corrupt."""
         index = self.path / "index.json"
+        if self.path.is_file():
+            raise NotADirectoryError(f"{self.path} is a file; --databank names a folder of assets, as sidestep assets extract makes one")
         if not index.is_file():
             makes = f"sidestep assets extract SCENE --databank {quote(str(self.path))}, or assets add, makes one"
             fix = f"{makes}; another is named by --databank"

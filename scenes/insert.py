@@ -66,7 +66,7 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         turned = (
             f"{placement.asset} is turned by {math.degrees(placement.yaw):g}deg from the lane that it goes along, so it slides sideways"
         )
-        warnings.append(f"{turned}; give yaw=0deg or yaw=180deg, or path=straight to go where it faces")
+        warnings.append(f"{turned}; give a yaw of 0deg or 180deg, or the path straight, to go where it faces")
     for point, heading in zip(xy, headings, strict=True):
         poses.append(standing_pose(scene, point, float(heading), asset.size))
     beyond = max(outside_ground(scene, point) for point in xy)

@@ -72,6 +72,9 @@ def test_a_missing_file_is_named(bank):
 def test_no_databank_is_said(tmp_path):
     with pytest.raises(FileNotFoundError, match="is not a databank"):
         Databank(tmp_path / "nowhere").entries()
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="file is a file; --databank names a folder"):
+        Databank(tmp_path / "file").entries()
 
 
 @pytest.mark.parametrize(
