@@ -149,9 +149,10 @@ def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
 
 
 def hold_shade(shown: Splats, boxes: list[np.ndarray]) -> None:
-    """Take from actors' splats beside their boxes the gradients that would move, turn or stretch them."""
+    """Take from actors' splats beside their boxes the gradients that would move, turn, stretch or colour them: they darken what is
+    below by their opacity alone. Free to, some took the colour of a tail light behind them, or of nothing that there is."""
     shade = beside(shown, boxes)
-    for name in ("means", "quats", "log_scales"):
+    for name in ("means", "quats", "log_scales", "sh"):
         gradient = shown.fields[name].grad
         if gradient is not None:
             gradient[shade] = 0

@@ -22,7 +22,7 @@ ABOVE, THICK = 0.02, 0.01
 """Metres above the ground in which it lies, and its thickness: it must be drawn over the road."""
 
 BLACK, LOGIT = 0.02, -2.2
-"""Its colour and the logit of its opacity. What the pictures do not hold up fades (`FADE` in `recon/fit/fit.py`)."""
+"""Its colour, which stays, and the logit of its opacity. What the pictures do not hold up fades (`FADE` in `recon/fit/fit.py`)."""
 
 
 def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
