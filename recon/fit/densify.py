@@ -8,7 +8,9 @@ import numpy as np
 import torch
 
 from recon.fit.model import FIELDS, Splats
+from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
+from scenes.harmonics import sh_from_rgb
 
 FAINT = 0.02
 """Opacity under which a splat is dropped."""
@@ -25,8 +27,8 @@ LONGEST = 12.0
 BOX_MARGIN = 0.25
 """Metres beyond its box that an actor's splat may stand."""
 
-SHADE_MARGIN, LOW = 2.0, 0.15
-"""The same of what lies lower than so many metres above its base: its shade."""
+SHADE_MARGIN = 2.0
+"""The same of its shade."""
 
 
 @dataclass
@@ -77,7 +79,7 @@ def grow(
     """
     fields = {k: v.detach() for k, v in splats.fields.items()}
     group = splats.group_of()
-    keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes)
+    keep = (torch.sigmoid(fields["logits"]) > FAINT) & _within(fields["means"], group, boxes, _shade(fields["sh"]))
     if astray is not None:
         keep &= ~astray
     need = torch.where(keep, growth.need(), 0.0)
@@ -130,32 +132,38 @@ def joined(
     return Splats(after, sizes, inserted(splats.reach, reach)), carried
 
 
-def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray]) -> torch.Tensor:
-    """Mask of splats that stand in their actor's box; the background has none."""
+def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray], shade: torch.Tensor) -> torch.Tensor:
+    """Mask of splats that stand in their actor's box, or around it, if they are its shade; the background has none."""
     half = torch.tensor(np.array([[np.inf] * 3, *[[s[0] / 2, s[1] / 2, s[2]] for s in boxes]]), dtype=torch.float32)
     half = half.to(group.device)[group]
-    margin = torch.where(means[:, 2:] < LOW, SHADE_MARGIN, BOX_MARGIN)
+    margin = torch.where(shade, SHADE_MARGIN, BOX_MARGIN)[:, None]
     inside = (means[:, :2].abs() <= half[:, :2] + margin).all(1) & (means[:, 2] <= half[:, 2] + BOX_MARGIN)
     return inside & ((means[:, 2] >= -BOX_MARGIN) | (group == 0))
 
 
+def _shade(sh: torch.Tensor) -> torch.Tensor:
+    """Mask `[N]` of the colours `[N, K, 3]` that shade is laid with, and keeps where it is held; what else strays from a box has others."""
+    return (sh.detach()[:, 0] == sh.new_tensor(sh_from_rgb(BLACK))).all(1)
+
+
 def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
-    """Indices int64 `[M]` of actors' splats beside their boxes: their shade, which lies where and as it was laid. Left to themselves such
-    splats stand up, and pass from the recorded path for what is behind them."""
+    """Indices int64 `[M]` of actors' shade beside their boxes, which lies where and as it was laid. Left to themselves such splats stand
+    up, and pass from the recorded path for what is behind them."""
     first = splats.sizes[0]
     sizes = torch.tensor(np.array([s[:2] for s in boxes]).reshape(-1, 2) / 2 + BOX_MARGIN, dtype=torch.float32)
     half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:], dtype=torch.int64), dim=0).to(splats.reach.device)
-    return first + (splats.fields["means"].detach()[first:, :2].abs() > half).any(1).nonzero()[:, 0]
+    outside = (splats.fields["means"].detach()[first:, :2].abs() > half).any(1)
+    return first + (outside & _shade(splats.fields["sh"][first:])).nonzero()[:, 0]
 
 
 def hold_shade(shown: Splats, boxes: list[np.ndarray]) -> None:
-    """Take from actors' splats beside their boxes the gradients that would move, turn, stretch or colour them: they darken what is
-    below by their opacity alone. Free to, some took the colour of a tail light behind them, or of nothing that there is."""
-    shade = beside(shown, boxes)
+    """Take from actors' shade beside their boxes the gradients that would move, turn, stretch or colour it: it darkens what is below by
+    its opacity alone. Free to, some took the colour of a tail light behind it, or of nothing that there is."""
+    which = beside(shown, boxes)
     for name in ("means", "quats", "log_scales", "sh"):
         gradient = shown.fields[name].grad
         if gradient is not None:
-            gradient[shade] = 0
+            gradient[which] = 0
 
 
 def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:

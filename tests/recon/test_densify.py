@@ -3,7 +3,9 @@ import torch
 
 from recon.fit.densify import Growth, beside, grow, kept
 from recon.fit.model import Splats
+from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
+from scenes.harmonics import sh_from_rgb
 
 
 def some(count, seed=0, spread=0.5):
@@ -77,15 +79,17 @@ def test_splats_of_an_actor_that_leave_its_box_are_dropped_and_the_background_is
 def test_the_shade_of_an_actor_reaches_farther_than_it_does():
     s = splats()
     beside = float(BOXES[0][0]) / 2 + 1.0
-    s.fields["means"][50], s.fields["means"][51] = torch.tensor([beside, 0, 0.02]), torch.tensor([beside, 0, 0.5])
+    s.fields["means"][50:52] = torch.tensor([beside, 0, 0.02])
+    s.fields["sh"][50] = sh_from_rgb(BLACK)
     after, _ = grow(s, {}, Growth.none(len(s)), 80, 1, BOXES)
-    assert after.sizes == [50, 19, 10]
-    assert (after.fields["means"] == s.fields["means"][50]).all(1).any()
+    assert after.sizes == [50, 19, 10], "what only strayed there goes"
+    assert (after.fields["sh"] == s.fields["sh"][50]).all(2).all(1).any()
 
 
-def test_shade_is_what_stands_beside_the_boxes_of_actors():
+def test_shade_is_what_is_black_beside_the_boxes_of_actors():
     s = splats()
-    s.fields["means"][[3, 55, 61]] = torch.tensor([5.0, 0, 0])
+    s.fields["means"][[3, 55, 58, 61]] = torch.tensor([5.0, 0, 0])
+    s.fields["sh"][[3, 55, 56, 61]] = sh_from_rgb(BLACK)
     assert beside(s, BOXES).tolist() == [55, 61]
     assert beside(Splats.of([some(4)], [torch.ones(4)]), []).tolist() == [], "a street without actors"
 
