@@ -143,7 +143,7 @@ def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray], s
 
 def _shade(sh: torch.Tensor) -> torch.Tensor:
     """Mask `[N]` of the colours `[N, K, 3]` that shade is laid with, and keeps where it is held; what else strays from a box has others."""
-    return (sh.detach()[:, 0] == sh.new_tensor(sh_from_rgb(BLACK))).all(1)
+    return (sh.detach()[:, 0] == sh_from_rgb(BLACK)).all(1)
 
 
 def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
