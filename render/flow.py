@@ -10,7 +10,7 @@ import warp as wp
 
 from render.kernels.flow import carry_kernel, see
 from render.kernels.lenses import LENS_FUNCTIONS
-from render.launch import run, stage, view
+from render.launch import run_pixels, stage, view
 from render.projection import moves, optics_of, poses
 from render.rays import camera_origins, camera_rays, on_device, readout
 from scenes.camera import Camera
@@ -40,7 +40,7 @@ class Correspondence:
         seen = torch.empty(self.depth.shape, dtype=torch.bool, device=self.depth.device)
         with stage(depth.device):
             told = [view(self.pixels, wp.vec2d), view(self.depth, float), HIDES, view(depth.contiguous(), float), view(seen, wp.bool)]
-            run(see, seen.numel(), told, depth.device)
+            run_pixels(see, seen.numel(), told, depth.device)
         return seen
 
 
@@ -77,10 +77,13 @@ def correspond(
         kernel, optics = carry_kernel(LENS_FUNCTIONS[other.lens.kind]), optics_of(other.lens)
 
         def carried(share: torch.Tensor) -> torch.Tensor:
-            run(kernel, depth.numel(), [*told, view(share, wp.float64), optics, *results], device)
+            run_pixels(kernel, depth.numel(), [*told, view(share, wp.float64), optics, *results], device)
             return found.pixels
 
-        _read_out(carried, other, torch.zeros_like(pixels[..., 0]), ways.shape[1] > 1)
+        if ways.shape[1] == 1:
+            carried(torch.zeros(1, 1, dtype=torch.float64, device=device))  # nobody asks for the share
+        else:
+            _read_out(carried, other, torch.zeros_like(pixels[..., 0]))
     return found
 
 
@@ -133,12 +136,10 @@ def _bends(
     return out
 
 
-def _read_out(carried: Callable[[torch.Tensor], torch.Tensor], other: Camera, share: torch.Tensor, moving: bool) -> None:
-    """Carry points to where they stand when `other` reads them out. carried: pixels `[H, W, 2]` at shares of the readout `[H, W]`, which
-    `share` is at first."""
+def _read_out(carried: Callable[[torch.Tensor], torch.Tensor], other: Camera, share: torch.Tensor) -> None:
+    """Carry points to where they stand when `other`, which moves meanwhile, reads them out. carried: pixels `[H, W, 2]` at shares of the
+    readout `[H, W]`, which `share` is at first."""
     at = carried(share)
-    if not moving:
-        return
     axis, extent = (0, other.width) if other.shutter == "columns" else (1, other.height)
 
     def missed(share: torch.Tensor) -> torch.Tensor:

@@ -40,6 +40,10 @@ BANDS = 16
 """Bands of tiles a launch is cut into: enough to even out a busy part of the image, few enough to cost nothing."""
 
 
+STRETCH = 64
+"""Pixels in a row that an item does on the CPU, where taking up its arguments takes as long as a pixel or two. On CUDA it is one."""
+
+
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="sidestep-render")
@@ -48,6 +52,13 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 def run(kernel: wp.Kernel, count: int, args: list, device: torch.device) -> None:
     """Launch `kernel` over `count` work items, inside a `stage`; its last parameter, `first`, is the index of a band's first item."""
     run_each(kernel, [(count, args)], device)
+
+
+def run_pixels(kernel: wp.Kernel, pixels: int, args: list, device: torch.device) -> None:
+    """Launch `kernel` over a picture's pixels, inside a `stage`; its last parameters are `stretch`, how many pixels in a row an item does,
+    and `first`, as of `run`: `pixels_of` in `kernels/types.py` says which these are."""
+    stretch = 1 if device.type == "cuda" else STRETCH
+    run(kernel, -(-pixels // stretch), [*args, stretch], device)
 
 
 def run_each(kernel: wp.Kernel, jobs: Sequence[tuple[int, list]], device: torch.device) -> None:

@@ -25,7 +25,7 @@ from render.frame_types import Frame
 from render.kernels.detail import add_photo, carry_over
 from render.portraits import portraits_of
 from render.rays import camera_rays, on_device
-from render.seen import GONE, NOISE, PARALLAX, Seen, faded, run_over
+from render.seen import GONE, NOISE, PARALLAX, PHOTOS, Seen, faded, run_over
 from scenes.asset import Asset
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -49,6 +49,9 @@ COVERED, RIM = 0.3, 2
 
 GRID = 12, 20
 """Points of a view, down and across, by which photos are chosen."""
+
+AT_ONCE = 64
+"""Photos that are asked what they show of a view, from the nearest on, until none that is farther off could be chosen."""
 
 APART = 0.06
 """Spread of what photos add to the sky at which little of it is believed: what differs is no sky but wires that no splats stand for."""
@@ -84,12 +87,13 @@ class References:
         self.ids = torch.tensor([0, *ids, -1])  # the last is the sky's, -1
         self.eyes = torch.tensor([s.camera.world_from_cam[:3, 3].tolist() for s in shots], dtype=torch.float64).reshape(-1, 3)
         self.times = torch.tensor([s.camera.time_us for s in shots])
-        self.back = [inverse(s.camera.world_from_cam) for s in shots]
-        self.alike: dict[tuple, list[int]] = {}
+        self.back = inverse(torch.stack([s.camera.world_from_cam for s in shots])) if shots else torch.zeros(0, 4, 4, dtype=torch.float64)
+        alike: dict[tuple, list[int]] = {}
         for i, shot in enumerate(shots):
-            self.alike.setdefault((shot.camera.lens.key(), shot.camera.width, shot.camera.height), []).append(i)
-        self.spare = torch.zeros(len(shots), dtype=torch.bool)
-        for indices in self.alike.values():
+            alike.setdefault((shot.camera.lens.key(), shot.camera.width, shot.camera.height), []).append(i)
+        self.spare, self.kind = torch.zeros(len(shots), dtype=torch.bool), torch.zeros(len(shots), dtype=torch.int64)
+        for kind, indices in enumerate(alike.values()):
+            self.kind[indices] = kind
             last = indices[0]
             for i in indices[1:]:
                 self.spare[i] = self._off(shots[i].camera)[last] < SPACING
@@ -143,7 +147,8 @@ class References:
         return faded(self._scores(frame, predicted))
 
     def _scores(self, frame: Frame, predicted: Sequence[Camera]) -> torch.Tensor:
-        """float64 `[S]`: the share of a frame that each shot shows, as sharply, by how far off it was taken."""
+        """float64 `[S]`: the share of a frame that each shot shows, as sharply, by how far off it was taken; 0 of those too far off to be
+        among the best."""
         camera = frame.camera
         assert frame.depth is not None
         y, x = (
@@ -155,23 +160,36 @@ class References:
         seen = (rays != 0).any(-1)  # past the edge of a fisheye's image there is nothing to show
         points = (rays[seen] * depth[seen, None]).double() @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
         detail = camera.lens.focal()[0] / camera.width / depth[seen]
-        shows = torch.zeros(len(self.shots), dtype=torch.float64)
-        for (_, width, height), indices in self.alike.items():
-            lens = self.shots[indices[0]].camera.lens
-            back = torch.stack([self.back[i] for i in indices])
-            local = points @ back[:, :3, :3].transpose(1, 2) + back[:, None, :3, 3]
-            pixels = lens.project(local)
-            side = torch.tensor([width, height])
-            # across the border by and by: rows of points that leave at once would make photos jump
-            inside = (torch.minimum(pixels, side - pixels) / (BORDER * side) + 0.5).clamp(0, 1).prod(-1) * lens.valid(local)
-            there = lens.focal()[0] / width / lens.depth(local).clamp_min(1e-6)
-            shows[indices] = (inside * (there / detail).clamp_max(1)).mean(-1)
+        off, scores = self._off(camera), torch.zeros(len(self.shots), dtype=torch.float64)
+        own = torch.zeros(len(self.shots), dtype=torch.bool)
         for other in predicted:
-            shows[((self.eyes - other.world_from_cam[:3, 3]).norm(dim=-1) < 1e-6) & (self.times == other.time_us)] = 0
-        off = self._off(camera)
-        nearest = float(off.where(shows > 0, torch.inf).min())
-        shows[self.spare] *= min(max(3 - 2 * nearest / SPACING, 0.0), 1.0)
-        return shows / (NEAR + off)
+            own |= ((self.eyes - other.world_from_cam[:3, 3]).norm(dim=-1) < 1e-6) & (self.times == other.time_us)
+        nearest = torch.inf
+        for some in off.argsort().split(AT_ONCE):
+            if (scores.topk(min(PHOTOS + 1, len(scores))).values[-1] >= 1 / (NEAR + off[some[0]])).item():
+                break
+            shows = self._shows(some, points, detail).masked_fill(own[some], 0)
+            if nearest == torch.inf and (shows > 0).any():
+                nearest = float(off[some[shows > 0]].min())
+            shows[self.spare[some]] *= min(max(3 - 2 * nearest / SPACING, 0.0), 1.0)
+            scores[some] = shows / (NEAR + off[some])
+        return scores
+
+    def _shows(self, some: torch.Tensor, points: torch.Tensor, detail: torch.Tensor) -> torch.Tensor:
+        """float64 `[n]`: the share of points `[P, 3]` that each of `some` shots shows, as sharply as `detail` `[P]`."""
+        shows = torch.zeros(len(some), dtype=torch.float64)
+        for kind in self.kind[some].unique().tolist():
+            alike = self.kind[some] == kind
+            shot = self.shots[int(some[alike][0])].camera
+            back = self.back[some[alike]]
+            local = points @ back[:, :3, :3].transpose(1, 2) + back[:, None, :3, 3]
+            pixels = shot.lens.project(local)
+            side = torch.tensor([shot.width, shot.height])
+            # across the border by and by: rows of points that leave at once would make photos jump
+            inside = (torch.minimum(pixels, side - pixels) / (BORDER * side) + 0.5).clamp(0, 1).prod(-1) * shot.lens.valid(local)
+            there = shot.lens.focal()[0] / shot.width / shot.lens.depth(local).clamp_min(1e-6)
+            shows[alike] = (inside * (there / detail).clamp_max(1)).mean(-1)
+        return shows
 
     def _off(self, camera: Camera) -> torch.Tensor:
         """float64 `[S]`: metres from a camera to each shot, and what may have moved in the time between them."""

@@ -11,7 +11,7 @@ import warp as wp
 from render.flow import HIDES, correspond
 from render.frame_types import Frame
 from render.kernels.detail import Here, Other
-from render.launch import run, stage, view
+from render.launch import run_pixels, stage, view
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 
@@ -77,4 +77,4 @@ def run_over(
         other.instance = wp.from_torch(seen.instance)
         here.pixels, here.depths = wp.from_torch(found.pixels, wp.vec2d), wp.from_torch(found.depth)
         here.instance, here.clear = wp.from_torch(instance), wp.from_torch(clear, wp.bool)
-        run(kernel, clear.numel(), [other, here, HIDES, *(view(*t) if isinstance(t, tuple) else t for t in told)], clear.device)
+        run_pixels(kernel, clear.numel(), [other, here, HIDES, *(view(*t) if isinstance(t, tuple) else t for t in told)], clear.device)

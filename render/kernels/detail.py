@@ -71,28 +71,33 @@ def looked_up(other: Other, here: Here, row: int, column: int, hides: float):
 
 
 @wp.kernel
-def carry_over(other: Other, here: Here, hides: float, keep: float, detail: wp.array2d[wp.vec4], first: int):
+def carry_over(other: Other, here: Here, hides: float, keep: float, detail: wp.array2d[wp.vec4], stretch: int, first: int):
     """Of the detail of the view before, `keep` is kept, where it is known."""
-    row, column = pixel_of(first + wp.tid(), detail.shape[1])
-    found, known = looked_up(other, here, row, column, hides)
-    if known > 0.0:
-        detail[row, column] = wp.lerp(detail[row, column], found, keep)
+    begin = stretch * (first + wp.tid())
+    for item in range(begin, wp.min(begin + stretch, detail.shape[0] * detail.shape[1])):
+        row, column = pixel_of(item, detail.shape[1])
+        found, known = looked_up(other, here, row, column, hides)
+        if known > 0.0:
+            detail[row, column] = wp.lerp(detail[row, column], found, keep)
 
 
 @wp.kernel
 def add_photo(
     other: Other, here: Here, hides: float, share: float, noise: float, parallax: float, rays: wp.array2d[wp.vec3],
     depth: wp.array2d[float], sums: wp.array2d[wp.vec4], squares: wp.array2d[float],
-    first: int,
+    stretch: int, first: int,
 ):  # fmt: skip
     """A photo's detail, by how sure it is: sums of that, with the sum of the weights in w, and of its mean square. parallax: what it
     adds to the noise, times the distance."""
-    row, column = pixel_of(first + wp.tid(), depth.shape[1])
-    found, known = looked_up(other, here, row, column, hides)
-    if known > 0.0:
-        noisy = noise
-        if here.instance[row, column] >= 0:
-            noisy += parallax / (depth[row, column] * wp.length(rays[row, column]))
-        sure = share / noisy
-        sums[row, column] += sure * wp.vec4(found[0], found[1], found[2], 1.0)
-        squares[row, column] += sure * (found[0] * found[0] + found[1] * found[1] + found[2] * found[2]) / 3.0
+    begin = stretch * (first + wp.tid())
+    for item in range(begin, wp.min(begin + stretch, depth.shape[0] * depth.shape[1])):
+        row, column = pixel_of(item, depth.shape[1])
+        found, known = looked_up(other, here, row, column, hides)
+        if known > 0.0:
+            noisy = noise
+            if here.instance[row, column] >= 0:
+                noisy += parallax / (depth[row, column] * wp.length(rays[row, column]))
+            sure = share / noisy
+            sums[row, column] = sums[row, column] + sure * wp.vec4(found[0], found[1], found[2], 1.0)
+            square = (found[0] * found[0] + found[1] * found[1] + found[2] * found[2]) / 3.0
+            squares[row, column] = squares[row, column] + sure * square

@@ -22,40 +22,42 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
         bends: wp.array2d[wp.vec3], depth: wp.array2d[float], instance: wp.array2d[int], place: wp.array[int],
         ways: wp.array3d[wp.mat44d], by_columns: int, shares: wp.array2d[wp.float64], optics: Optics,
         pixels: wp.array2d[wp.vec2d], flow: wp.array2d[wp.vec2], depths: wp.array2d[float],
-        first: int,
+        stretch: int, first: int,
     ):  # fmt: skip
         """bends: how far a point moves within its instance, seen from here. ways[place[instance], k, line]: coefficient of the k-th power
         of the share; the line is the pixel's row or column where each has its own. The last of the ways is the sky's, which only turns.
         depths: the points' own in the other camera, inf for the sky."""
-        row, column = pixel_of(first + wp.tid(), depth.shape[1])
-        powers = ways.shape[1]
-        line = int(0)
-        if ways.shape[2] > 1:
-            line = wp.where(by_columns != 0, column, row)
-        ray = wp.vec3d(rays[top + row, left + column])
-        i = place[wp.max(instance[row, column], -1) + 1]
-        sky = instance[row, column] < 0 or depth[row, column] == wp.inf
-        if sky:
-            i = ways.shape[0] - 1
-        else:
-            ray = wp.float64(depth[row, column]) * ray
-        start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
-        bend = bends[wp.min(row, bends.shape[0] - 1), wp.min(column, bends.shape[1] - 1)]
-        p = start + ray + wp.vec3d(bend)
-        v = wp.transform_point(ways[i, powers - 1, line], p)
-        for k in range(1, powers):
-            v = wp.transform_point(ways[i, powers - 1 - k, line], p) + shares[row, column] * v
-        distance = wp.length(v)
-        to = wp.vec2d(wp.float64(wp.nan), wp.float64(wp.nan))
-        if v[2] > optics.cos_limit * distance and wp.length_sq(ray) > wp.float64(0.0):
-            to = pixel(optics, v)
-        pixels[row, column] = to
-        here = wp.vec2d(wp.float64(left + column) + wp.float64(0.5), wp.float64(top + row) + wp.float64(0.5))
-        flow[row, column] = wp.vec2(to - here)
-        far = v[2]
-        if wp.static(around):
-            far = distance
-        depths[row, column] = wp.where(sky, wp.inf, float(far))
+        begin = stretch * (first + wp.tid())
+        for item in range(begin, wp.min(begin + stretch, depth.shape[0] * depth.shape[1])):
+            row, column = pixel_of(item, depth.shape[1])
+            powers = ways.shape[1]
+            line = int(0)
+            if ways.shape[2] > 1:
+                line = wp.where(by_columns != 0, column, row)
+            ray = wp.vec3d(rays[top + row, left + column])
+            i = place[wp.max(instance[row, column], -1) + 1]
+            sky = instance[row, column] < 0 or depth[row, column] == wp.inf
+            if sky:
+                i = ways.shape[0] - 1
+            else:
+                ray = wp.float64(depth[row, column]) * ray
+            start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
+            bend = bends[wp.min(row, bends.shape[0] - 1), wp.min(column, bends.shape[1] - 1)]
+            p = start + ray + wp.vec3d(bend)
+            v = wp.transform_point(ways[i, powers - 1, line], p)
+            for k in range(1, powers):
+                v = wp.transform_point(ways[i, powers - 1 - k, line], p) + shares[row, column] * v
+            distance = wp.length(v)
+            to = wp.vec2d(wp.float64(wp.nan), wp.float64(wp.nan))
+            if v[2] > optics.cos_limit * distance and wp.length_sq(ray) > wp.float64(0.0):
+                to = pixel(optics, v)
+            pixels[row, column] = to
+            here = wp.vec2d(wp.float64(left + column) + wp.float64(0.5), wp.float64(top + row) + wp.float64(0.5))
+            flow[row, column] = wp.vec2(to - here)
+            far = v[2]
+            if wp.static(around):
+                far = distance
+            depths[row, column] = wp.where(sky, wp.inf, float(far))
 
     return carry
 
@@ -66,18 +68,22 @@ def shows(at: wp.vec2d, depth: float, hides: float, there: wp.array2d[float]):
     far = float(-wp.inf)
     zero = wp.float64(0.0)
     if at[0] >= zero and at[1] >= zero and at[0] <= wp.float64(there.shape[1]) and at[1] <= wp.float64(there.shape[0]):
-        x = int(at[0] + wp.float64(0.5))
-        y = int(at[1] + wp.float64(0.5))
-        for v in range(wp.max(y - 1, 0), wp.min(y + 1, there.shape[0])):
-            for u in range(wp.max(x - 1, 0), wp.min(x + 1, there.shape[1])):
-                far = wp.max(far, there[v, u])
+        right = int(at[0] + wp.float64(0.5))
+        below = int(at[1] + wp.float64(0.5))
+        for v in range(2):
+            line = wp.clamp(below + v - 1, 0, there.shape[0] - 1)
+            for u in range(2):
+                far = wp.max(far, there[line, wp.clamp(right + u - 1, 0, there.shape[1] - 1)])
     return far >= (1.0 - hides) * depth
 
 
 @wp.kernel
 def see(
-    pixels: wp.array2d[wp.vec2d], depths: wp.array2d[float], hides: float, there: wp.array2d[float], seen: wp.array2d[wp.bool], first: int
-):
+    pixels: wp.array2d[wp.vec2d], depths: wp.array2d[float], hides: float, there: wp.array2d[float], seen: wp.array2d[wp.bool],
+    stretch: int, first: int,
+):  # fmt: skip
     """Which points show there: `shows`."""
-    row, column = pixel_of(first + wp.tid(), pixels.shape[1])
-    seen[row, column] = shows(pixels[row, column], depths[row, column], hides, there)
+    begin = stretch * (first + wp.tid())
+    for item in range(begin, wp.min(begin + stretch, seen.shape[0] * seen.shape[1])):
+        row, column = pixel_of(item, pixels.shape[1])
+        seen[row, column] = shows(pixels[row, column], depths[row, column], hides, there)

@@ -138,6 +138,23 @@ def test_shares_of_photos_change_little_along_a_path(street, unclear):
     assert torch.stack(shares).diff(dim=0).abs().max() < 0.06
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.8])
+def test_photos_too_far_off_to_be_chosen_are_not_asked(street, monkeypatch, shift):
+    times = street.frame_times(CAMERA)
+    of_all = [Shot(street.camera(name, int(t)), lambda w, h: np.zeros((h, w, 3), np.uint8)) for name in street.rig for t in times]
+    references, asked = References(of_all, street), []
+    shows = References._shows
+    monkeypatch.setattr(References, "_shows", lambda self, some, *told: asked.extend(some.tolist()) or shows(self, some, *told))
+    for view in views(street, times[::3], shift):
+        for predicted in ([], [view.camera]):
+            monkeypatch.setattr("render.references.AT_ONCE", len(of_all))
+            best = references.chosen(view, predicted)
+            monkeypatch.setattr("render.references.AT_ONCE", 2)
+            asked.clear()
+            assert references.chosen(view, predicted) == best
+            assert 2 < len(asked) < len(of_all)
+
+
 def test_an_actor_that_was_removed_leaves_no_ghost(street, unclear):
     empty = replace(unclear, actors=())
     references = References(shots(street), unclear, empty)
