@@ -6,7 +6,11 @@ from pathlib import Path
 
 import pytest
 
-import render  # noqa: F401 - says how OpenMP's workers wait, before anything loads torch
+if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
+    # before anything loads torch: where each worker has a thread for every core, they wait for one another, and tests take 1.6 times as long
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // int(workers))))
+
+import render  # noqa: E402, F401 - says how OpenMP's workers wait, before anything loads torch
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a script's background jobs do; some tests send it, and it is to be heard
     signal.signal(signal.SIGINT, signal.default_int_handler)
