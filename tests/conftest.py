@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
-    # before anything loads torch: where each worker has a thread for every core, they wait for one another, and tests take 1.6 times as long
+    # before anything loads torch: where each has a thread for every core, they wait for one another, and tests take 1.6 times as long
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // int(workers))))
 
 import render  # noqa: E402, F401 - says how OpenMP's workers wait, before anything loads torch
