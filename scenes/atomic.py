@@ -98,12 +98,12 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
 
 
 def _name(error: OSError, partial: Path, path: Path) -> None:
-    """Tell of an error, as a full disk, with the name that the user knows: what stood in `partial` was to stand in `path`. Where a write
-    fails, and not the opening, Python names no file."""
+    """Raise an error, as of a full disk, anew with the name that the user knows: what stood in `partial` was to stand in `path`. Where a
+    write fails, and not the opening, Python names no file; in PyAV's errors the name cannot be changed."""
     if error.filename is None and error.errno in FULL:
-        error.filename = str(path)
-    elif error.filename is not None and Path(error.filename).is_relative_to(partial):
-        error.filename = str(path / Path(error.filename).relative_to(partial))
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    if error.filename is not None and Path(error.filename).is_relative_to(partial):
+        raise OSError(error.errno, error.strerror, str(path / Path(error.filename).relative_to(partial))) from error
 
 
 def need_folder(path: Path) -> None:
