@@ -88,10 +88,8 @@ class Convert:
         from scenes.formats.axis import axis_warning, said_up
         from scenes.formats.trained import model_of
 
-        thing, warnings = open_splats(self.source, self.drop_invalid)
-        if self.up is not None:
-            if isinstance(thing, Asset):
-                raise UsageError(f"--up is for files of splats; {self.source} is an asset, whose z is up")
+        thing, warnings = open_splats(self.source, self.drop_invalid, self.up)
+        if self.up is not None and not isinstance(thing, Asset):
             thing = stood_up(thing, self.source, self.up)
         said = self.up or said_up(self.source)
         turned = _turned(self.source, self.target, said)

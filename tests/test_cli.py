@@ -410,7 +410,9 @@ def test_splats_whose_up_is_said_stand_upright_in_files_that_have_one(door, tmp_
         plain = door(["convert", str(lying), str(tmp_path / name), "-w"])[0]
         assert ("does not say which of its axes points up" in plain) == (name != "a.ply")
     assert "turned from y up to z up" in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])[0]
-    assert "an asset, whose z is up" in door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "c.ply"), "--up", "y"], 2)[1]
+    for command, name in (("convert", "c.ply"), ("render", "-o=c.mp4")):
+        words = [command, "bank/assets/car/0001/asset.usdc", *name.replace("c.", f"{tmp_path}/c.").split("="), "--up", "y"]
+        assert "an asset, whose z is up" in door(words, 2)[1]
     lying.write_bytes(lying.read_bytes().replace(b"element", b"comment Vertical axis: y\nelement", 1))
     assert "its vertical axis is y" in door(["convert", str(lying), str(tmp_path / "c.spz")])[1]
 
