@@ -99,9 +99,10 @@ class Insert:
         with alone(self.scene):  # the track's name is free of what the scene has
             scene, _ = open_scene(self.scene)
             result = insert(scene, asset, placement, int(scene.ego.times_us[0]) + self.start)
-            add_edit(self.scene, result.actor.track, [result.actor], about)
-        recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
-        warn([*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))])
+            recorded = [scene.camera(name, int(t)) for name in scene.rig for t in scene.frame_times(name)]
+            warnings = [*result.warnings, *unseen_warning(result.actor, seeing(result.actor, recorded))]
+            add_edit(self.scene, result.actor.track, [result.actor], about)  # last: who stops meanwhile has changed nothing
+        warn(warnings)
         layer = self.scene / "edits" / f"{result.actor.track}.usda"
         fix = f"sidestep edit {quote(str(self.scene))} --undo {result.actor.track}"
         print(f"inserted {self.asset} as {result.actor.track}; {layer} holds the edit: delete it, or {fix}, to undo it")

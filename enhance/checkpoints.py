@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -160,6 +161,8 @@ def read_state(path: Path) -> dict:
 
     ValueError where it is cut off, holds anything but tensors, numbers, text and bytes in dicts and lists, or is something else.
     """
+    if path.is_file() and path.stat().st_size < 1024 and path.read_bytes().startswith(b"version https://git-lfs"):
+        raise ValueError(f"{path} is not the file itself but Git LFS's pointer to it; fetch it by git lfs pull, or by hf download")
     if path.suffix == ".safetensors":
         from safetensors import SafetensorError
         from safetensors.torch import load_file
@@ -169,11 +172,12 @@ def read_state(path: Path) -> dict:
         except SafetensorError as error:
             raise ValueError(f"{path} is not a whole safetensors file ({error}); fetch it again") from error
     try:
-        with torch.serialization.safe_globals([io.BytesIO]):  # Transformer Engine's state beside the weights; bytes, never run
+        # Transformer Engine's state beside the weights is bytes, never run; torch warns of a pickle that it then refuses, or reads
+        with torch.serialization.safe_globals([io.BytesIO]), warnings.catch_warnings(action="ignore", category=UserWarning):
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except pickle.UnpicklingError as error:
         told = [line.strip() for line in str(error).splitlines() if "global" in line.lower()]
-        why = told[0] if told else "it is no checkpoint, or damaged"
+        why = told[0].split(". ")[0] if told else "it is no checkpoint, or damaged"  # what torch goes on with is how to run it
         raise ValueError(f"{path} does not open as tensors alone: {why}; fetch it again, or re-save its state dicts alone") from error
     except (OSError, MemoryError):
         raise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
@@ -214,21 +214,14 @@ class Check:
 
 
 ACTIONS = {"extract": Extract, "add": Add, "list": List, "show": Show, "check": Check}
+_Action: Any = Union[tuple(Annotated[action, subcommand(name)] for name, action in ACTIONS.items())]  # noqa: UP007 - made at run time
 
 
 @dataclass
 class Assets:
     """Assets of the databank: extract them from a scene, add your own, list them, show one, check all."""
 
-    action: OmitArgPrefixes[
-        OmitSubcommandPrefixes[
-            Annotated[Extract, subcommand("extract")]
-            | Annotated[Add, subcommand("add")]
-            | Annotated[List, subcommand("list")]
-            | Annotated[Show, subcommand("show")]
-            | Annotated[Check, subcommand("check")]
-        ]
-    ]
+    action: OmitArgPrefixes[OmitSubcommandPrefixes[_Action]]
 
     def run(self) -> None:
         self.action.run()

@@ -126,7 +126,7 @@ class Video:
                         yield frame
                         decoded += 1
             except FFmpegError as error:
-                raise ValueError(f"{self.path} cannot be decoded after frame {decoded}: {error.strerror}") from error
+                raise ValueError(f"{self.path} cannot be decoded after frame {decoded}: {error.strerror}; fetch the file again") from error
         if decoded == 0:
             raise ValueError(f"{self.path} has no frames that can be decoded")
 
@@ -137,7 +137,7 @@ class Video:
         try:
             return av.open(str(self.path))
         except FFmpegError as error:
-            raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}") from error
+            raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}; fetch or export it again") from error
 
 
 def _turns(frame) -> tuple[int, bool]:

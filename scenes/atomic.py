@@ -2,8 +2,10 @@
 
 import errno
 import os
+import platform
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -12,17 +14,20 @@ from pathlib import Path
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """What a write says for which there is no room: on the disk, in one's share of it, in a file."""
 
+HALF = ".half-"
+"""What the hidden names of half-written files and folders have after the target's; the machine and the process follow."""
+
 
 @contextmanager
 def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path in the target's folder, with its suffix; it becomes `path` when the block ends.
 
-    On any exception (Ctrl-C and a full disk too) it is removed and `path` stays as it was. Whether an existing file
-    may be replaced is the caller's question. Raises FileNotFoundError where the target's folder does not exist.
+    On any exception (Ctrl-C and a full disk too) it is removed and `path` stays as it was; what a killed process left goes, too.
+    Whether an existing file may be replaced is the caller's question. Raises FileNotFoundError where the target's folder does not exist.
     """
     path = Path(path)
     need_folder(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=_half(path, path.stem), suffix=path.suffix, dir=path.parent)
     os.close(handle)
     partial = Path(name)
     try:
@@ -36,10 +41,26 @@ def atomic_file(path: str | os.PathLike) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def clear_partials(path: Path) -> None:
-    """Take away what `atomic_file` left behind where it was killed, of a file that nobody else writes now."""
-    for partial in path.parent.glob(f".{escape(path.stem)}.????????{escape(path.suffix)}"):
-        partial.unlink(missing_ok=True)
+def _half(path: Path, name: str) -> str:
+    """How the hidden name begins by which this process writes `path`, for `name`. What processes of this machine that run no more, which
+    were killed, left of the same target is taken away."""
+    mine = f".{name}{HALF}{zlib.crc32(platform.node().encode()):08x}-"
+    if os.name == "posix" and HALF not in str(path.parent):  # where a whole folder is being written nothing can be left of its files
+        for left in path.parent.glob(f"{escape(mine)}*"):
+            if not _runs(left.name.removeprefix(mine).partition("-")[0]):
+                shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+    return f"{mine}{os.getpid()}-"
+
+
+def _runs(process: str) -> bool:
+    """Whether a process of that number runs, as it does where nobody can tell."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError, ValueError):  # another user's, or no number
+        return True
+    return True
 
 
 @contextmanager
@@ -47,13 +68,13 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
     """Yield an empty temporary folder beside the target; it becomes `path` when the block ends.
 
     An existing target raises FileExistsError, or with `replace` gives way once the new folder is complete. On any
-    exception the temporary folder is removed and `path` stays as it was.
+    exception the temporary folder is removed and `path` stays as it was; what a killed process left goes, too.
     """
     path = Path(path)
     need_folder(path)
     if path.exists() and not replace:
         raise FileExistsError(f"{path} exists already")
-    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    partial = Path(tempfile.mkdtemp(prefix=_half(path, path.name), dir=path.parent))
     try:
         yield partial
         partial.chmod(0o777 & ~_umask())
@@ -77,12 +98,12 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
 
 
 def _name(error: OSError, partial: Path, path: Path) -> None:
-    """Tell of an error, as a full disk, with the name that the user knows: what stood in `partial` was to stand in `path`. Where a write
-    fails, and not the opening, Python names no file."""
+    """Raise an error, as of a full disk, anew with the name that the user knows: what stood in `partial` was to stand in `path`. Where a
+    write fails, and not the opening, Python names no file; in PyAV's errors the name cannot be changed."""
     if error.filename is None and error.errno in FULL:
-        error.filename = str(path)
-    elif error.filename is not None and Path(error.filename).is_relative_to(partial):
-        error.filename = str(path / Path(error.filename).relative_to(partial))
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    if error.filename is not None and Path(error.filename).is_relative_to(partial):
+        raise OSError(error.errno, error.strerror, str(path / Path(error.filename).relative_to(partial))) from error
 
 
 def need_folder(path: Path) -> None:

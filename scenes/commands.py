@@ -88,10 +88,8 @@ class Convert:
         from scenes.formats.axis import axis_warning, said_up
         from scenes.formats.trained import model_of
 
-        thing, warnings = open_splats(self.source, self.drop_invalid)
-        if self.up is not None:
-            if isinstance(thing, Asset):
-                raise UsageError(f"--up is for files of splats; {self.source} is an asset, whose z is up")
+        thing, warnings = open_splats(self.source, self.drop_invalid, self.up)
+        if self.up is not None and not isinstance(thing, Asset):
             thing = stood_up(thing, self.source, self.up)
         said = self.up or said_up(self.source)
         turned = _turned(self.source, self.target, said)
@@ -169,13 +167,16 @@ class Edit:
         edit = edits.Edit(self.remove, _once(self.shift, "--shift"), assets, _once(self.retime, "--retime"))
         told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
         name = self.name or free_name(self.scene, "edit")
-        add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
+        edits.check_edit(edit, scene)
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
         lit = {actor.track: edit.apply(actor, scene).asset for actor in scene.actors if actor.track in wanted}
         others += [line for track, asset in lit.items() for line in light_held(wanted[track], asset, scene)]
+        warnings = [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)]
+        # last, since finding out what to warn of takes seconds: who stops meanwhile has changed nothing
+        add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
         layer = self.scene / "edits" / f"{name}.usda"
         done = f"changed {', '.join(edit.tracks())}; {layer} holds the edit: delete it, or give --undo {name}, to undo it"
-        return [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)], [done]
+        return warnings, [done]
 
 
 def _without(scene: Path, edit: Undone) -> str:

@@ -75,18 +75,21 @@ def open_view(path: Path, drop_invalid: bool = False, up: str | None = None) -> 
         if up is not None:
             raise UsageError(f"--up is for files of splats; {path} is a scene, whose z is up")
         return open_scene(path, drop_invalid)
-    thing, warnings = open_splats(path, drop_invalid)
+    thing, warnings = open_splats(path, drop_invalid, up)
     warnings += axis_warning(path) if up is None else []
     return around(thing, str(path), loaded_axis(path, up) if up else "z", model_of(path)), warnings
 
 
-def open_splats(path: Path, drop_invalid: bool = False) -> tuple[Asset | Gaussians, list[str]]:
-    """The splats or asset of a file, and what was dropped. ValueError where it is a scene or not finite."""
-    from scenes import Scene
+def open_splats(path: Path, drop_invalid: bool = False, up: str | None = None) -> tuple[Asset | Gaussians, list[str]]:
+    """The splats or asset of a file, and what was dropped. ValueError where it is a scene or not finite; UsageError where an asset is said
+    to have another axis that points `up` than its own."""
+    from scenes import Asset, Scene
 
     thing, warnings = _open(path, drop_invalid)
     if isinstance(thing, Scene):
         raise ValueError(f"{path} is a scene of many files; give one of them, as {path / 'background.usdc'}")
+    if up is not None and isinstance(thing, Asset):
+        raise UsageError(f"--up is for files of splats; {path} is an asset, whose z is up")
     return thing, warnings
 
 

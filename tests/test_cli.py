@@ -161,6 +161,23 @@ def test_undoing_and_changing_at_once_is_all_or_nothing(door, tmp_path):
     assert "as it was without aside; but late still moves veh_1 from where aside had put it: undo that too, and give it anew" in out
 
 
+@pytest.mark.parametrize(
+    ("command", "last"),
+    [(["insert", "--asset", "car/0001", "--at", "20m,-3.5m"], "scenes.seen.unseen_warning"),
+     (["edit", "--shift", "veh_1=0m,1m"], "scenes.edit.absences")],
+)  # fmt: skip
+def test_who_stops_while_it_is_found_out_what_to_warn_of_has_changed_nothing(door, tmp_path, monkeypatch, command, last):
+    shutil.copytree("street", tmp_path / "street")
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(last, stopped)
+    _, errors = door([command[0], str(tmp_path / "street"), *command[1:], "--databank", "bank"], 130)
+    assert errors == "sidestep: interrupted\n"
+    assert "edits" not in load(tmp_path / "street").meta and not list((tmp_path / "street" / "edits").iterdir())
+
+
 def test_an_asset_can_follow_a_csv(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.5,15,0\n")
@@ -393,7 +410,9 @@ def test_splats_whose_up_is_said_stand_upright_in_files_that_have_one(door, tmp_
         plain = door(["convert", str(lying), str(tmp_path / name), "-w"])[0]
         assert ("does not say which of its axes points up" in plain) == (name != "a.ply")
     assert "turned from y up to z up" in door(["convert", str(tmp_path / "a.spz"), str(tmp_path / "b.ply")])[0]
-    assert "an asset, whose z is up" in door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "c.ply"), "--up", "y"], 2)[1]
+    for command, name in (("convert", "c.ply"), ("render", "-o=c.mp4")):
+        words = [command, "bank/assets/car/0001/asset.usdc", *name.replace("c.", f"{tmp_path}/c.").split("="), "--up", "y"]
+        assert "an asset, whose z is up" in door(words, 2)[1]
     lying.write_bytes(lying.read_bytes().replace(b"element", b"comment Vertical axis: y\nelement", 1))
     assert "its vertical axis is y" in door(["convert", str(lying), str(tmp_path / "c.spz")])[1]
 

@@ -66,7 +66,7 @@ class PublicEnhancer:
         memory  of the frame before; None at the start of a clip. Dropped where the size changed and after a cut, where the pictures do not
                 look alike; until there are as many results as the model takes, each frame is worked on by itself, as the release does.
 
-        Raises ValueError for values that are not finite.
+        Raises ValueError for values that are not finite, given or made.
         """
         rgb = checked(frame).rgb.to(self.device, torch.float32).clamp(0, 1)
         last = () if memory is None or not _follows(rgb, memory.given) else memory.frames
@@ -74,6 +74,8 @@ class PublicEnhancer:
         if self.reference is not None:
             clip = (rgb, _resized(self.reference, rgb.shape[:2]))
         out = in_parts(self.model, torch.stack(clip).permute(0, 3, 1, 2)[None], torch.bfloat16 if self.bfloat16 else torch.float32)
+        if not out.isfinite().all():
+            raise ValueError(f"{self.about.get('file', self.model.name)} makes values that are not finite of a frame; fetch it again")
         better = out[0].permute(1, 2, 0).clamp(0, 1).contiguous()
         return better, Recent(rgb, (better.clone(), *last)[: max(self.history, 1)])  # what is handed out may be drawn on
 

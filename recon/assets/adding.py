@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 import torch
 
@@ -17,7 +18,9 @@ from scenes.formats import GLB, PLY, SPZ, USD, found
 from scenes.formats.axis import loaded_axis
 from scenes.formats.trained import model_of
 from scenes.gaussians import Gaussians
+from scenes.opening import scene_folder
 from scenes.report import validate
+from scenes.scene import Scene
 from scenes.sizes import SHEET, odd_size
 
 OUTLIERS = 0.002
@@ -56,8 +59,11 @@ def add_splats(
     scale, up, forward: what the file's own axes and unit are where they are not as its format has them (`own_axes`).
     """
     splats = load(file)
+    if isinstance(splats, Scene):
+        raise ValueError(f"{file} is a scene; sidestep assets extract {quote(str(scene_folder(file)))} cuts out what it has")
     if not isinstance(splats, Gaussians):
-        raise ValueError(f"{file} holds no plain splats; assets and scenes are opened as they are")
+        fix = f"make splats of it: sidestep convert {quote(str(file))} {file.stem}.ply, and add these with --up z --forward x"
+        raise ValueError(f"{file} is an asset already, with its own frame and size; name its databank by --databank, or {fix}")
     if not len(splats):
         raise ValueError(f"{file} holds no splats")
     own_up, own_forward, metres = own_axes(file)

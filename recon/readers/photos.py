@@ -23,6 +23,8 @@ from recon.readers.sfm import solve
 from scenes.pictures import PICTURES, is_turned, opened, rgb_of, swaps_sides
 
 PHOTOS = tuple(suffix for suffix in PICTURES if suffix != ".webp")  # which COLMAP does not read
+UNREAD = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".nef", ".arw")
+"""Suffixes of pictures that phones, cameras and the web have, and COLMAP does not read."""
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
 FEWEST = 3
 """Pictures that a world can be made of."""
@@ -42,8 +44,10 @@ def is_photos(path: Path) -> bool:
 
 
 def check_enough(path: Path) -> None:
-    """ValueError where a path is a photo, or holds photos, but fewer than a world can be made of."""
+    """ValueError where a path is a photo, or holds photos, but fewer than a world can be made of, or such as are not read."""
     count = len(_photos(path)) if path.is_dir() else int(path.is_file() and path.suffix.lower() in PHOTOS)
+    if count < FEWEST and (unread := _unread(path)):
+        raise ValueError(f"{path} {'holds' if path.is_dir() else 'is'} {unread}, which are not read; export them as .jpg")
     if 0 < count < FEWEST:
         what = f"{'holds' if path.is_dir() else 'is'} {count} photo{'s' * (count > 1)}"
         raise ValueError(f"{path} {what}, and a world is made of at least {FEWEST} of one place; give a folder of as many")
@@ -53,6 +57,13 @@ def _photos(path: Path) -> list[Path]:
     """A folder's photos in the order they were taken in; what a Mac leaves on a foreign disk (._01.jpg) is none."""
     found = [p for p in path.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith(".")]
     return sorted(found, key=lambda p: recorded(p.name))
+
+
+def _unread(path: Path) -> str:
+    """How many pictures at a path are of which kinds that are not read, in words; "" for none."""
+    files = path.iterdir() if path.is_dir() else [path]
+    kinds = [p.suffix for p in files if p.suffix.lower() in UNREAD and not p.name.startswith(".")]
+    return " and ".join(f"{kinds.count(kind)} {kind} picture{'s' * (kinds.count(kind) > 1)}" for kind in dict.fromkeys(kinds))
 
 
 def is_video(path: Path) -> bool:
@@ -145,9 +156,15 @@ def _of_one_size(path: Path) -> list[str]:
     sizes = {p.name: _size(p) for p in _photos(path)}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     most = max(counts, key=lambda size: counts[size])
+    if counts[most] < FEWEST:
+        fix = "scale or cut them to one, as one camera takes them"
+        raise ValueError(f"{path} has {len(sizes)} photos, of which no {FEWEST} are of one size in pixels; {fix}")
     others = [name for name, size in sizes.items() if size != most]
     if others:
-        print(f"left out {', '.join(others[:5])}: not {most[0]}x{most[1]} as most photos", file=sys.stderr)
+        more = f" and {len(others) - 5} more" if len(others) > 5 else ""
+        print(f"left out {', '.join(others[:5])}{more}: not {most[0]}x{most[1]} as most photos", file=sys.stderr)
+    if unread := _unread(path):
+        print(f"left out {unread}, which are not read; export them as .jpg", file=sys.stderr)
     return [name for name, size in sizes.items() if size == most]
 
 

@@ -1,7 +1,9 @@
 """The public models: read strictly, and the same as their unmodified graphs."""
 
 import io
+import pickle
 import random
+import warnings
 
 import made_public as made
 import pytest
@@ -240,9 +242,16 @@ def test_a_file_that_is_cut_off_foreign_or_would_run_code_is_refused(harmonizer,
     cut.write_text("<html>Access to this model is restricted</html>")
     with pytest.raises(ValueError, match="cut.pkl"):
         open_public(cut)
+    cut.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(ValueError, match="cut.pkl is not the file itself but Git LFS's pointer.* git lfs pull"):
+        open_public(cut)
+    cut.write_bytes(pickle.dumps(print))  # in a protocol that torch warns of
+    with warnings.catch_warnings(action="error"), pytest.raises(ValueError, match="cut.pkl does not open as tensors alone"):
+        open_public(cut)
     torch.save({"state_dict_unet": print}, cut)
-    with pytest.raises(ValueError, match="print"):
+    with pytest.raises(ValueError, match="print") as refused:
         read_state(cut)
+    assert "safe_globals" not in str(refused.value)  # no advice to run it
     torch.save({"layer.weight": torch.zeros(2)}, cut)
     with pytest.raises(ValueError, match=r"layer\.weight; give NVIDIA Harmonizer"):
         Enhancer.load(cut)
@@ -368,9 +377,16 @@ def test_torchscript_that_does_not_run_or_is_cut_off_is_refused(tmp_path):
         def forward(self, x):
             return x[..., ::2]
 
+    class Lost(torch.nn.Module):
+        def forward(self, x):
+            return x / 0
+
     path = tmp_path / "harmonizer_nontemporal.pt"
     torch.jit.save(torch.jit.script(Half4()), path)
     with pytest.raises(ValueError, match="use the .pkl"):
+        Enhancer.load(path, bfloat16=False).step(picture())
+    torch.jit.save(torch.jit.script(Lost()), path)
+    with pytest.raises(ValueError, match=r"harmonizer_nontemporal\.pt makes values that are not finite"):
         Enhancer.load(path, bfloat16=False).step(picture())
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match="fetch it again"):

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 from randomized import gaussians
-from street import box, car
+from street import box, car, street
 
 from recon.assets import adding
 from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
@@ -60,6 +60,14 @@ def test_splats_of_a_usd_file_that_says_no_axis_stand_as_cameras_see_them(tmp_pa
     file.write_text("".join(line for line in file.read_text().splitlines(True) if "upAxis" not in line and "metersPerUnit" not in line))
     id, _ = add_splats(tmp_path / "bank", file, "car", None, None, None, {})
     torch.testing.assert_close(Databank(tmp_path / "bank").load(id).gaussians.means, upright.means, atol=2e-3, rtol=0)
+
+
+def test_an_asset_and_a_scene_are_refused_with_what_makes_one_of_them(tmp_path):
+    save(car(), tmp_path / "car.usdc")
+    save(street(), tmp_path / "s1")
+    for file, fix in (("car.usdc", r"sidestep convert \S*/car.usdc car.ply, .*--up z --forward x"), ("s1/scene.usda", r"extract \S*/s1 ")):
+        with pytest.raises(ValueError, match=fix):
+            add_splats(tmp_path / "bank", tmp_path / file, "car", None, None, None, {})
 
 
 def test_turning_splats_turns_their_axes_and_their_harmonics():

@@ -88,6 +88,31 @@ def test_photos_of_another_size_are_left_out_and_said(walk, solved, tmp_path, ca
     assert len(solved[0][0]) == 6 and "left out turned.png: not 96x54" in capsys.readouterr().err
 
 
+def test_photos_of_as_many_sizes_are_refused_for_that(tmp_path):
+    (tmp_path / "walk").mkdir()
+    for i in range(5):
+        Image.new("RGB", (96 + i // 2, 54)).save(tmp_path / f"walk/{i}.png")
+    with pytest.raises(ValueError, match="walk has 5 photos, of which no 3 are of one size in pixels; scale or cut them to one"):
+        open_log(tmp_path / "walk")
+    assert not (tmp_path / "walk.sfm").exists()
+
+
+def test_photos_of_a_kind_that_is_not_read_are_said(walk, solved, tmp_path, capsys):
+    (tmp_path / "phone").mkdir()
+    for name in ("IMG_1.HEIC", "IMG_2.HEIC", "3.webp", "._IMG_1.HEIC"):
+        (tmp_path / "phone" / name).write_bytes(b"some")
+    with pytest.raises(
+        ValueError, match=r"phone holds (2 \.HEIC pictures and 1 \.webp picture|1 \.webp picture and 2 \.HEIC pictures), .*\.jpg"
+    ):
+        open_log(tmp_path / "phone")
+    with pytest.raises(ValueError, match=r"IMG_1\.HEIC is 1 \.HEIC picture, which are not read; export them as \.jpg"):
+        open_log(tmp_path / "phone" / "IMG_1.HEIC")
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    (tmp_path / "walk" / "IMG_1.HEIC").touch()
+    open_log(tmp_path / "walk")
+    assert len(solved[0][0]) == 6 and "left out 1 .HEIC picture, which are not read" in capsys.readouterr().err
+
+
 def test_what_a_mac_leaves_among_photos_is_none(walk, solved, tmp_path):
     shutil.copytree(walk / "images", tmp_path / "walk")
     (tmp_path / "walk/._000.png").write_bytes(b"\x00\x05\x16\x07")

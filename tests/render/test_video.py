@@ -122,6 +122,19 @@ def test_a_frame_of_another_size_is_refused(tmp_path):
         video.write(torch.zeros(16, 32, 3))
 
 
+def test_a_video_that_the_disk_has_no_room_for_is_named_and_leaves_nothing(tmp_path):
+    resource = pytest.importorskip("resource", reason="no limits of files here")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large") as told, VideoWriter(tmp_path / "a.mp4", 10, 640, 360) as video:
+            for seed in range(30):
+                video.write(torch.rand(360, 640, 3, generator=torch.Generator().manual_seed(seed)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert told.value.filename == str(tmp_path / "a.mp4") and not list(tmp_path.iterdir())
+
+
 def test_a_name_that_is_no_video_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.mp4"):
         VideoWriter(tmp_path / "a.gif", 10, 32, 32)

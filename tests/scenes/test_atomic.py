@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from scenes.atomic import atomic_file, atomic_folder, made_folder
-from scenes.state import save_state
 
 
 def listing(folder):
@@ -93,15 +92,40 @@ def test_writing_into_a_file_as_if_it_were_a_folder_names_it(tmp_path):
             made_folder(path)
 
 
-def test_half_of_a_state_that_a_killed_run_left_goes_with_the_next(tmp_path):
-    kill = "import os, sys; from scenes.atomic import atomic_file\nwith atomic_file(sys.argv[1]): os.kill(os.getpid(), 9)"
-    for name in ("checkpoint.pt", "s[1].fit", "checkpoint_2.pt"):
-        subprocess.run([sys.executable, "-c", kill, str(tmp_path / name)], check=False)
-    assert len(listing(tmp_path)) == 3
-    save_state(tmp_path / "checkpoint.pt", {})
-    save_state(tmp_path / "s[1].fit", {})
-    (other,) = {path for path in listing(tmp_path) if path.startswith(".")}
-    assert other.startswith(".checkpoint_2."), "what is another's stays"
+KILLED = """
+import os, sys
+from scenes.atomic import atomic_file, atomic_folder
+with (atomic_folder if sys.argv[2] == "folder" else atomic_file)(sys.argv[1]) as half:
+    print(half, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_left_half_goes_with_the_next_write(tmp_path):
+    """But not what another target, a process that runs or another machine has, nor files of the user's own."""
+    targets = {"out.mp4": "file", "s[1].fit": "file", "s1": "folder", "out_2.mp4": "file", "out": "folder"}
+    begun = {}
+    for name, kind in targets.items():
+        command = [sys.executable, "-c", KILLED, str(tmp_path / name), kind]
+        begun[name] = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    halves = {name: Path(process.stdout.readline().strip()) for name, process in begun.items()}
+    (halves["s1"] / "big").write_text("half of it")
+    for name in ("out.mp4", "s[1].fit", "s1", "out_2.mp4"):
+        begun[name].kill()
+        begun[name].wait()
+    (tmp_path / ".out.settings.mp4").touch()
+    elsewhere = tmp_path / halves["out.mp4"].name.replace("half-", "half-0")
+    elsewhere.touch()
+    for path in ("out.mp4", "s[1].fit"):
+        with atomic_file(tmp_path / path):
+            pass
+    for path in ("s1", "out"):
+        with atomic_folder(tmp_path / path):
+            pass
+    kept = [halves["out_2.mp4"].name, halves["out"].name, ".out.settings.mp4", elsewhere.name]
+    assert listing(tmp_path) == sorted(["out", "out.mp4", "s1", "s[1].fit", *kept])
+    begun["out"].kill()
+    begun["out"].wait()
 
 
 def test_a_folder_is_made_with_those_above_it_and_refused_where_none_takes_files(tmp_path, monkeypatch):
