@@ -15,6 +15,10 @@ from render.room import Room
 CHUNKS = 8
 """Chunks of the depth order that are counted and emitted side by side on CPU threads."""
 
+MANY = 32_768
+"""Records from which on torch's sort is the fastest on one core: a third of the time of numpy's for 130,000 of them, where that finds no
+vectors to its liking, and as much where it does."""
+
 
 @dataclass(frozen=True)
 class TileLists:
@@ -34,10 +38,13 @@ class TileLists:
 def depth_order(keys: torch.Tensor) -> torch.Tensor:
     """Indices int32 of the records by rising depth, ties by index; on the CPU without those that are culled, on CUDA they come last: how
     many there are is not asked."""
-    if keys.device.type == "cpu":  # key and index in one number: its sort on a CPU's vectors beats a radix sort of pairs by two
+    if keys.device.type == "cpu":
+        if len(keys) >= MANY:
+            depths, order = keys.sort(stable=True)  # of so many integers torch sorts by radix
+            return order[: int(torch.searchsorted(depths, int(CULLED)))].to(torch.int32)
         culled = keys.numpy()
         (there,) = np.nonzero(culled != int(CULLED))
-        pairs = np.empty((len(there), 2), dtype="<i4")
+        pairs = np.empty((len(there), 2), dtype="<i4")  # key and index in one number, which vectors sort
         pairs[:, 0], pairs[:, 1] = there, culled[there]
         pairs.reshape(-1).view("<i8").sort()
         return torch.from_numpy(pairs[:, 0].copy())
