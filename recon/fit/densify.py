@@ -146,20 +146,17 @@ def _shade(sh: torch.Tensor) -> torch.Tensor:
     return (sh.detach()[:, 0] == sh_from_rgb(BLACK)).all(1)
 
 
-def beside(splats: Splats, boxes: list[np.ndarray]) -> torch.Tensor:
-    """Indices int64 `[M]` of actors' shade beside their boxes, which lies where and as it was laid. Left to themselves such splats stand
-    up, and pass from the recorded path for what is behind them."""
-    first = splats.sizes[0]
-    sizes = torch.tensor(np.array([s[:2] for s in boxes]).reshape(-1, 2) / 2 + BOX_MARGIN, dtype=torch.float32)
-    half = torch.repeat_interleave(sizes, torch.tensor(splats.sizes[1:], dtype=torch.int64), dim=0).to(splats.reach.device)
-    outside = (splats.fields["means"].detach()[first:, :2].abs() > half).any(1)
-    return first + (outside & _shade(splats.fields["sh"][first:])).nonzero()[:, 0]
+def shade_of(splats: Splats) -> torch.Tensor:
+    """Which splats, bool `[N]`, are the shade that actors take along."""
+    black = _shade(splats.fields["sh"])
+    black[: splats.sizes[0]] = False
+    return black
 
 
-def hold_shade(shown: Splats, boxes: list[np.ndarray]) -> None:
-    """Take from actors' shade beside their boxes the gradients that would move, turn, stretch or colour it: it darkens what is below by
-    its opacity alone. Free to, some took the colour of a tail light behind it, or of nothing that there is."""
-    which = beside(shown, boxes)
+def hold_shade(shown: Splats, which: torch.Tensor) -> None:
+    """Take from the shade among splats, bool `[N]`, the gradients that would move, turn, stretch or colour it: it lies where and as it was
+    laid, and darkens what is below by its opacity alone. Free to, some stood up and passed from the recorded path for what is behind it,
+    some took the colour of a tail light, or of nothing that there is."""
     for name in ("means", "quats", "log_scales", "sh"):
         gradient = shown.fields[name].grad
         if gradient is not None:

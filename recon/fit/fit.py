@@ -11,7 +11,7 @@ import torch
 
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, grow, hold_shade, joined, kept
+from recon.fit.densify import Growth, grow, hold_shade, joined, kept, shade_of
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
@@ -149,7 +149,7 @@ class Fit:
         which = self._in_sight(view, camera, ends, aside)
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
-        known = self._known(view)
+        known, shade = self._known(view), shade_of(shown)
         by_lot = self._drawn_by_lot(shown)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
@@ -164,7 +164,7 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            closing = shown.held(self.flat_ground.on(shown), ("means", "quats"))
+            closing = shown.held(self.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
             (solid,) = draw(self._placed(closing, view, aside), aside, "alpha", scale=scale_of(view, aside))
             haze = haze + self.openings.gaps(solid, aside)
         for weight, there in known:
@@ -176,7 +176,7 @@ class Fit:
         colours = shown.fields["sh"].grad
         if self.guessed is not None and colours is not None:
             colours.mul_(~self.guessed[which, None, None])
-        hold_shade(shown, self.motion.boxes)
+        hold_shade(shown, shade)
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         self.descent.follow(self.splats, which, shown, rates, self.growth)
         self.flat_ground.press(self.splats, which, self.descent, rates, self._settled(), camera.world_from_cam.detach()[:3, 3])

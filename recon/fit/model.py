@@ -57,7 +57,8 @@ class Splats:
 
     def held(self, which: torch.Tensor, names: Sequence[str]) -> Splats:
         """The same splats, of which some, bool `[N]`, are not differentiated by these fields."""
-        still = {name: torch.where(which[:, None], self.fields[name].detach(), self.fields[name]) for name in names}
+        of = {name: self.fields[name] for name in names}
+        still = {name: torch.where(which.view(-1, *[1] * (field.ndim - 1)), field.detach(), field) for name, field in of.items()}
         return Splats(self.fields | still, self.sizes, self.reach)
 
     def group_of(self) -> torch.Tensor:

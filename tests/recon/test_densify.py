@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.fit.densify import Growth, beside, grow, kept
+from recon.fit.densify import Growth, grow, kept, shade_of
 from recon.fit.model import Splats
 from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
@@ -86,12 +86,11 @@ def test_the_shade_of_an_actor_reaches_farther_than_it_does():
     assert (after.fields["sh"] == s.fields["sh"][50]).all(2).all(1).any()
 
 
-def test_shade_is_what_is_black_beside_the_boxes_of_actors():
+def test_shade_is_what_is_black_of_actors():
     s = splats()
-    s.fields["means"][[3, 55, 58, 61]] = torch.tensor([5.0, 0, 0])
-    s.fields["sh"][[3, 55, 56, 61]] = sh_from_rgb(BLACK)
-    assert beside(s, BOXES).tolist() == [55, 61]
-    assert beside(Splats.of([some(4)], [torch.ones(4)]), []).tolist() == [], "a street without actors"
+    s.fields["sh"][[3, 55, 61]] = sh_from_rgb(BLACK)
+    assert shade_of(s).nonzero()[:, 0].tolist() == [55, 61]
+    assert not shade_of(Splats.of([some(4)], [torch.ones(4)])).any(), "a street without actors"
 
 
 def test_a_split_keeps_the_place_and_halves_the_length():

@@ -7,7 +7,8 @@ import torch
 from recon import open_log
 from recon.assets.cleaning import lies_on_road
 from recon.build import begin, choose
-from recon.fit.densify import beside
+from recon.fit.densify import shade_of
+from recon.fit.model import Splats
 from recon.log import Track
 from recon.seeds.shade import ABOVE, BESIDE, shade
 from recon.tracks import LIMBED
@@ -76,7 +77,7 @@ def test_it_lies_as_it_was_laid(drive):
     log = open_log(drive)
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
-    which = beside(fit.splats, fit.motion.boxes)
+    which = shade_of(fit.splats).nonzero()[:, 0]
     before = {name: field[which].clone() for name, field in fit.splats.fields.items()}
     for _ in range(5):
         fit.step()
@@ -86,3 +87,23 @@ def test_it_lies_as_it_was_laid(drive):
     assert torch.equal(before["log_scales"][:, :2], after["log_scales"][:, :2]), "its thickness is what cameras can tell, at least"
     assert torch.equal(before["sh"], after["sh"]), "black, as it was laid"
     assert not torch.equal(before["logits"], after["logits"])
+
+
+def test_it_closes_no_gap_that_is_seen_from_aside(drive, monkeypatch):
+    """Hidden behind another car it would grow dense to close the road there, a dark mat, and fog where it was free to rise."""
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    asked = []
+    gaps = fit.openings.gaps
+
+    def alone(alpha, camera):
+        asked.append(torch.autograd.grad(gaps(alpha, camera), shown[-1].fields["logits"], retain_graph=True)[0])
+        return gaps(alpha, camera)
+
+    shown, select = [], Splats.select
+    monkeypatch.setattr(Splats, "select", lambda self, *which: shown.append(select(self, *which)) or shown[-1])
+    monkeypatch.setattr(fit.openings, "gaps", alone)
+    fit.step()
+    shade = shade_of(shown[-1])
+    assert shade.sum() > 20 and asked and asked[0].any() and not asked[0][shade].any()
