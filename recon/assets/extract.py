@@ -17,6 +17,7 @@ from recon.assets.closing import closed
 from recon.assets.looking import looking_at
 from recon.assets.photos import photos_of
 from recon.assets.sight import FARTHEST, Sight, Views, sight_of
+from recon.mirror import mirrored, within_box
 from render import Frame, rasterize
 from render.album import shots_in
 from render.references import Shot
@@ -33,12 +34,6 @@ from scenes.seen import SECTORS, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
 from scenes.usd_scene import load_recorded
-
-FLOOR = 0.06
-"""Metres above the base of a box under which splats are road, not wheel."""
-
-FAINT = 0.05
-"""Opacity under which a splat is left behind."""
 
 FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10
@@ -184,11 +179,11 @@ def _judged(
         flaw = f"{sight.views} views within {FARTHEST:.0f} m that show a side of it, fewer than {FEWEST_VIEWS}"
     elif (part := silhouette(cut, asset.size)) < FULL_SIDE:
         flaw = f"only {math.floor(100 * part)}% of its side was reconstructed, less than {FULL_SIDE:.0%}"
-    whole, mirrored = completed(cut, sight.left, sight.right) if not flaw else (cut, False)
+    whole, doubled = completed(cut, sight.left, sight.right) if not flaw else (cut, False)
     if not flaw and len(whole) < FEWEST_SPLATS:
         flaw = f"{len(whole)} splats, fewer than {FEWEST_SPLATS}"
     near = round(sight.nearest, 2) if math.isfinite(sight.nearest) else None
-    meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": mirrored, "nearest_m": near}
+    meta = meta | {"views": sight.views, "sectors": sight.sectors, "mirrored": doubled, "nearest_m": near}
     meta["exposure"] = shown_colours(dimmed(whole, gain))
     return Candidate(replace(asset, gaussians=whole, meta=meta), meta["track"], flaw, box, instance, gain)
 
@@ -204,20 +199,6 @@ def silhouette(gaussians: Gaussians, size: torch.Tensor) -> float:
     grid = torch.zeros(1, 1, *shape)
     grid[0, 0, column, row] = 1
     return float(torch.nn.functional.max_pool2d(grid, 3, 1, 1).mean())
-
-
-def within_box(gaussians: Gaussians, size: torch.Tensor) -> Gaussians:
-    """The splats of a box frame that belong to the object: inside, above the floor, not faint, and not sticking out of the box."""
-    half = size[:2].float() / 2 + 0.08
-    means, axes = gaussians.means, matrix_from_quat(gaussians.quats)
-    # from the sides it was not seen from, a splat that the pictures drew out along their rays is a spike
-    spread = 1.5 * (axes.square() * gaussians.log_scales.exp().square()[:, None]).sum(2).sqrt()
-    keep = (means[:, :2].abs() <= half).all(1) & (means[:, 2] > FLOOR) & (means[:, 2] < float(size[2]) + 0.1)
-    keep &= (means[:, :2].abs() + spread[:, :2] < half + 0.12).all(1)
-    keep &= (means[:, 2] + spread[:, 2] < float(size[2]) + 0.15) & (means[:, 2] - spread[:, 2] > FLOOR - 0.15)
-    keep &= torch.sigmoid(gaussians.logit_opacities) > FAINT
-    keep &= gaussians.log_scales.amax(1) < math.log(float(size.min()) / 3)
-    return gaussians.select(keep)
 
 
 def moved(gaussians: Gaussians, to_from_local: torch.Tensor, size: torch.Tensor) -> Gaussians:
@@ -241,11 +222,7 @@ def completed(gaussians: Gaussians, left: float, right: float) -> tuple[Gaussian
     if min(left, right) >= max(left, right) / 3:
         return gaussians, False
     half = gaussians.select(y >= 0 if left > right else y <= 0)
-    mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
-    flip = torch.tensor([1.0, -1.0, 1.0])
-    # of a mirrored rotation the axes x and z turn the other way round
-    other = replace(half, means=half.means * flip, quats=half.quats * torch.tensor([1.0, -1.0, 1.0, -1.0]), sh=turned(half.sh, mirror))
-    return Gaussians.cat([half, other]), True
+    return Gaussians.cat([half, mirrored(half)]), True
 
 
 def thumbnail(asset: Asset) -> bytes:

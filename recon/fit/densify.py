@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,18 +119,17 @@ def kept(splats: Splats, carried: dict[str, torch.Tensor], which: torch.Tensor) 
 
 
 def joined(
-    splats: Splats, carried: dict[str, torch.Tensor], more: Gaussians, reach: torch.Tensor
+    splats: Splats, carried: dict[str, torch.Tensor], more: Sequence[Gaussians], reach: Sequence[torch.Tensor]
 ) -> tuple[Splats, dict[str, torch.Tensor]]:
-    """The splats and `more` of the background, of `reach` `[M]`, behind those that it has; what the new ones carry with them is zeros."""
-    end, fields = splats.sizes[0], Splats.of([more], [reach]).fields
-
-    def inserted(old: torch.Tensor, new: torch.Tensor) -> torch.Tensor:
-        return torch.cat([old[:end], new.to(old), old[end:]])
-
-    after = {k: inserted(v.detach(), fields[k]) for k, v in splats.fields.items()}
-    sizes = [end + len(more), *splats.sizes[1:]]
-    carried = {k: inserted(t, t.new_zeros(len(more), *t.shape[1:])) for k, t in carried.items()}
-    return Splats(after, sizes, inserted(splats.reach, reach)), carried
+    """The splats, and `more` of each group, the background first, behind those that it has; reach `[M]` of each. What the new ones carry
+    with them is zeros."""
+    new = Splats.of(list(more), list(reach)).to(splats.reach.device)
+    groups = torch.cat([splats.group_of(), new.group_of()])
+    order = torch.argsort(groups, stable=True)
+    after = {k: torch.cat([v.detach(), new.fields[k]])[order] for k, v in splats.fields.items()}
+    carried = {k: torch.cat([t, t.new_zeros(len(new), *t.shape[1:])])[order] for k, t in carried.items()}
+    sizes = torch.bincount(groups, minlength=len(splats.sizes)).tolist()
+    return Splats(after, sizes, torch.cat([splats.reach, new.reach])[order]), carried
 
 
 def _within(means: torch.Tensor, group: torch.Tensor, boxes: list[np.ndarray], shade: torch.Tensor) -> torch.Tensor:

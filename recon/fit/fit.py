@@ -15,6 +15,7 @@ from recon.fit.densify import Growth, grow, hold_shade, joined, kept, shade_of
 from recon.fit.descent import Descent, rates_at
 from recon.fit.develop import developed
 from recon.fit.flat import FlatGround
+from recon.fit.halves import ROOM, halves, outdone
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, draw, placed_groups
@@ -271,8 +272,18 @@ class Fit:
 
     @torch.no_grad()
     def _guess(self) -> None:
-        """Give what pictures hardly show its neighbours' colours, to keep, once what went astray since the last growth is gone."""
+        """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray is gone."""
         self._renew(*kept(self.splats, self.descent.tensors(), ~(self.swept.holds(self.splats) | self.clear.holds(self.splats))))
+        part, inside = self._shown()
+        stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
+        self._renew(*kept(self.splats, self.descent.tensors(), stays))
+        part = self._completed(part[stays])
+        self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
+        self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
+        self.descent.still_colours(self.guessed)
+
+    def _shown(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the picture shows that shows most of each splat `[N]`, and whether any has its middle in it, by `shown_parts`."""
         part, inside = torch.zeros_like(self.splats.reach), torch.zeros_like(self.splats.reach, dtype=torch.bool)
         for view in self.training:
             camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
@@ -281,12 +292,19 @@ class Fit:
             shown, within = shown_parts(placed, camera, scale_of(view, camera))
             part[which] = torch.maximum(part[which], shown)
             inside[which] |= within
-        stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
+        return part, inside
+
+    def _completed(self, part: torch.Tensor) -> torch.Tensor:
+        """Give vehicles the halves that no picture shows. part: what pictures show of each splat `[N]`; returned of all there are then."""
+        more, reach = halves(self.splats, part, self.motion.tracks)
+        if not any(map(len, more)):
+            return part
+        splats, carried = joined(self.splats, self.descent.tensors() | {"part": part, "old": torch.ones_like(part)}, more, reach)
+        part, old = carried.pop("part"), carried.pop("old") > 0
+        self._renew(splats, carried)
+        stays = ~outdone(self.splats, part, old, self._shown()[0], self.config.budget)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
-        part = part[stays]
-        self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
-        self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
-        self.descent.still_colours(self.guessed)
+        return part[stays]
 
     def _settled(self) -> float:
         """How long steps still are: towards the end they become ever shorter."""
@@ -333,7 +351,8 @@ class Fit:
         """Split where most is wrong and pictures pull, drop what does not show."""
         left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
         carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
-        self._renew(*grow(self.splats, carried, self.growth, self.config.budget, left, self.motion.boxes, astray))
+        budget = round(self.config.budget * (1 - ROOM)) if self.motion.tracks else self.config.budget
+        self._renew(*grow(self.splats, carried, self.growth, budget, left, self.motion.boxes, astray))
 
     @torch.no_grad()
     def _refill(self) -> None:
@@ -347,7 +366,7 @@ class Fit:
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 more = fewer(more, max(0, self.config.budget - len(self.splats)))
                 reach = reach_of(more, path, self.motion.rig).to(self.device)
-                self._renew(*joined(self.splats, self.descent.tensors(), more, reach))
+                self._renew(*joined(self.splats, self.descent.tensors(), [more], [reach]))
 
     def _renew(self, splats: Splats, carried: dict[str, torch.Tensor]) -> None:
         """Go on with other splats, and what each carries with it."""

@@ -8,9 +8,10 @@ import torch
 from street import box, car, rig
 
 from recon import extract_assets
-from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned, within_box
+from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned
 from recon.assets.looking import looking_at
 from recon.assets.sight import Views, sight_of
+from recon.mirror import within_box
 from render import rasterize, render_frame
 from render.album import keep_photos
 from render.references import Shot
