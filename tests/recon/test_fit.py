@@ -258,7 +258,7 @@ def test_views_come_as_often_as_they_should_and_none_waits_for_long():
     assert len(rounds) > 15, "in another order each time"
 
 
-def test_nothing_is_left_standing_where_something_drove(drive):
+def test_nothing_is_left_standing_where_something_drove(drive, monkeypatch):
     log = open_log(drive)
     names, span = choose(log)
     start, fit = begin(log, names, span, SIZE, CONFIG, 4)
@@ -277,6 +277,7 @@ def test_nothing_is_left_standing_where_something_drove(drive):
     squares, last = tensors["moments"][:, 1].uniform_().clone(), tensors["last"].random_(90).clone()
     stays = ~(fit.swept.holds(fit.splats) | fit.clear.holds(fit.splats))
     assert not stays[:20].any() and stays[20:].float().mean() > 0.9
+    monkeypatch.setattr("recon.fit.fit.halves", lambda *told: ([], []))  # which would change the cars
     fit._guess()
     tensors = fit.descent.tensors()
     assert torch.equal(tensors["moments"][:, 1], squares[stays]) and torch.equal(tensors["last"], last[stays])
