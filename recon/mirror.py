@@ -22,7 +22,7 @@ SOLID = 0.3
 """Opacity from which on a splat tells that something is where it is."""
 
 THERE = 0.15
-"""Metres from something solid within which a mirror image is not needed."""
+"""Metres from something solid within which nothing is added to it."""
 
 FEWEST = 50
 """Solid splats from which on a vehicle has a side to be mirrored."""

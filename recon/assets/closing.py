@@ -18,7 +18,8 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from recon.assets.patching import CLEARANCE, OPAQUE, SOLID, STEP, in_colours_of, patched, shown_alone
+from recon.assets.patching import CLEARANCE, OPAQUE, STEP, in_colours_of, patched, shown_alone
+from recon.mirror import SOLID, THERE
 from recon.tracks import VEHICLES
 from scenes.asset import Asset
 from scenes.gaussians import Gaussians
@@ -29,9 +30,6 @@ ENDS = {"front": 1.0, "rear": -1.0}
 
 ROW = 0.08
 """Metres between the heights at which a vehicle's outline is taken."""
-
-THERE = 0.15
-"""Metres within which what was reconstructed is kept, and nothing added."""
 
 HOLE = 6
 """Points within two steps of one, itself among them, from which on what lets light through is a hole; 13 where all do."""

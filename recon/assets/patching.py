@@ -14,6 +14,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from recon.mirror import SOLID
 from recon.seeds.points import Cloud, splats_from
 from render import Frame, rasterize
 from scenes.camera import Camera
@@ -26,9 +27,6 @@ CLEARANCE = 0.25
 
 STEP = 0.05
 """Metres between the splats that close something."""
-
-SOLID = 0.3
-"""Opacity from which on a splat is a part of the outline."""
 
 OPAQUE = 0.8
 """Alpha from which on there is no hole."""

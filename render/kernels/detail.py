@@ -3,7 +3,7 @@
 import warp as wp
 
 from render.kernels.flow import shows
-from render.kernels.types import OPTIONS, pixel_of
+from render.kernels.types import OPTIONS, pixel_of, pixels_of
 
 wp.set_module_options(OPTIONS)
 
@@ -73,8 +73,8 @@ def looked_up(other: Other, here: Here, row: int, column: int, hides: float):
 @wp.kernel
 def carry_over(other: Other, here: Here, hides: float, keep: float, detail: wp.array2d[wp.vec4], stretch: int, first: int):
     """Of the detail of the view before, `keep` is kept, where it is known."""
-    begin = stretch * (first + wp.tid())
-    for item in range(begin, wp.min(begin + stretch, detail.shape[0] * detail.shape[1])):
+    begin, end = pixels_of(first + wp.tid(), stretch, detail.shape[0], detail.shape[1])
+    for item in range(begin, end):
         row, column = pixel_of(item, detail.shape[1])
         found, known = looked_up(other, here, row, column, hides)
         if known > 0.0:
@@ -89,8 +89,8 @@ def add_photo(
 ):  # fmt: skip
     """A photo's detail, by how sure it is: sums of that, with the sum of the weights in w, and of its mean square. parallax: what it
     adds to the noise, times the distance."""
-    begin = stretch * (first + wp.tid())
-    for item in range(begin, wp.min(begin + stretch, depth.shape[0] * depth.shape[1])):
+    begin, end = pixels_of(first + wp.tid(), stretch, depth.shape[0], depth.shape[1])
+    for item in range(begin, end):
         row, column = pixel_of(item, depth.shape[1])
         found, known = looked_up(other, here, row, column, hides)
         if known > 0.0:

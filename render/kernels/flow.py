@@ -6,7 +6,7 @@ import warp as wp
 
 from render.kernels.lenses import ROUND, LensFunctions
 from render.kernels.lenses.optics import Optics
-from render.kernels.types import OPTIONS, pixel_of
+from render.kernels.types import OPTIONS, pixel_of, pixels_of
 
 wp.set_module_options(OPTIONS)
 
@@ -27,8 +27,8 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
         """bends: how far a point moves within its instance, seen from here. ways[place[instance], k, line]: coefficient of the k-th power
         of the share; the line is the pixel's row or column where each has its own. The last of the ways is the sky's, which only turns.
         depths: the points' own in the other camera, inf for the sky."""
-        begin = stretch * (first + wp.tid())
-        for item in range(begin, wp.min(begin + stretch, depth.shape[0] * depth.shape[1])):
+        begin, end = pixels_of(first + wp.tid(), stretch, depth.shape[0], depth.shape[1])
+        for item in range(begin, end):
             row, column = pixel_of(item, depth.shape[1])
             powers = ways.shape[1]
             line = int(0)
@@ -83,7 +83,7 @@ def see(
     stretch: int, first: int,
 ):  # fmt: skip
     """Which points show there: `shows`."""
-    begin = stretch * (first + wp.tid())
-    for item in range(begin, wp.min(begin + stretch, seen.shape[0] * seen.shape[1])):
+    begin, end = pixels_of(first + wp.tid(), stretch, seen.shape[0], seen.shape[1])
+    for item in range(begin, end):
         row, column = pixel_of(item, pixels.shape[1])
         seen[row, column] = shows(pixels[row, column], depths[row, column], hides, there)

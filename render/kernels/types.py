@@ -127,6 +127,13 @@ def pixel_of(item: int, width: int):
 
 
 @wp.func
+def pixels_of(item: int, stretch: int, height: int, width: int):
+    """Of the pixels that an item does, `stretch` in a row, the first, and the one behind the last."""
+    begin = stretch * item
+    return begin, wp.min(begin + stretch, height * width)
+
+
+@wp.func
 def matrix_at(rows: wp.array2d[wp.float64], d: int, at: int):
     return wp.mat33d(
         rows[d, at], rows[d, at + 1], rows[d, at + 2],
