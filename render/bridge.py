@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 import warp as wp
@@ -18,6 +19,7 @@ from render.projected import Projected
 from render.projection import projection, uniforms
 from render.settings import Settings
 from render.work import Work, work
+from scenes.lenses import Lens
 
 FIELDS = 5
 """Tensors of one `Gaussians`."""
@@ -45,10 +47,20 @@ def _copied(per_splat: torch.Tensor, copies: int) -> torch.Tensor:
 def prepare(settings: Settings, seen, poses: torch.Tensor, lens: torch.Tensor, fields) -> tuple[Work, list, torch.Tensor]:
     """What the host finds out before the device begins: arguments as of `Rasterize`; the work, and what its kernels are told: of all poses
     together, and of each as rows, still on the host."""
-    copies = projection(settings.lens, settings.rolling).copies
     instances = [tuple(f.contiguous() for f in fields[i : i + FIELDS]) for i in range(0, len(fields), FIELDS)]
-    *told, rows = uniforms(settings, settings.lens(*lens.tolist()), poses.detach().cpu(), copies)
-    return work(instances, seen, copies), told, rows
+    return work(instances, seen, projection(settings.lens, settings.rolling).copies), *told_of(settings, poses, lens)
+
+
+def told_of(settings: Settings, poses: torch.Tensor, lens: torch.Tensor) -> tuple[list, torch.Tensor]:
+    """What projection's kernels are told of the camera, and as rows of every pose, on the host: all that changes from pose to pose."""
+    copies = projection(settings.lens, settings.rolling).copies
+    *told, rows = uniforms(settings, _lens(settings.lens, *lens.tolist()), poses.detach().cpu(), copies)
+    return told, rows
+
+
+@lru_cache(maxsize=16)
+def _lens(kind: type[Lens], *params: float) -> Lens:
+    return kind(*params)
 
 
 def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, features, frames, rays) -> tuple[Projected, Picture]:
@@ -81,6 +93,15 @@ def pictures(settings: Settings, picture: Picture) -> tuple[torch.Tensor | None,
     median = picture.picks[MEDIAN] if settings.wanted.median else None
     instance = torch.where(alpha < 0.5, -1, picture.picks[WHO]).to(torch.int32) if settings.wanted.instance else None
     return picture.planes[1:4], alpha, z, weights, channels, median, instance
+
+
+def drawn_only(settings: Settings, seen, poses, lens, features, frames, rays, *fields) -> tuple[torch.Tensor | None, ...]:
+    """What `Rasterize` gives, where nobody will ask for a gradient: of many instances autograd alone would take a third of a GPU's frame."""
+    settings = replace(settings, gradients=False)
+    with torch.no_grad():
+        todo, told, rows = prepare(settings, seen, poses, lens, fields)
+        _, picture = paint(settings, todo, told, upload(rows, fields[0].device), features, frames, rays)
+        return pictures(settings, picture)
 
 
 class Rasterize(torch.autograd.Function):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import torch
 import warp as wp
 
-from render.bridge import paint, pictures, prepare
+from render.bridge import paint, pictures, prepare, told_of
 from render.frame_types import Frame, RenderConfig
 from render.kernels.types import Wanted
 from render.launch import stage, upload
@@ -69,7 +69,9 @@ class Captured:
         )
         if self._settings.by_rays:
             raise ValueError('response "ray" and order "pixel" cannot be recorded; ask rasterize for them')
-        self._todo, self._told, rows = self._prepared(camera)
+        fields = [t for p in self.placed for t in p.gaussians.tensors().values()]
+        self._lens = camera.lens.params()
+        self._todo, self._told, rows = prepare(self._settings, None, poses(camera, self.placed), self._lens, fields)
         self._rows = upload(rows, self._device)
         self._graph: torch.cuda.CUDAGraph | None = None
         # for how many entries; the graph's pictures, and the counts that it leaves
@@ -79,18 +81,14 @@ class Captured:
         """The frames of cameras that differ in their poses and times alone; see `one_ahead`."""
         return one_ahead(self._draw, cameras, self.room)
 
-    def _prepared(self, camera: Camera):
-        fields = [t for p in self.placed for t in p.gaussians.tensors().values()]
-        with torch.no_grad():
-            return prepare(self._settings, None, poses(camera, self.placed), camera.lens.params(), fields)
-
     def _draw(self, camera: Camera) -> Frame:
-        same = (camera.lens.key(), camera.width, camera.height, camera.shutter, moves(camera, self.placed))
-        if same != (self.camera.lens.key(), self.camera.width, self.camera.height, self.camera.shutter, self._settings.rolling):
+        if self._shared(camera) != self._shared(self.camera):
             raise ValueError("all cameras of a recording must share lens, size and shutter; record another for this one")
         check_poses([], camera)
         check_projection(camera, self.placed, self._settings.model)
-        self._rows.copy_(upload(self._prepared(camera)[2], self._device))
+        with torch.no_grad():
+            _, rows = told_of(self._settings, poses(camera, self.placed), self._lens)
+            self._rows.copy_(upload(rows, self._device))
         if self._device.type != "cuda":
             with stage(self._device):
                 return Frame(camera, **self._paint())
@@ -102,6 +100,9 @@ class Captured:
         for count in needed:
             self.room.note(count)
         return Frame(camera, **{name: picture.clone() for name, picture in recorded.items()})
+
+    def _shared(self, camera: Camera) -> tuple:
+        return camera.lens.key(), camera.width, camera.height, camera.shutter, moves(camera, self.placed)
 
     def _paint(self) -> dict[str, torch.Tensor]:
         with torch.no_grad():

@@ -52,10 +52,11 @@ def draw(settings: Settings, scene: Projected) -> Picture:
     x, y, width, height = settings.part
     whole = window(settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y)
     parts: list[Part] = []
-    divided = [whole] if settings.room else windows(scene.records, scene.counts, whole, settings.config.most_entries)
+    total = None if settings.room else int(scene.counts.sum(dtype=torch.int64))
+    divided = [whole] if total is None else windows(scene.records, scene.counts, whole, settings.config.most_entries, total)
     planes = picks = scene.records
     for w in divided:
-        lists, counts = _lists(settings, scene, w, alone=len(divided) == 1)
+        lists, counts = _lists(settings, scene, w, len(divided) == 1, total)
         drawn, picked, ends = _composite(settings, w, lists, scene)
         if len(divided) == 1:
             planes, picks = drawn, picked
@@ -89,7 +90,7 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     for part in parts:
         lists, counts = part.lists, part.counts
         if lists is None or counts is None:
-            lists, counts = _lists(settings, scene, part.window, alone=False)
+            lists, counts = _lists(settings, scene, part.window, False)
         slots = torch.empty(lists.ids.shape[0], GRADIENTS, dtype=torch.float32, device=device)
         channel_slots = torch.empty(lists.ids.shape[0], scene.channels, dtype=torch.float32, device=device)
         grads = _of_part(settings, part, wanted)
@@ -115,12 +116,13 @@ def draw_backward(settings: Settings, scene: Projected, parts: list[Part], gradi
     return Slots(sums.counts, sums.starts, sums.slots, g_features, g_frames, g_rays)
 
 
-def _lists(settings: Settings, scene: Projected, w: Window, alone: bool) -> tuple[TileLists, torch.Tensor]:
-    """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up."""
+def _lists(settings: Settings, scene: Projected, w: Window, alone: bool, total: int | None = None) -> tuple[TileLists, torch.Tensor]:
+    """The window's tile lists and each record's count in them. alone: the window is all that is drawn, so the counts may be used up, whose
+    sum is total, where it is known."""
     counts = scene.counts if alone else room_in(scene.records, scene.counts, w)
     drawn = settings.drawn_tiles(counts.device)
     told = (w, drawn, settings.gradients, counts.device.type == "cpu" and settings.room is None, settings.room)
-    return tile_lists(scene.records, scene.reach, scene.order, counts, *told), counts
+    return tile_lists(scene.records, scene.reach, scene.order, counts, *told, total if alone else None), counts
 
 
 def _planes(w: Window, count: int, device) -> torch.Tensor:

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
+import numpy as np
 import torch
 
 from render.kept import kept_beside
@@ -28,7 +30,7 @@ CLUSTER = 1024
 """Splats of a cluster: a whole number of items."""
 
 
-def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> list[torch.Tensor | None]:
+def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> list[np.ndarray | None]:
     """bool `[items]` for each of `placed`: which of its runs of ITEM splats `camera` may see; None where all are drawn without a look."""
     if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
         return [None] * len(placed)
@@ -37,15 +39,15 @@ def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> lis
     return [_of_items(next(seen), len(p.gaussians)) if len(p.gaussians) else None for p in placed]
 
 
-def _of_items(clusters: torch.Tensor, splats: int) -> torch.Tensor:
-    return clusters.repeat_interleave(CLUSTER // ITEM)[: -(-splats // ITEM)]
+def _of_items(clusters: np.ndarray, splats: int) -> np.ndarray:
+    return clusters.repeat(CLUSTER // ITEM)[: -(-splats // ITEM)]
 
 
-def splats_in_sight(placed: Sequence[Placed], seen: Sequence[torch.Tensor | None]) -> torch.Tensor:
+def splats_in_sight(placed: Sequence[Placed], seen: Sequence[np.ndarray | None]) -> torch.Tensor:
     """int64 `[M]`, of all splats of `placed`, one after the other, those that are projected."""
     sizes = [len(p.gaussians) for p in placed]
-    shown = [torch.ones(n, dtype=torch.bool) if s is None else s.repeat_interleave(ITEM)[:n] for s, n in zip(seen, sizes, strict=True)]
-    return torch.cat(shown).nonzero()[:, 0].to(placed[0].gaussians.device)
+    shown = [np.ones(n, dtype=bool) if s is None else s.repeat(ITEM)[:n] for s, n in zip(seen, sizes, strict=True)]
+    return torch.from_numpy(np.flatnonzero(np.concatenate(shown))).to(placed[0].gaussians.device)
 
 
 def differentiated(placed: Sequence[Placed], camera: Camera, features: torch.Tensor | Sequence[torch.Tensor] | None = None) -> bool:
@@ -60,33 +62,37 @@ def differentiated(placed: Sequence[Placed], camera: Camera, features: torch.Ten
 
 def view_sides(camera: Camera, model: SplatModel) -> torch.Tensor:
     """Unit normals `[5, 3]`, out of the view, of the planes through the eye that bound it, and of the plane of the camera."""
-    left, right, top, bottom = view_box(camera.lens, camera.width, camera.height, 4 * math.sqrt(model.widening) + 1)
+    return _sides(camera.lens.key(), camera.width, camera.height, 4 * math.sqrt(model.widening) + 1)
+
+
+@lru_cache(maxsize=64)
+def _sides(lens: tuple, width: int, height: int, margin: float) -> torch.Tensor:
+    left, right, top, bottom = view_box(lens[0](*lens[1:]), width, height, margin)
     normals = [[1, 0, -right], [-1, 0, left], [0, 1, -bottom], [0, -1, top], [0, 0, -1]]
     return torch.nn.functional.normalize(torch.tensor(normals, dtype=torch.float64), dim=1)
 
 
-def _seen(placed: Sequence[Placed], camera: Camera, sides: torch.Tensor) -> list[torch.Tensor]:
+def _seen(placed: Sequence[Placed], camera: Camera, sides: torch.Tensor) -> list[np.ndarray]:
     """For each cluster of each instance, whether it lies beyond none of the sides."""
     if not placed:
         return []
     centres, radii = zip(*(bounds(p.gaussians) for p in placed), strict=True)
-    sizes = [len(r) for r in radii]
+    ends = np.cumsum([len(r) for r in radii])
     poses = inverse(camera.world_from_cam) @ torch.stack([p.world_from_local for p in placed])
-    poses = poses.cpu().repeat_interleave(torch.tensor(sizes), 0)
-    there = (poses[:, :3, :3] @ torch.cat(centres)[..., None])[..., 0] + poses[:, :3, 3]
+    poses = poses.detach().cpu().numpy().repeat([len(r) for r in radii], 0)
+    there = np.einsum("cij,cj->ci", poses[:, :3, :3], np.concatenate(centres)) + poses[:, :3, 3]
     # a bound that is not a number is not beyond anything
-    beyond = (there @ sides.T > torch.cat(radii)[:, None]).any(1)
-    return list((~beyond).split(sizes))
+    beyond = (there @ sides.numpy().T > np.concatenate(radii)[:, None]).any(1)
+    return np.split(~beyond, ends[:-1])
 
 
-def bounds(g: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
-    """Centres `[C, 3]` and radii `[C]`, float64 on the CPU, of spheres around the clusters' ellipsoids of 3.33 sigma; kept until the splats
-    change."""
+def bounds(g: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Centres `[C, 3]` and radii `[C]`, float64, of spheres around the clusters' ellipsoids of 3.33 sigma; kept until the splats change."""
     return _spheres(g.means, g.log_scales, CLUSTER)
 
 
 @kept_beside
-def _spheres(means: torch.Tensor, log_scales: torch.Tensor, cluster: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _spheres(means: torch.Tensor, log_scales: torch.Tensor, cluster: int) -> tuple[np.ndarray, np.ndarray]:
     spare = -len(means) % cluster  # the last cluster is filled up with its last splat
     means, reach = means.detach(), float(REACH) * log_scales.detach().amax(1).exp()
     means = torch.cat([means, means[-1:].expand(spare, 3)]).view(-1, cluster, 3)
@@ -94,5 +100,5 @@ def _spheres(means: torch.Tensor, log_scales: torch.Tensor, cluster: int) -> tup
     centres = 0.5 * (means.amin(1) + means.amax(1))
     radii = ((means - centres[:, None]).norm(dim=2) + reach).amax(1)
     # float32's rounding here and in the kernels
-    centres, radii = centres.double().cpu(), radii.double().cpu()
-    return centres, radii * (1 + 1e-5) + 1e-5 * centres.norm(dim=1)
+    centres, radii = centres.double().cpu().numpy(), radii.double().cpu().numpy()
+    return centres, radii * (1 + 1e-5) + 1e-5 * np.linalg.norm(centres, axis=1)

@@ -4,6 +4,7 @@ Warp runs a CPU launch as one serial loop and releases the GIL, so bands on a th
 makes the result the same bits on any number of threads.
 """
 
+import math
 import os
 import sys
 import threading
@@ -189,7 +190,10 @@ def _threads() -> int:
         return new.submit(torch.get_num_threads).result()
 
 
-_WARP_TYPES = {float: wp.float32, int: wp.int32}
+_SCALARS = {float: torch.float32, int: torch.int32}
+"""Torch's name for what kernels call by Python's."""
+
+_ARRAY = type(wp.from_torch(torch.zeros(1), return_ctype=True))
 
 
 def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
@@ -198,11 +202,27 @@ def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
 
 
 def view(tensor: torch.Tensor, dtype) -> object:
-    """A torch tensor as a Warp array of `dtype`, no copy, no Python object: what `run` takes."""
-    return wp.from_torch(tensor.detach(), dtype=_WARP_TYPES.get(dtype, dtype), requires_grad=False, return_ctype=True)
+    """A torch tensor as a Warp array of `dtype`, no copy, no Python object: what `run` takes.
+
+    As Warp's own `from_torch`, which takes five times as long: a frame has two dozen of these, and a GPU waits for them. dtype: of a number,
+    or of a vector or matrix, which are the last dimensions then. ValueError for another dtype or shape.
+    """
+    size, element = _layout(dtype, tensor.dtype)
+    shape, strides = tensor.shape, tensor.stride()
+    if element:
+        inner = len(element)
+        if shape[-inner:] != element or strides[-1] != 1 or strides[-inner] != math.prod(element[1:]):
+            raise ValueError(f"an array of {dtype.__name__} must end in {element}, one beside the other, got {tuple(shape)} by {strides}")
+        shape, strides = shape[:-inner] or (1,), strides[:-inner] or (1,)
+    array = _ARRAY(tensor.data_ptr(), 0, len(shape), shape, [size * stride for stride in strides])
+    array._ref = tensor  # until it is launched
+    return array
 
 
-def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int) -> None:
-    """Stable radix sort of the first `count` int32 pairs in place; both tensors hold room for `2 * count`."""
-    first, second = (wp.from_torch(t, dtype=wp.int32) for t in (keys, values))
-    wp.utils.radix_sort_pairs(first, second, count)  # type: ignore[arg-type]  # without return_ctype these are arrays
+@cache
+def _layout(dtype, kind: torch.dtype) -> tuple[int, tuple[int, ...]]:
+    """Bytes of a number, and the shape of an element; () where that is a number."""
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    if (_SCALARS.get(scalar) or wp.dtype_to_torch(scalar)) != kind:
+        raise ValueError(f"a kernel's array of {dtype.__name__} cannot be a tensor of {kind}")
+    return kind.itemsize, getattr(dtype, "_shape_", ())

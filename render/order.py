@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 
-from render.kernels.bin import WITH_SLOTS, deal, emit_pairs
+from render.kernels.bin import WITH_SLOTS, cut_lists, deal, emit_pairs
 from render.kernels.types import CULLED, Window
-from render.launch import run, sort_pairs, view
+from render.launch import run, view
 from render.room import Room
 
 CHUNKS = 8
@@ -48,29 +49,25 @@ def depth_order(keys: torch.Tensor) -> torch.Tensor:
         pairs[:, 0], pairs[:, 1] = there, culled[there]
         pairs.reshape(-1).view("<i8").sort()
         return torch.from_numpy(pairs[:, 0].copy())
-    n = len(keys)
-    pair = keys.new_empty(2, 2 * n)
-    pair[0, :n], pair[1, :n] = keys, torch.arange(n, dtype=torch.int32, device=keys.device)
-    if n:
-        sort_pairs(pair[0], pair[1], n)
-    return pair[1, :n]
+    return keys.sort(stable=True).indices.to(torch.int32)
 
 
 def tile_lists(
     records: torch.Tensor, reach: torch.Tensor, order: torch.Tensor, counts: torch.Tensor, window: Window, drawn: torch.Tensor,
-    slots: bool = True, counting: bool = True, room: Room | None = None,
+    slots: bool = True, counting: bool = True, room: Room | None = None, total: int | None = None,
 ) -> TileLists:  # fmt: skip
     """Deal the visible records, sorted by depth, to the window's tiles: by a stable counting pass, or (CUDA) by a stable sort of tiles.
 
     counts `[N]`: entries to set aside for each record. drawn int32 `[tiles_y, tiles_x]` of the image: 0 for tiles that shall have no
-    entries. slots: whether gradients will need slots; then counts become how many each record has. room: for as many entries, of a sort.
+    entries. slots: whether gradients will need slots; then counts become how many each record has. Of a sort, room: for as many entries;
+    total: the sum of counts, where it is known.
     """
     if len(order) == 0:
         none = torch.empty(0, dtype=torch.int32, device=records.device)
         return TileLists(none.new_zeros(window.tiles_x * window.tiles_y + 1), none, none, torch.zeros_like(counts))
     if counting:
         return _by_counting(records, reach, order, counts, window, drawn, slots)
-    return _by_sorting(records, order, counts, window, drawn, room)
+    return _by_sorting(records, order, counts, window, drawn, room, total)
 
 
 def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bool) -> TileLists:
@@ -99,24 +96,24 @@ def _by_counting(records, reach, order, counts, window: Window, drawn, slots: bo
     return TileLists(starts, ids, slot_of, first_slot)
 
 
-def _by_sorting(records, order, counts, window: Window, drawn, room: Room | None) -> TileLists:
+def _by_sorting(records, order, counts, window: Window, drawn, room: Room | None, total: int | None) -> TileLists:
     device, tiles = records.device, window.tiles_x * window.tiles_y
-    in_order = counts[order]
+    in_order = counts.index_select(0, order)
     ends = in_order.cumsum(0)
-    if room is None:
-        total = max(1, int(ends[-1]))
-    else:
+    if room is not None:
         total = room.entries
         room.note(ends[-1])
-    first_slot = torch.empty_like(counts)
-    first_slot[order] = (ends - in_order).clamp(max=total).to(torch.int32)
-    pair = torch.zeros(2, 2 * total, dtype=torch.int32, device=device)
-    pair[0] = tiles
-    owner = torch.zeros(total, dtype=torch.int32, device=device)
-    told = [view(records, float), view(order, int), window, view(drawn, int), view(first_slot, int), view(counts, int), total]
-    run(emit_pairs, len(order), [*told, view(pair[0], int), view(pair[1], int), view(owner, int)], device)
-    sort_pairs(pair[0], pair[1], total)
-    slot_of = pair[1, :total].clone()
-    edges = torch.arange(tiles + 1, dtype=torch.int32, device=device)
-    starts = torch.searchsorted(pair[0, :total].contiguous(), edges).to(torch.int32)
-    return TileLists(starts, owner[slot_of.long()], slot_of, first_slot)
+    elif total is None:
+        total = int(ends[-1])
+    total = max(1, total)
+    first_slot, owner, ids, slot_of = (torch.empty(n, dtype=torch.int32, device=device) for n in (len(counts), total, total, total))
+    tile_of = torch.full((total,), tiles, dtype=torch.int32, device=device)
+    told = [view(records, float), view(order, int), window, view(drawn, int), view(in_order, int), view(ends, wp.int64), total]
+    out = [view(counts, int), view(first_slot, int), view(tile_of, int), view(owner, int)]
+    run(emit_pairs, len(order), [*told, *out], device)
+    # a radix sort goes through what keys have of bits, and tiles of all but giant pictures need no more than 16
+    by_tile = (tile_of.to(torch.int16) if tiles < 2**15 else tile_of).sort(stable=True).indices
+    starts = torch.empty(tiles + 1, dtype=torch.int32, device=device)
+    of_entries = [view(by_tile, wp.int64), view(tile_of, int), view(owner, int), tiles]
+    run(cut_lists, total, [*of_entries, view(starts, int), view(ids, int), view(slot_of, int)], device)
+    return TileLists(starts, ids, slot_of, first_slot)

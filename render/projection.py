@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -129,11 +130,13 @@ def projection(lens: type[Lens], rolling: bool) -> Projection:
 def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -> list:
     """What the kernels of `projection` are told of the camera and, as rows, of all instances with `poses` `[P, C, 4, 4]`."""
     view = _view(replace(settings, mask=None, instances=(), looks=(), room=None), lens)  # a key that is kept must not keep a mask
-    instances = torch.tensor(settings.instances, dtype=torch.float64)[:, None]
     if isinstance(lens, Pinhole) and not settings.rolling:
-        rotation, translation = poses[:, 0, :3, :3], poses[:, 0, :3, 3]
-        eye = -(rotation.mT @ translation[..., None])[..., 0]
-        return [view, torch.cat([rotation.flatten(1), translation, eye, instances], 1)]
+        cam_from_local = poses[:, 0].numpy()
+        rotation, translation = cam_from_local[:, :3, :3], cam_from_local[:, :3, 3]
+        eye = -(translation[:, None] @ rotation)[:, 0]
+        rows = [rotation.reshape(-1, 9), translation, eye, np.array(settings.instances, dtype=np.float64)[:, None]]
+        return [view, torch.from_numpy(np.concatenate(rows, 1))]
+    instances = torch.tensor(settings.instances, dtype=torch.float64)[:, None]
     optics = optics_of(lens)
     powers = torch.cat([poses[..., :3, :3].flatten(2), poses[..., :3, 3]], 2)
     powers = torch.nn.functional.pad(powers, (0, 0, 0, POWERS - powers.shape[1])).flatten(1)

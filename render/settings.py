@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 
@@ -69,7 +70,7 @@ class Settings:
     def drawn_tiles(self, device: torch.device) -> torch.Tensor:
         """int32 `[rows, columns]` of all the image's tiles: 0 for those without a pixel of the mask."""
         if self.mask is None:
-            return torch.ones(-(-self.height // TILE), -(-self.width // TILE), dtype=torch.int32, device=device)
+            return _all_tiles(-(-self.height // TILE), -(-self.width // TILE), device)
         pixels = self.mask[None, None].to(device, torch.float32)
         return torch.nn.functional.max_pool2d(pixels, TILE, ceil_mode=True)[0, 0].to(torch.int32)
 
@@ -105,3 +106,9 @@ class Settings:
     def termination(self) -> float:
         """Transmittance below which a pixel is done. Not 0: backward divides by what is left, so nothing may underflow."""
         return max(self.config.termination, 1e-10)
+
+
+@lru_cache(maxsize=16)
+def _all_tiles(rows: int, columns: int, device: torch.device) -> torch.Tensor:
+    """Kept: nobody writes to it."""
+    return torch.ones(rows, columns, dtype=torch.int32, device=device)

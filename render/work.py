@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
 
-from render.kernels.types import ITEM
+from render.kernels.types import BASE, COUNT, DRAW, FIRST, ITEM
 from render.launch import upload
 
 SMALL = 8192
@@ -40,41 +42,45 @@ class Work:
     records: int
 
 
-def work(instances: Sequence[Fields], seen: Sequence[torch.Tensor | None] | None = None, copies: int = 1) -> Work:
+def work(instances: Sequence[Fields], seen: Sequence[np.ndarray | None] | None = None, copies: int = 1) -> Work:
     """The work of projecting all instances, `copies` times; records are numbered by copy, instance and splat.
 
     seen: bool `[items]` of each instance, which of its runs of ITEM splats are projected; None for all.
     """
-    device = instances[0][0].device
-    sizes = torch.tensor([len(fields[0]) for fields in instances])
-    cut = -(-sizes // ITEM)
-    owner = torch.repeat_interleave(cut)
-    first = (torch.arange(len(owner)) - (cut.cumsum(0) - cut)[owner]) * ITEM
-    if seen is not None:
-        kept = torch.cat([torch.ones(n, dtype=torch.bool) if s is None else s for s, n in zip(seen, cut.tolist(), strict=True)])
-        owner, first = owner[kept], first[kept]
-    count = (sizes[owner] - first).clamp(max=ITEM)
-    base = count.cumsum(0) - count
-    per_instance = torch.bincount(owner, minlength=len(instances)).tolist()
-    projected = int(count.sum())
-    items = torch.stack([first, count, base, owner], 1).to(torch.int32)
-    of_instance = items.split(per_instance)
+    sizes = [len(fields[0]) for fields in instances]
+    items, per_instance = _cut(tuple(sizes))
+    if seen is not None and not all(s is None or s.all() for s in seen):
+        kept = np.concatenate([np.ones(n, dtype=bool) if s is None else s for s, n in zip(seen, per_instance, strict=True)])
+        items = items[kept]
+        items[:, BASE] = items[:, COUNT].cumsum() - items[:, COUNT]
+        per_instance = np.bincount(items[:, DRAW], minlength=len(instances)).tolist()
+    projected = int(items[-1, BASE] + items[-1, COUNT]) if len(items) else 0
+    ends = np.cumsum(per_instance).tolist()
 
     groups = []
     for members in _together(instances):
-        lengths = [len(instances[p][0]) for p in members]
-        fields = instances[members[0]]
-        own = of_instance[members[0]]
+        fields, own = instances[members[0]], items[ends[members[0]] - per_instance[members[0]] : ends[members[0]]]
+        lengths, cuts = [sizes[p] for p in members], [per_instance[p] for p in members]
         if len(members) > 1:
             fields = tuple(torch.cat([instances[p][k] for p in members]) for k in range(len(fields)))
-            before = torch.tensor([sum(lengths[:k]) for k in range(len(members))], dtype=torch.int32)
-            counts = [per_instance[p] for p in members]
-            own = torch.cat([of_instance[p] for p in members])
-            own[:, 0] += before.repeat_interleave(torch.tensor(counts))
+            own = np.concatenate([items[ends[p] - per_instance[p] : ends[p]] for p in members])
+            own[:, FIRST] += np.repeat(np.cumsum(lengths) - lengths, cuts)
         for copy in range(copies):
-            there = own + torch.tensor([0, 0, copy * projected, copy * len(instances)], dtype=torch.int32)
-            groups.append(Group(fields, members, lengths, upload(there, device), [per_instance[p] for p in members]))
+            there = own + np.array([0, 0, copy * projected, copy * len(instances)], dtype=np.int32)
+            groups.append(Group(fields, members, lengths, upload(torch.from_numpy(there), fields[0].device), cuts))
     return Work(groups, copies * projected)
+
+
+@lru_cache(maxsize=16)
+def _cut(sizes: tuple[int, ...]) -> tuple[np.ndarray, list[int]]:
+    """Items int32 `[n, 4]` of all splats of instances of these sizes, and how many each instance has; kept, so nobody may write to them."""
+    per_instance = [-(-n // ITEM) for n in sizes]
+    owner = np.repeat(np.arange(len(sizes)), per_instance)
+    first = (np.arange(len(owner)) - (np.cumsum(per_instance) - per_instance)[owner]) * ITEM
+    count = np.minimum(np.asarray(sizes)[owner] - first, ITEM)
+    items = np.stack([first, count, count.cumsum() - count, owner], 1).astype(np.int32)
+    items.flags.writeable = False
+    return items, per_instance
 
 
 def _together(instances: Sequence[Fields]) -> Iterator[list[int]]:

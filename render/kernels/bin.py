@@ -186,23 +186,49 @@ def deal(
 
 @wp.kernel
 def emit_pairs(
-    records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int],
-    starts: wp.array[int], counts: wp.array[int], room: int, tile_keys: wp.array[int], slot_of: wp.array[int], owner: wp.array[int],
+    records: wp.array2d[float], order: wp.array[int], window: Window, drawn: wp.array2d[int], in_order: wp.array[int],
+    ends: wp.array[wp.int64], room: int, counts: wp.array[int], first_slot: wp.array[int], tile_of: wp.array[int], owner: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """CUDA: one thread a splat writes (tile, slot) in depth order; a stable radix sort by tile then makes the lists. What no entry is
-    written to, or `room` has no place for, stays behind every tile."""
-    j = order[first + wp.tid()]
-    if counts[j] > 0:
-        slot = starts[j]
-        end = slot + wp.min(counts[j], room - slot)
+    """CUDA: one thread a splat writes the tile of each of its slots, in depth order; a stable sort of slots by tile then makes the lists.
+    in_order, ends: room set aside for each splat by depth, and its running sum. counts becomes how many entries each has. A slot that no
+    entry is written to keeps what tile it was given before."""
+    d = first + wp.tid()
+    j = order[d]
+    begin = int(wp.min(ends[d] - wp.int64(in_order[d]), wp.int64(room)))
+    first_slot[j] = begin
+    if in_order[d] > 0:
+        slot = begin
+        end = slot + wp.min(in_order[d], room - slot)
         rows = within(span_of(records[j, Y], records[j, Y_EXT]), window.top, window.tiles_y)
         for ty in range(rows[0], rows[1] + 1):
             columns = within(columns_of(records, j, ty), window.left, window.tiles_x)
             for tx in range(columns[0], wp.min(columns[1], columns[0] + end - slot - 1) + 1):
                 if drawn[ty, tx] != 0:
-                    tile_keys[slot] = (ty - window.top) * window.tiles_x + tx - window.left
-                    slot_of[slot] = slot
+                    tile_of[slot] = (ty - window.top) * window.tiles_x + tx - window.left
                     owner[slot] = j
                     slot += 1
-        counts[j] = slot - starts[j]
+        counts[j] = slot - begin
+
+
+@wp.kernel
+def cut_lists(
+    by_tile: wp.array[wp.int64], tile_of: wp.array[int], owner: wp.array[int], tiles: int, starts: wp.array[int], ids: wp.array[int],
+    slot_of: wp.array[int],
+    first: int,
+):  # fmt: skip
+    """CUDA: one thread an entry; by_tile: slots sorted by tile. Each list begins where the tile is another than the entry before's;
+    behind all tiles are those of no entry."""
+    k = first + wp.tid()
+    slot = int(by_tile[k])
+    slot_of[k] = slot
+    ids[k] = owner[slot]
+    tile = tile_of[slot]
+    before = int(-1)
+    if k > 0:
+        before = tile_of[int(by_tile[k - 1])]
+    for beginning in range(before + 1, tile + 1):
+        starts[beginning] = k
+    if k + 1 == by_tile.shape[0]:
+        for beginning in range(tile + 1, tiles + 1):
+            starts[beginning] = k + 1

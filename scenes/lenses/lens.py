@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import torch
@@ -33,8 +33,7 @@ class Lens:
         cy: Number
 
     def __post_init__(self):
-        for name in (f.name for f in fields(self)):
-            value = float(torch.as_tensor(getattr(self, name)).detach())
+        for name, value in zip(_names(type(self)), self.key()[1:], strict=True):
             if name in self.positive and not value > 0:
                 raise ValueError(f"{name} must be a positive number of pixels, got {value}")
             if not math.isfinite(value):
@@ -42,7 +41,10 @@ class Lens:
 
     def params(self) -> torch.Tensor:
         """float64 `[P]`: the fields in order; differentiable where they are tensors."""
-        return torch.stack([torch.as_tensor(getattr(self, f.name), dtype=torch.float64) for f in fields(self)])
+        values = [getattr(self, name) for name in _names(type(self))]
+        if not any(isinstance(value, torch.Tensor) for value in values):
+            return torch.tensor(values, dtype=torch.float64)
+        return torch.stack([torch.as_tensor(value, dtype=torch.float64) for value in values])
 
     def scaled(self, sx: float, sy: float) -> Self:
         """The lens of an image resized by sx, sy."""
@@ -81,7 +83,13 @@ class Lens:
 
     def key(self) -> tuple:
         """Type and numbers, hashable: what may be kept for a lens is kept under it."""
-        return type(self), *self.params().tolist()
+        values = [getattr(self, name) for name in _names(type(self))]
+        return type(self), *(float(value.detach()) if isinstance(value, torch.Tensor) else float(value) for value in values)
+
+
+@cache
+def _names(lens: type[Lens]) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(lens))
 
 
 def first_fall(margin: Callable[[torch.Tensor], torch.Tensor], end: float, steps: int = _STEPS) -> float:

@@ -1,6 +1,6 @@
 """Milliseconds against error of the enhancer, for precision, history, tiles and resolution.
 
-    python -m tests.bench.enhance [--size 640x360] [--size 1024x576] [--repeat 9] [--clock cpu] [--plot enhance.png]
+    python -m tests.bench.enhance [--size 640x360] [--size 1024x576] [--repeat 9] [--clock cpu] [--device cuda] [--plot enhance.png]
 
 The last of twelve frames of the bundled drive, shot two metres to the left with two inserted cars. The error is to the frame that the same
 weights give in float32, with all tiles and all of the history, in levels of 255. All rows but "as loaded" have the network repair the
@@ -35,7 +35,7 @@ SHARES = (0.5, 0.75)
 READS = tuple(name for name in Enhancer.reads if name != "reference")
 
 
-def clip(width: int, height: int) -> list[Frame]:
+def clip(width: int, height: int, device: str) -> list[Frame]:
     """The frames, with what the enhancer reads and need."""
     scene = load(DATA / "drive002")
     assert isinstance(scene, Scene)
@@ -43,7 +43,7 @@ def clip(width: int, height: int) -> list[Frame]:
     for text in (PARKED, MOVING):
         placement = parse_placement(text)
         scene = insert(scene, Databank(DATA / "databank").load(placement.asset), placement, times[0]).scene
-    return list(render_clip(scene, CAMERA, SHIFT, times, width, height, outputs=("rgb", "need", *READS)))
+    return list(render_clip(scene.to(device), CAMERA, SHIFT, times, width, height, outputs=("rgb", "need", *READS)))
 
 
 def without_need(frame: Frame) -> Frame:
@@ -94,16 +94,16 @@ def _shrunk(frame: Frame, share: float) -> Frame:
     return Frame(frame.camera, rgb=rgb, instance=instance, flow_prev=flow)
 
 
-def works(frames: list[Frame], weights: str) -> dict[tuple[str, str], Callable[[], torch.Tensor]]:
+def works(frames: list[Frame], weights: str, device: str) -> dict[tuple[str, str], Callable[[], torch.Tensor]]:
     """What is compared, by knob and setting; the first is the reference."""
-    exact = Enhancer.load(weights, bfloat16=False, repair=True)
-    usual = Enhancer.load(weights, repair=True)
+    exact = Enhancer.load(weights, device, bfloat16=False, repair=True)
+    usual = Enhancer.load(weights, device, repair=True)
     made = {("precision", "float32"): stepping(exact, frames, without_need)}
     if has_bfloat16(usual.device):
         made["precision", "bfloat16"] = stepping(usual, frames, without_need)
     for k in range(usual.history, -1, -1):
-        made["history", f"{k} frames"] = stepping(Enhancer.load(weights, history=k, repair=True), frames, without_need)
-    made["network", "as loaded"] = stepping(Enhancer.load(weights), frames, without_need)
+        made["history", f"{k} frames"] = stepping(Enhancer.load(weights, device, history=k, repair=True), frames, without_need)
+    made["network", "as loaded"] = stepping(Enhancer.load(weights, device), frames, without_need)
     tiles: dict[str, Callable[[Frame], Frame]] = {"all": without_need, "need, as rendered": lambda f: f, "actors": inserted_only}
     for name, given in (tiles | {"none": nothing}).items():
         made["tiles", name] = stepping(usual, frames, given)
@@ -112,8 +112,8 @@ def works(frames: list[Frame], weights: str) -> dict[tuple[str, str], Callable[[
     return made
 
 
-def rows(width: int, height: int, weights: str, repeat: int, clock: str) -> list[dict]:
-    made = works(clip(width, height), weights)
+def rows(width: int, height: int, weights: str, repeat: int, clock: str, device: str) -> list[dict]:
+    made = works(clip(width, height, device), weights, device)
     ms = in_turns({" ".join(key): work for key, work in made.items()}, repeat, clock)
     reference = next(iter(made.values()))()
     found = []
@@ -148,14 +148,15 @@ def main() -> None:
     parser.add_argument("--weights", default="builtin")
     parser.add_argument("--repeat", type=int, default=9)
     parser.add_argument("--clock", choices=CLOCKS, default="wall", help="cpu: of all threads together, for a busy machine")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     found = []
     for size in args.size or ["640x360"]:
         width, height = (int(v) for v in size.split("x"))
-        found += rows(width, height, args.weights, args.repeat, args.clock)
-    print(f"{torch.get_num_threads()} threads, median ms ({args.clock})\n\n{table(found)}")
+        found += rows(width, height, args.weights, args.repeat, args.clock, args.device)
+    print(f"{args.device}, {torch.get_num_threads()} threads, median ms ({args.clock})\n\n{table(found)}")
     if args.json:
         args.json.write_text(json.dumps(found, indent=1))
     if args.plot:

@@ -23,14 +23,19 @@ CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 def timed(work: Callable[[], object], repeat: int, clock: str = "wall") -> float:
-    """Median milliseconds of `work()` after one warm-up."""
-    work()
+    """Median milliseconds of `work()` after one warm-up, until a GPU, where there is one, has done it."""
+    _finished(work())
     times = []
     for _ in range(repeat):
         start = CLOCKS[clock]()
-        work()
+        _finished(work())
         times.append(1000 * (CLOCKS[clock]() - start))
     return statistics.median(times)
+
+
+def _finished(_made: object) -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def in_turns(works: dict[str, Callable[[], object]], repeat: int, clock: str = "wall", rounds: int = 3) -> dict[str, float]:
