@@ -24,15 +24,18 @@ from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.lenses import OpenCV, Pinhole
 from scenes.lenses.box import view_box
-from scenes.poses import inverse
 
 CLUSTER = 1024
 """Splats of a cluster: a whole number of items."""
 
+FEW = 1_000_000
+"""Splats that a GPU projects and sorts before the host has found out which it need not."""
+
 
 def in_sight(placed: Sequence[Placed], camera: Camera, model: SplatModel) -> list[np.ndarray | None]:
     """bool `[items]` for each of `placed`: which of its runs of ITEM splats `camera` may see; None where all are drawn without a look."""
-    if not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
+    few = placed[0].gaussians.device.type == "cuda" and sum(len(p.gaussians) for p in placed) < FEW
+    if few or not isinstance(camera.lens, Pinhole | OpenCV) or moves(camera, placed):
         return [None] * len(placed)
     there = [p for p in placed if len(p.gaussians)]
     seen = iter(_seen(there, camera, view_sides(camera, model)))
@@ -77,13 +80,13 @@ def _seen(placed: Sequence[Placed], camera: Camera, sides: torch.Tensor) -> list
     if not placed:
         return []
     centres, radii = zip(*(bounds(p.gaussians) for p in placed), strict=True)
-    ends = np.cumsum([len(r) for r in radii])
-    poses = inverse(camera.world_from_cam) @ torch.stack([p.world_from_local for p in placed])
-    poses = poses.detach().cpu().numpy().repeat([len(r) for r in radii], 0)
-    there = np.einsum("cij,cj->ci", poses[:, :3, :3], np.concatenate(centres)) + poses[:, :3, 3]
+    sizes = [len(r) for r in radii]
+    eye, poses = (pose.detach().cpu().numpy() for pose in (camera.world_from_cam, torch.stack([p.world_from_local for p in placed])))
+    turns, places = eye[:3, :3].T @ poses[:, :3, :3], (poses[:, :3, 3] - eye[:3, 3]) @ eye[:3, :3]
+    there = np.einsum("cij,cj->ci", turns.repeat(sizes, 0), np.concatenate(centres)) + places.repeat(sizes, 0)
     # a bound that is not a number is not beyond anything
     beyond = (there @ sides.numpy().T > np.concatenate(radii)[:, None]).any(1)
-    return np.split(~beyond, ends[:-1])
+    return np.split(~beyond, np.cumsum(sizes)[:-1])
 
 
 def bounds(g: Gaussians) -> tuple[np.ndarray, np.ndarray]:

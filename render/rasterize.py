@@ -111,8 +111,8 @@ def rasterize(
 def _draw(
     placed: list[Placed], camera: Camera, outputs, background, flow_to, model, config, features=None, crop=None, mask=None, room=None
 ) -> Frame:
-    seen = None
-    if differentiated(placed, camera, features):
+    seen, traced = None, differentiated(placed, camera, features)
+    if traced:
         if room is not None:
             raise ValueError(
                 "a room is for frames without gradients, which may lack splats; leave room= out, or draw under torch.no_grad()"
@@ -145,7 +145,7 @@ def _draw(
     frames = rays = None
     if settings.by_rays:
         # all gradients of response "ray" go by these; an order has none
-        along = model.response == "ray" and seen is None
+        along = model.response == "ray" and traced
         with torch.set_grad_enabled(along and torch.is_grad_enabled()):
             rays, looks = exact_rays(camera, placed, settings.rolling)
             rays, settings = on_device(rays, placed[0].gaussians.device), replace(settings, looks=tuple(looks))
@@ -153,7 +153,7 @@ def _draw(
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
     lens = camera.lens.params()
     told = (settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
-    drawn = Rasterize.apply(*told) if seen is None else drawn_only(*told)
+    drawn = Rasterize.apply(*told) if traced else drawn_only(*told)
     frame = picture_of(settings, background if "rgb" in outputs else None, *drawn)
     if settings.wanted.channels:
         parts = frame["sums"].split([field.shape[1] for field in summed.values()], -1)

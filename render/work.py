@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from render.kernels.types import BASE, COUNT, DRAW, FIRST, ITEM
+from render.kernels.types import FIRST, ITEM
 from render.launch import upload
 
 SMALL = 8192
@@ -47,40 +47,51 @@ def work(instances: Sequence[Fields], seen: Sequence[np.ndarray | None] | None =
 
     seen: bool `[items]` of each instance, which of its runs of ITEM splats are projected; None for all.
     """
-    sizes = [len(fields[0]) for fields in instances]
-    items, per_instance = _cut(tuple(sizes))
-    if seen is not None and not all(s is None or s.all() for s in seen):
-        kept = np.concatenate([np.ones(n, dtype=bool) if s is None else s for s, n in zip(seen, per_instance, strict=True)])
-        items = items[kept]
-        items[:, BASE] = items[:, COUNT].cumsum() - items[:, COUNT]
-        per_instance = np.bincount(items[:, DRAW], minlength=len(instances)).tolist()
-    projected = int(items[-1, BASE] + items[-1, COUNT]) if len(items) else 0
-    ends = np.cumsum(per_instance).tolist()
-
+    sizes, device = tuple(len(fields[0]) for fields in instances), instances[0][0].device
+    together = tuple(tuple(members) for members in _together(instances))
+    if seen is None or all(s is None or s.all() for s in seen):
+        items, per_instance, records = _all_items(sizes, together, copies, device)
+    else:
+        items, per_instance, records = _items(sizes, together, copies, device, seen)
     groups = []
-    for members in _together(instances):
-        fields, own = instances[members[0]], items[ends[members[0]] - per_instance[members[0]] : ends[members[0]]]
-        lengths, cuts = [sizes[p] for p in members], [per_instance[p] for p in members]
+    for i, members in enumerate(together):
+        fields = instances[members[0]]
         if len(members) > 1:
             fields = tuple(torch.cat([instances[p][k] for p in members]) for k in range(len(fields)))
-            own = np.concatenate([items[ends[p] - per_instance[p] : ends[p]] for p in members])
-            own[:, FIRST] += np.repeat(np.cumsum(lengths) - lengths, cuts)
-        for copy in range(copies):
-            there = own + np.array([0, 0, copy * projected, copy * len(instances)], dtype=np.int32)
-            groups.append(Group(fields, members, lengths, upload(torch.from_numpy(there), fields[0].device), cuts))
-    return Work(groups, copies * projected)
+        lengths, cuts = [sizes[p] for p in members], [per_instance[p] for p in members]
+        groups += [Group(fields, list(members), lengths, own, cuts) for own in items[i]]
+    return Work(groups, records)
+
+
+Items = tuple[list[list[torch.Tensor]], list[int], int]
+"""Of each group, each copy's items; how many each instance has; and how many splats all have."""
 
 
 @lru_cache(maxsize=16)
-def _cut(sizes: tuple[int, ...]) -> tuple[np.ndarray, list[int]]:
-    """Items int32 `[n, 4]` of all splats of instances of these sizes, and how many each instance has; kept, so nobody may write to them."""
+def _all_items(sizes: tuple[int, ...], together: tuple[tuple[int, ...], ...], copies: int, device: torch.device) -> Items:
+    """Kept: nobody writes to them."""
+    return _items(sizes, together, copies, device, None)
+
+
+def _items(sizes: Sequence[int], together, copies: int, device: torch.device, seen: Sequence[np.ndarray | None] | None) -> Items:
     per_instance = [-(-n // ITEM) for n in sizes]
     owner = np.repeat(np.arange(len(sizes)), per_instance)
     first = (np.arange(len(owner)) - (np.cumsum(per_instance) - per_instance)[owner]) * ITEM
+    if seen is not None:
+        kept = np.concatenate([np.ones(n, dtype=bool) if s is None else s for s, n in zip(seen, per_instance, strict=True)])
+        owner, first = owner[kept], first[kept]
+        per_instance = np.bincount(owner, minlength=len(sizes)).tolist()
     count = np.minimum(np.asarray(sizes)[owner] - first, ITEM)
     items = np.stack([first, count, count.cumsum() - count, owner], 1).astype(np.int32)
-    items.flags.writeable = False
-    return items, per_instance
+    of_instance, projected = np.split(items, np.cumsum(per_instance)[:-1]), int(count.sum())
+    made = []
+    for members in together:
+        own = np.concatenate([of_instance[p] for p in members])
+        lengths = [sizes[p] for p in members]
+        own[:, FIRST] += np.repeat(np.cumsum(lengths) - lengths, [per_instance[p] for p in members])
+        steps = [np.array([0, 0, copy * projected, copy * len(sizes)], dtype=np.int32) for copy in range(copies)]
+        made.append([upload(torch.from_numpy(own + step), device) for step in steps])
+    return made, per_instance, copies * projected
 
 
 def _together(instances: Sequence[Fields]) -> Iterator[list[int]]:
