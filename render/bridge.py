@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import add
 
 import torch
 import warp as wp
@@ -54,13 +55,13 @@ def prepare(settings: Settings, seen, poses: torch.Tensor, lens: torch.Tensor, f
 def told_of(settings: Settings, poses: torch.Tensor, lens: torch.Tensor) -> tuple[list, torch.Tensor]:
     """What projection's kernels are told of the camera, and as rows of every pose, on the host: all that changes from pose to pose."""
     copies = projection(settings.lens, settings.rolling).copies
-    *told, rows = uniforms(settings, _lens(settings.lens, *lens.tolist()), poses.detach().cpu(), copies)
+    *told, rows = uniforms(settings, _lens((settings.lens, *lens.tolist())), poses.detach().cpu(), copies)
     return told, rows
 
 
 @lru_cache(maxsize=16)
-def _lens(kind: type[Lens], *params: float) -> Lens:
-    return kind(*params)
+def _lens(key: tuple) -> Lens:
+    return key[0](*key[1:])
 
 
 def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, features, frames, rays) -> tuple[Projected, Picture]:
@@ -96,7 +97,7 @@ def pictures(settings: Settings, picture: Picture) -> tuple[torch.Tensor | None,
 
 
 def drawn_only(settings: Settings, seen, poses, lens, features, frames, rays, *fields) -> tuple[torch.Tensor | None, ...]:
-    """What `Rasterize` gives, where nobody will ask for a gradient: of many instances autograd alone would take a third of a GPU's frame."""
+    """What `Rasterize` gives, where nobody will ask for a gradient; of many instances autograd alone takes a third of a GPU's frame."""
     settings = replace(settings, gradients=False)
     with torch.no_grad():
         todo, told, rows = prepare(settings, seen, poses, lens, fields)
@@ -146,11 +147,11 @@ class Rasterize(torch.autograd.Function):
                 jobs.append((len(shared[-1]), args))
             run_each(ways.backward, jobs, device)
             outputs: list[list[torch.Tensor]] = [[] for _ in range(instances)]
-            uniform: list[torch.Tensor] = [slots.values.new_zeros(0, ways.uniforms)] * instances
+            uniform: list[list[torch.Tensor]] = [[] for _ in range(instances)]
             for g, out, rows in zip(groups, outs, shared, strict=True):
                 rows_of = rows.split([n * threads for n in g.per_member])
                 for p, own, *gradients in zip(g.members, rows_of, *(f.split(g.sizes) for f in out), strict=True):
-                    uniform[p] = torch.cat([uniform[p], own])
+                    uniform[p].append(own)
                     # the other side of a seam: the same splats and the same pose once more
                     outputs[p] = [a + b for a, b in zip(outputs[p], gradients, strict=True)] if outputs[p] else gradients
             both_sides = [None if g is None else g.view(ways.copies, -1, g.shape[1]).sum(0) for g in (slots.channels, slots.frames)]
@@ -158,6 +159,6 @@ class Rasterize(torch.autograd.Function):
         fields = [f for gradients in outputs for f in gradients]
         if not any(ctx.needs_input_grad[2:4]):
             return None, None, None, None, *more, *fields
-        of_pose = torch.stack([g.sum(0, dtype=torch.float64) for g in uniform]).cpu()
+        of_pose = torch.stack([reduce(add, (rows.sum(0, dtype=torch.float64) for rows in sides)) for sides in uniform]).cpu()
         g_lens = ways.lens_gradient(of_pose, len(ctx.like_lens))
         return None, None, ways.pose_gradient(of_pose).to(ctx.like_poses), g_lens.to(ctx.like_lens), *more, *fields

@@ -103,5 +103,5 @@ def _spheres(means: torch.Tensor, log_scales: torch.Tensor, cluster: int) -> tup
     centres = 0.5 * (means.amin(1) + means.amax(1))
     radii = ((means - centres[:, None]).norm(dim=2) + reach).amax(1)
     # float32's rounding here and in the kernels
-    centres, radii = centres.double().cpu().numpy(), radii.double().cpu().numpy()
-    return centres, radii * (1 + 1e-5) + 1e-5 * np.linalg.norm(centres, axis=1)
+    middles, reaches = centres.double().cpu().numpy(), radii.double().cpu().numpy()
+    return middles, reaches * (1 + 1e-5) + 1e-5 * np.linalg.norm(middles, axis=1)

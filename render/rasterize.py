@@ -152,8 +152,7 @@ def _draw(
             frames = torch.cat([canonical_frames(*one) for one in _in_camera(placed, camera, looks)]) if along else None
     fields = [t for p in placed for t in p.gaussians.tensors().values()]
     lens = camera.lens.params()
-    told = (settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
-    drawn = Rasterize.apply(*told) if traced else drawn_only(*told)
+    drawn = (Rasterize.apply if traced else drawn_only)(settings, seen, cam_from_local, lens, channels, frames, rays, *fields)
     frame = picture_of(settings, background if "rgb" in outputs else None, *drawn)
     if settings.wanted.channels:
         parts = frame["sums"].split([field.shape[1] for field in summed.values()], -1)
@@ -247,7 +246,9 @@ def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
     given = [camera.world_from_cam, camera.world_from_cam_end]
     for p in placed:
         given += [p.world_from_local, p.world_from_local_end]
-    stacked = torch.stack([pose for pose in given if pose is not None]).detach().cpu().numpy()  # numpy's small sums take a third of torch's time
+    stacked = (
+        torch.stack([pose for pose in given if pose is not None]).detach().cpu().numpy()
+    )  # numpy's small sums take a third of torch's time
     with np.errstate(invalid="ignore"):
         turn = stacked[:, :3, :3]
         off = np.abs(turn @ turn.transpose(0, 2, 1) - _UNIT).sum((1, 2))
@@ -255,7 +256,9 @@ def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
         # one value that is not finite makes the sum so
         fit = (off + 0 * stacked.sum((1, 2)) < STRETCHED) & (sunk < 1e-6)
     if not fit.all():
-        names = [f"{which} of {whose}" for whose in ("camera", *(f"instance {p.instance}" for p in placed)) for which in ("pose", "end pose")]
+        names = [
+            f"{which} of {whose}" for whose in ("camera", *(f"instance {p.instance}" for p in placed)) for which in ("pose", "end pose")
+        ]
         named = [(name, pose) for name, pose in zip(names, given, strict=True) if pose is not None]
         for (name, pose), bent, below in zip(named, off.tolist(), sunk.tolist(), strict=True):
             if not torch.isfinite(pose).all():

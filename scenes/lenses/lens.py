@@ -33,7 +33,7 @@ class Lens:
         cy: Number
 
     def __post_init__(self):
-        for name, value in zip(_names(type(self)), self.key()[1:], strict=True):
+        for name, value in zip(self._names(), self.key()[1:], strict=True):
             if name in self.positive and not value > 0:
                 raise ValueError(f"{name} must be a positive number of pixels, got {value}")
             if not math.isfinite(value):
@@ -41,7 +41,7 @@ class Lens:
 
     def params(self) -> torch.Tensor:
         """float64 `[P]`: the fields in order; differentiable where they are tensors."""
-        values = [getattr(self, name) for name in _names(type(self))]
+        values = [getattr(self, name) for name in self._names()]
         if not any(isinstance(value, torch.Tensor) for value in values):
             return torch.tensor(values, dtype=torch.float64)
         return torch.stack([torch.as_tensor(value, dtype=torch.float64) for value in values])
@@ -83,13 +83,13 @@ class Lens:
 
     def key(self) -> tuple:
         """Type and numbers, hashable: what may be kept for a lens is kept under it."""
-        values = [getattr(self, name) for name in _names(type(self))]
+        values = [getattr(self, name) for name in self._names()]
         return type(self), *(float(value.detach()) if isinstance(value, torch.Tensor) else float(value) for value in values)
 
-
-@cache
-def _names(lens: type[Lens]) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(lens))
+    @classmethod
+    @cache
+    def _names(cls) -> tuple[str, ...]:
+        return tuple(f.name for f in fields(cls))
 
 
 def first_fall(margin: Callable[[torch.Tensor], torch.Tensor], end: float, steps: int = _STEPS) -> float:

@@ -3,7 +3,8 @@
     python -m tests.bench.public [--size 320x192] [--narrow 1] [--repeat 1] [--clock cpu] [--device cuda] [--json public.json]
 
 Random weights in Cosmos-Predict2 0.6B's and the Wan autoencoder's sizes; the unmodified graphs are diffusers' own, in float32. The last
-rows are whole steps as `sidestep enhance --weights` takes them, in bfloat16 where that is fast. --narrow n makes all of it n times narrower.
+rows are whole steps as `sidestep enhance --weights` takes them, in bfloat16 where that is fast. --narrow n makes all of it n times
+narrower.
 """
 
 from __future__ import annotations
