@@ -22,9 +22,9 @@ def window(left: int, top: int, tiles_x: int, tiles_y: int) -> Window:
     return w
 
 
-def windows(records: torch.Tensor, counts: torch.Tensor, whole: Window, most: int, total: int) -> list[Window]:
-    """The whole, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in it, total of all."""
-    return [whole] if total <= most else _halved(records, counts, whole, most)
+def windows(records: torch.Tensor, counts: torch.Tensor, whole: Window, most: int) -> list[Window]:
+    """The whole, or it halved until every window needs room for `most` entries at most. counts `[N]`: room in it."""
+    return [whole] if int(counts.sum(dtype=torch.int64)) <= most else _halved(records, counts, whole, most)
 
 
 def _halved(records: torch.Tensor, counts: torch.Tensor, w: Window, most: int) -> list[Window]:

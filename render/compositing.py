@@ -53,7 +53,8 @@ def draw(settings: Settings, scene: Projected) -> Picture:
     whole = window(settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y)
     parts: list[Part] = []
     total = None if settings.room else int(scene.counts.sum(dtype=torch.int64))
-    divided = [whole] if total is None else windows(scene.records, scene.counts, whole, settings.config.most_entries, total)
+    most = settings.config.most_entries
+    divided = [whole] if total is None or total <= most else windows(scene.records, scene.counts, whole, most)
     planes = picks = scene.records
     for w in divided:
         lists, counts = _lists(settings, scene, w, len(divided) == 1, total)

@@ -1,9 +1,11 @@
 """Files and folders that appear whole or not at all: written beside their target, then renamed."""
 
+import ctypes
 import errno
 import os
 import platform
 import shutil
+import sys
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -48,8 +50,15 @@ def _half(path: Path, name: str) -> str:
     if os.name == "posix" and HALF not in str(path.parent):  # where a whole folder is being written nothing can be left of its files
         for left in path.parent.glob(f"{escape(mine)}*"):
             if not _runs(left.name.removeprefix(mine).partition("-")[0]):
-                shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+                _remove(left)
     return f"{mine}{os.getpid()}-"
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _runs(process: str) -> bool:
@@ -78,7 +87,9 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
     try:
         yield partial
         partial.chmod(0o777 & ~_umask())
-        if path.exists():
+        if not path.exists():
+            os.rename(partial, path)
+        elif not _swapped(partial, path):
             old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent)) / path.name
             os.rename(path, old)
             try:
@@ -88,13 +99,19 @@ def atomic_folder(path: str | os.PathLike, replace: bool = False) -> Iterator[Pa
                 raise
             finally:
                 shutil.rmtree(old.parent, ignore_errors=True)
-        else:
-            os.rename(partial, path)
     except OSError as error:
         _name(error, partial, path)
         raise
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _remove(partial)
+
+
+def _swapped(one: Path, other: Path) -> bool:
+    """Whether two names could be exchanged at one go, as Linux does on most disks (`renameat2`): no moment, for a kill to fall into, is
+    without either."""
+    exchange = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    here, both = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return exchange is not None and exchange(here, os.fsencode(one), here, os.fsencode(other), both) == 0
 
 
 def _name(error: OSError, partial: Path, path: Path) -> None:

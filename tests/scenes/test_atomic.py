@@ -64,6 +64,25 @@ def test_a_folder_is_replaced_only_when_asked_to(tmp_path):
     assert listing(tmp_path) == ["s1"] and listing(target) == ["new"]
 
 
+@pytest.mark.parametrize("exchanged", [True, False])
+@pytest.mark.parametrize("link", [True, False])
+def test_a_folder_or_a_link_to_one_is_replaced_at_one_go_where_the_disk_can(tmp_path, monkeypatch, exchanged, link):
+    (tmp_path / "first").mkdir()
+    target = tmp_path / "s1"
+    target.symlink_to("first") if link else (tmp_path / "first").rename(target)
+
+    def gone(*_):
+        raise AssertionError("for a moment there was no s1")
+
+    if not exchanged:
+        monkeypatch.setattr("scenes.atomic._swapped", lambda *_: False)
+    elif sys.platform == "linux":
+        monkeypatch.setattr(os, "rename", gone)
+    with atomic_folder(target, replace=True) as partial:
+        (partial / "new").write_text("new")
+    assert listing(tmp_path) == ["first"] * link + ["s1"] and listing(target) == ["new"] and not target.is_symlink()
+
+
 def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path):
     code = f"""
 import os, signal
