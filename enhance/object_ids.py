@@ -46,7 +46,7 @@ class ObjectIds:
 
 def _array(file: Path) -> np.ndarray:
     try:
-        ids = np.load(file, allow_pickle=False)
+        ids = np.load(file, mmap_mode="r", allow_pickle=False)  # nothing is reserved, whatever size a damaged header tells
     except (ValueError, EOFError, OSError) as problem:
         raise ValueError(f"{file} is not an array of numpy's ({problem}); write it again") from None
     if ids.dtype == bool:

@@ -233,6 +233,9 @@ def test_ids_that_do_not_fit_are_refused(tmp_path, pictures, capsys):
     refused("1.npy tells of 1699 objects.*without soft edges")
     (folder / "1.npy").write_bytes(b"none")
     refused("1.npy is not an array")
+    with (folder / "1.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<i4", "fortran_order": False, "shape": (1 << 40, 50)})
+    refused("1.npy is not an array")
     (folder / "1.npy").unlink()
     refused("has ids for 2 pictures, and the clip has 3")
 
