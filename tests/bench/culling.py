@@ -10,6 +10,7 @@ import math
 import sys
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from render import rasterize
@@ -27,7 +28,7 @@ def rig_of(camera: Camera, count: int) -> list[Camera]:
     return [replace(camera, world_from_cam=camera.world_from_cam @ turn) for turn in turns]
 
 
-def those_in_sight(placed: list[Placed], seen: list[torch.Tensor | None]) -> list[Placed]:
+def those_in_sight(placed: list[Placed], seen: list[np.ndarray | None]) -> list[Placed]:
     """Copies of `placed` without what is not seen."""
     return [replace(p, gaussians=p.gaussians.select(splats_in_sight([p], [s]))) for p, s in zip(placed, seen, strict=True)]
 
