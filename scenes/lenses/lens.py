@@ -34,7 +34,7 @@ class Lens:
 
     def __post_init__(self):
         for name in (f.name for f in fields(self)):
-            value = float(torch.as_tensor(getattr(self, name)).detach())
+            value = float(getattr(self, name))
             if name in self.positive and not value > 0:
                 raise ValueError(f"{name} must be a positive number of pixels, got {value}")
             if not math.isfinite(value):
@@ -42,7 +42,10 @@ class Lens:
 
     def params(self) -> torch.Tensor:
         """float64 `[P]`: the fields in order; differentiable where they are tensors."""
-        return torch.stack([torch.as_tensor(getattr(self, f.name), dtype=torch.float64) for f in fields(self)])
+        numbers = [getattr(self, f.name) for f in fields(self)]
+        if any(isinstance(number, torch.Tensor) for number in numbers):
+            return torch.stack([torch.as_tensor(number, dtype=torch.float64) for number in numbers])
+        return torch.tensor(numbers, dtype=torch.float64)
 
     def scaled(self, sx: float, sy: float) -> Self:
         """The lens of an image resized by sx, sy."""
