@@ -145,7 +145,7 @@ class Fit:
             beside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
             aside = self.motion.beside(shot, beside)
         rates = self._rates()
-        which = self._in_sight(shot, *[aside] * (aside is not None))
+        which = self._in_sight(shot, aside)
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
         known, shade = self._known(view), shade_of(shown)
@@ -166,8 +166,10 @@ class Fit:
             closing = shown.held(self.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
             (solid,) = draw(self._placed(closing, aside), aside.camera, "alpha", scale=scale_of(view, aside.camera))
             haze = haze + self.openings.gaps(solid, aside.camera)
-        for weight, there in known:
-            haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)
+        if known:
+            weights, depths = zip(*known, strict=True)
+            mistakes = mistake(drawn["depth"], alpha, torch.stack(depths)).unbind()
+            haze = haze + sum(self.config.depth_weight * weight * each for weight, each in zip(weights, mistakes, strict=True))
         unrest = self.limbs.unrest(shot.near, camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
@@ -211,14 +213,15 @@ class Fit:
         shown = self.splats.select(self._in_sight(shot), self.sh_count())
         return self._render(shown, shot, partial(sample_equirect, self.sky), outputs=outputs)
 
-    def _in_sight(self, *shots: Shot) -> torch.Tensor:
-        """Indices of the splats that pictures of a moment may show."""
+    def _in_sight(self, *shots: Shot | None) -> torch.Tensor:
+        """Indices of the splats that any of the pictures may show."""
         eyes: list[Eye] = []
-        for shot in shots:
+        taken = [shot for shot in shots if shot is not None]
+        for shot in taken:
             middle = inverse(shot.camera.world_from_cam.detach())
             first, last = (middle, middle) if shot.read is None else shot.read[:, 0]
             eyes.append((shot.camera, first, last))
-        return in_sight(self.splats, eyes, {i for shot in shots for i in shot.near})
+        return in_sight(self.splats, eyes, {i for shot in taken for i in shot.near})
 
     def _render(
         self,

@@ -397,7 +397,7 @@ def _mistakes(fit):
         shot = fit.motion.shot(view, SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
         drawn = fit._render(shown, shot, partial(sample_equirect, fit.sky), outputs=("rgb", "alpha", "depth"))
-        found.append(float(mistake(drawn["depth"], drawn["alpha"], fit.measured[0].views[view.camera, view.index])))
+        found.append(float(mistake(drawn["depth"], drawn["alpha"], fit.measured[0].views[view.camera, view.index][None])))
     return np.mean(found)
 
 
