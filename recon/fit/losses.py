@@ -79,8 +79,9 @@ def _band(size: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     return torch.where(near, _taps(dtype)[away.clamp(0, WINDOW - 1)], 0.0).to(device)
 
 
+@lru_cache(maxsize=8)
 def _kernels(count: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """The window across a row and down a column, of `count` channels."""
+    """The window across a row and down a column, of `count` channels; shared, not to be written to."""
     across = _taps(dtype).expand(count, 1, 1, WINDOW).contiguous()
     return across, across.transpose(2, 3).contiguous()
 

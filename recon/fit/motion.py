@@ -147,10 +147,10 @@ class Motion:
         and these actors' groups."""
         row = self.row[view.camera, view.index]
         there = self._there[row]
-        before, after = self._knots[:, row, there]
         share, late = self._shares[row, there], self.clocks[view.camera] + torch.tensor(later_us) / CLOCK_US
-        corrections = torch.cat([self.ego.deltas, self.paths])
-        deltas = (corrections[before] * (1 - share) + corrections[after] * share) * self._units[there]
+        knots = self._knots[:, row, there]
+        before, after = torch.cat([self.ego.deltas, self.paths]).index_select(0, knots.flatten()).view(*knots.shape, 6)
+        deltas = (before * (1 - share) + after * share) * self._units[there]
         deltas = deltas + self._drifts[row, there] * late[:, None, None]
         mount = scaled(self.extrinsics[view.camera], *EXTRINSIC)
         small = small_poses(torch.cat([deltas.flatten(0, 1), mount[None]]))
@@ -173,7 +173,7 @@ class Motion:
 
     def unrest(self) -> torch.Tensor:
         """What corrections cost that shake, and clocks that are off."""
-        bend = (self.paths[2:] - 2 * self.paths[1:-1] + self.paths[:-2])[self._inner]
+        bend = (self.paths[2:] - 2 * self.paths[1:-1] + self.paths[:-2]).index_select(0, self._inner)
         return CALM * (self.ego.unrest() + bend.square().sum() + self.clocks.square().sum())
 
     # ---- what it comes to

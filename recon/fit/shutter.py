@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 import warp as wp
 
-from recon.kernels.carry import carry
+from recon.kernels.shutter import carry
 from render.launch import run, stage, upload, view
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
