@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -59,6 +60,20 @@ class Shot:
         return replace(self, read=None)
 
 
+class _Around(NamedTuple):
+    """The body at a view's moment and, behind it, the actors that there are: their groups (the body's is 0), uncorrected poses
+    `[1 + A, 4, 4]`, shares `[1 + A, 1]` of the later of their `knots` `[2, 1 + A]` among all corrections, drifts `[1 + A, 6]`, units
+    `[1 + A, 6]` of corrections, and radii."""
+
+    groups: list[int]
+    bases: torch.Tensor
+    shares: torch.Tensor
+    drifts: torch.Tensor
+    knots: torch.Tensor
+    units: torch.Tensor
+    radii: np.ndarray
+
+
 class Motion:
     """Poses of cameras and actors at every view's moment and shortly before and after, differentiable in their corrections.
 
@@ -75,26 +90,29 @@ class Motion:
         views = frames.views
         times = np.array([v.time_us for v in views])
         self.row = {(v.camera, v.index): i for i, v in enumerate(views)}
-        # of the body and, one after the other behind it, all actors at every view `[V, 1 + A, ...]`
+        # of the body and, one after the other behind it, all actors at every view
         all_knots = [ego, *actors]
         counts = [len(knots.deltas) for knots in all_knots]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.paths = torch.zeros(int(self._first[-1] - self._first[1]), 6)
         between = [torch.arange(a, a + n - 2) for a, n in zip(self._first[1:-1] - self._first[1], counts[1:], strict=True) if n > 2]
         self._inner = torch.cat([torch.zeros(0, dtype=torch.int64), *between])
-        self._bases, knot, share = (torch.stack(parts, 1) for parts in zip(*(knots.base(times) for knots in all_knots), strict=True))
+        bases, knot, share = (torch.stack(parts, 1) for parts in zip(*(knots.base(times) for knots in all_knots), strict=True))
         first, last = torch.from_numpy(self._first[:-1]), torch.from_numpy(self._first[1:] - 1)
-        self._knots, self._shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)]), share.float()[..., None]
-        self._drifts = torch.stack([drift(knots, times) for knots in all_knots], 1)
-        self._units = torch.tensor([[unit[0]] * 3 + [unit[1]] * 3 for unit in (EGO, *[ACTOR] * len(actors))])
-        # which of these there are, the body always
-        self._there = [torch.tensor([0, *(i for i, k in enumerate(actors, 1) if k.trajectory.covers(t))]) for t in times]
-        self._places, self._radii = self._bases[:, 1:, :3, 3].numpy(), np.array([np.linalg.norm(box) for box in boxes])
-        self._moves = (self.speeds() >= SLOW).tolist()
+        knots, shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)], 1), share.float()[..., None]
+        drifts = torch.stack([drift(knots, times) for knots in all_knots], 1)
+        units = torch.tensor([[unit[0]] * 3 + [unit[1]] * 3 for unit in (EGO, *[ACTOR] * len(actors))])
+        radii = np.array([0.0, *(np.linalg.norm(box) for box in boxes)])
+        self._speeds = drifts[:, 0, 3:].norm(dim=1) * (1e6 / CLOCK_US)
+        self._around = []
+        for row, time in enumerate(times):
+            there = [0, *(i for i, k in enumerate(actors, 1) if k.trajectory.covers(time))]
+            of = [part[row, there] for part in (bases, shares, drifts)]
+            self._around.append(_Around(there, *of, knots[row][:, there], units[there], radii[there]))
 
     def speeds(self) -> torch.Tensor:
         """Metres a second `[V]` of the body at every view."""
-        return self._drifts[:, 0, 3:].norm(dim=1) * (1e6 / CLOCK_US)
+        return self._speeds
 
     def camera(self, view: View) -> Camera:
         """The view's camera at its corrected pose."""
@@ -102,7 +120,8 @@ class Motion:
 
     def shot(self, view: View, size: tuple[int, int] | None = None) -> Shot:
         """The view's camera at its corrected pose, of pictures of this width and height, and what it sees."""
-        half = self.rig[view.camera].readout_us / 2 * self._moves[self.row[view.camera, view.index]]
+        moves = self._speeds[self.row[view.camera, view.index]] >= SLOW
+        half = self.rig[view.camera].readout_us / 2 if moves else 0.0
         poses, groups = self._poses(view, [0.0, -half, half] if half else [0.0])
         camera = self._rig_at(view, poses[0, 0])
         camera = camera if size is None else camera.resized(*size)
@@ -131,12 +150,11 @@ class Motion:
 
     def near(self, view: View, camera: Camera) -> list[int]:
         """Groups of the actors that may be in a camera's view at the view's moment."""
-        row = self.row[view.camera, view.index]
-        actors = self._there[row].numpy()[1:] - 1
-        pose, radii = camera.world_from_cam.detach().numpy(), self._radii[actors]
-        x, _, z = ((self._places[row, actors] - pose[:3, 3]) @ pose[:3, :3]).T
+        around = self._around[self.row[view.camera, view.index]]
+        pose, places, radii = camera.world_from_cam.detach().numpy(), around.bases.numpy()[1:, :3, 3], around.radii[1:]
+        x, _, z = ((places - pose[:3, 3]) @ pose[:3, :3]).T
         aside = np.abs(x) - 1.5 * radii < np.maximum(z, 0) * (camera.width / (1.6 * camera.lens.focal()[0])) + radii
-        return (actors[(z > -radii) & aside] + 1).tolist()
+        return [group for group, seen in zip(around.groups[1:], (z > -radii) & aside, strict=True) if seen]
 
     def _rig_at(self, view: View, world_from_cam: torch.Tensor) -> Camera:
         rig = self.rig[view.camera]
@@ -145,21 +163,21 @@ class Motion:
     def _poses(self, view: View, later_us: list[float]) -> tuple[torch.Tensor, list[int]]:
         """Corrected poses `[T, 1 + A, 4, 4]` of the view's camera and of the actors that there are, so much later than the view's moment;
         and these actors' groups."""
-        row = self.row[view.camera, view.index]
-        there = self._there[row]
-        share, late = self._shares[row, there], self.clocks[view.camera] + torch.tensor(later_us) / CLOCK_US
-        knots = self._knots[:, row, there]
-        before, after = torch.cat([self.ego.deltas, self.paths]).index_select(0, knots.flatten()).view(*knots.shape, 6)
-        deltas = (before * (1 - share) + after * share) * self._units[there]
-        deltas = deltas + self._drifts[row, there] * late[:, None, None]
+        around = self._around[self.row[view.camera, view.index]]
+        late = self.clocks[view.camera] + torch.tensor(later_us) / CLOCK_US
+        corrections = torch.cat([self.ego.deltas, self.paths]).index_select(0, around.knots.flatten())
+        before, after = corrections.view(*around.knots.shape, 6)
+        deltas = (before * (1 - around.shares) + after * around.shares) * around.units
+        deltas = deltas + around.drifts * late[:, None, None]
         mount = scaled(self.extrinsics[view.camera], *EXTRINSIC)
         small = small_poses(torch.cat([deltas.flatten(0, 1), mount[None]]))
-        body, actors = (self._bases[row, there] @ small[:-1].view(*deltas.shape[:2], 4, 4)).split([1, len(there) - 1], 1)
-        return torch.cat([body @ (self.rig[view.camera].body_from_cam @ small[-1]), actors], 1), there[1:].tolist()
+        poses = around.bases @ small[:-1].view(*deltas.shape[:2], 4, 4)
+        cameras = poses[:, :1] @ (self.rig[view.camera].body_from_cam @ small[-1])
+        return torch.cat([cameras, poses[:, 1:]], 1), around.groups[1:]
 
     def left(self, view: View) -> torch.Tensor:
         """The direction `[3]` to the body's left at a view."""
-        return self._bases[self.row[view.camera, view.index], 0, :3, 1]
+        return self._around[self.row[view.camera, view.index]].bases[0, :3, 1]
 
     def parameters(self, refine: Sequence[str] = REFINED) -> list[torch.Tensor]:
         """What a fit corrects of what `refine` names; mounts and clocks only where there are several cameras, since the body's poses make

@@ -13,7 +13,6 @@ from recon.fit.motion import Motion
 from recon.frames import Frames
 from recon.skies import always_hidden
 from recon.view import View
-from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.spread import spread
@@ -53,7 +52,7 @@ class Openings:
         """What lies behind everything, colours `[h, w, 3]` by directions `[h, w, 3]` in the world: the sky `[H, 2H, 3]`, and where no
         picture shows it any one grey, another one each time. A bright sky below the road would be the cheapest light at the edges of shade,
         and leave holes there."""
-        grey = upload(torch.rand(1, generator=generator), self.device)
+        grey = float(torch.rand(1, generator=generator))
 
         def behind(directions: torch.Tensor) -> torch.Tensor:
             open_ = ~masked(self.hidden, directions)
