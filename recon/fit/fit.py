@@ -38,7 +38,6 @@ from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.ground import Ground
-from scenes.poses import inverse
 from scenes.sky import sample_equirect
 
 SKY_PRIOR = 3e-6
@@ -145,7 +144,7 @@ class Fit:
             beside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
             aside = self.motion.beside(shot, beside)
         rates = self._rates()
-        which = self._in_sight(shot, aside)
+        which = self._in_sight(shot) if aside is None else self._in_sight(shot, aside)
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
         known, shade = self._known(view), shade_of(shown)
@@ -213,15 +212,10 @@ class Fit:
         shown = self.splats.select(self._in_sight(shot), self.sh_count())
         return self._render(shown, shot, partial(sample_equirect, self.sky), outputs=outputs)
 
-    def _in_sight(self, *shots: Shot | None) -> torch.Tensor:
+    def _in_sight(self, *shots: Shot) -> torch.Tensor:
         """Indices of the splats that any of the pictures may show."""
-        eyes: list[Eye] = []
-        taken = [shot for shot in shots if shot is not None]
-        for shot in taken:
-            middle = inverse(shot.camera.world_from_cam.detach())
-            first, last = (middle, middle) if shot.read is None else shot.read[:, 0]
-            eyes.append((shot.camera, first, last))
-        return in_sight(self.splats, eyes, {i for shot in taken for i in shot.near})
+        eyes: list[Eye] = [(shot.camera, *shot.backs()) for shot in shots]
+        return in_sight(self.splats, eyes, {i for shot in shots for i in shot.near})
 
     def _render(
         self,
@@ -255,7 +249,7 @@ class Fit:
         opacity = torch.sigmoid(shown.fields["logits"])
         stays = upload(torch.rand(opacity.shape, generator=self.generator) >= share, opacity.device)
         denser = torch.where(stays, opacity / (1 - share), 0.0).clamp(1e-5, 0.999)
-        return Splats(shown.fields | {"logits": torch.logit(denser)}, shown.sizes, shown.reach)
+        return shown.changed(logits=torch.logit(denser))
 
     def _placed(self, shown: Splats, shot: Shot) -> list[Placed]:
         """The splats in sight where they are at a shot's moment, each, where rows are read one after the other, at its own row's."""

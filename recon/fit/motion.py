@@ -55,6 +55,13 @@ class Shot:
         """Of those that may be in view."""
         return {i: self.actors[i] for i in self.near}
 
+    def backs(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """cam_from_world `[4, 4]` as the readout begins and as it ends."""
+        if self.read is not None:
+            return self.read[0, 0], self.read[1, 0]
+        back = inverse(self.camera.world_from_cam.detach())
+        return back, back
+
     def at_once(self) -> Shot:
         """The same without a readout."""
         return replace(self, read=None)
@@ -107,8 +114,8 @@ class Motion:
         self._around = []
         for row, time in enumerate(times):
             there = [0, *(i for i, k in enumerate(actors, 1) if k.trajectory.covers(time))]
-            of = [part[row, there] for part in (bases, shares, drifts)]
-            self._around.append(_Around(there, *of, knots[row][:, there], units[there], radii[there]))
+            base, part, way = (of[row, there] for of in (bases, shares, drifts))
+            self._around.append(_Around(there, base, part, way, knots[row][:, there], units[there], radii[there]))
 
     def speeds(self) -> torch.Tensor:
         """Metres a second `[V]` of the body at every view."""
@@ -127,10 +134,8 @@ class Motion:
         camera = camera if size is None else camera.resized(*size)
         read = None
         if half:
-            locals_ = poses[1:].detach().clone()
-            cam_from_world = inverse(locals_[:, :1])
-            locals_[:, 0] = torch.eye(4, dtype=torch.float64)
-            read = cam_from_world @ locals_
+            there, still = poses[1:].detach(), torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4)
+            read = inverse(there[:, :1]) @ torch.cat([still, there[:, 1:]], 1)
         return Shot(view, camera, dict(zip(groups, poses[0, 1:].unbind(), strict=True)), self.near(view, camera), read)
 
     def beside(self, shot: Shot, camera: Camera) -> Shot:
@@ -143,7 +148,7 @@ class Motion:
             return splats
         row = {0: 0} | {group: k for k, group in enumerate(shot.actors, 1)}
         there = [i for i, size in enumerate(splats.sizes) if size]
-        first, last = shot.read[:, [row[i] for i in there]]
+        first, last = shot.read[:, [row.get(i, 0) for i in there]]  # who is not there is not placed either
         means, shutter = splats.fields["means"], self.rig[shot.view.camera].shutter
         shifts = readout_shifts(means, [splats.sizes[i] for i in there], first, last, shot.camera, shutter)
         return splats.changed(means=means + shifts)
