@@ -160,7 +160,7 @@ def hold_shade(shown: Splats, which: torch.Tensor) -> None:
     for name in ("means", "quats", "log_scales", "sh"):
         gradient = shown.fields[name].grad
         if gradient is not None:
-            gradient[which] = 0
+            gradient.masked_fill_(which.view(-1, *[1] * (gradient.ndim - 1)), 0)  # unlike an index, this does not wait for the device
 
 
 def _axes(quats: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:

@@ -29,7 +29,7 @@ def developed(
     `shift` (rows and columns, below `SKY_STEP`), or those between would never learn.
     """
     rays = on_device(_sample_rays(camera.lens.key(), camera.width, camera.height, tuple(shift)), rgb.device)
-    samples = sky(rays @ upload(camera.world_from_cam[:3, :3].detach(), rgb.device).T)
+    samples = sky(rays @ upload(camera.world_from_cam[:3, :3].detach().float(), rgb.device).T)
     if rgb.device.type == "cuda":
         return developed_by_matrices(rgb, alpha, samples, exposure, shift)
     return Develop.apply(rgb, alpha, samples, exposure, shift)
@@ -37,10 +37,10 @@ def developed(
 
 @lru_cache(maxsize=512)
 def _sample_rays(key: tuple, width: int, height: int, shift: tuple[int, int]) -> torch.Tensor:
-    """float64 `[h, w, 3]` directions in the camera of the sky's samples; shared, not to be written to."""
+    """float32 `[h, w, 3]` directions in the camera of the sky's samples; shared, not to be written to."""
     lens_type, *numbers = key
     y, x = (SKY_STEP * (torch.arange(n // SKY_STEP + 2) + 0.5) - s for n, s in zip((height, width), shift, strict=True))
-    return lens_type(*numbers).unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double())
+    return lens_type(*numbers).unproject(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).double()).float()
 
 
 def developed_by_matrices(rgb: torch.Tensor, alpha: torch.Tensor, samples: torch.Tensor, exposure: torch.Tensor, shift: Sequence[int]):

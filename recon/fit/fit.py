@@ -4,7 +4,6 @@ ground is pressed flat besides."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,8 +17,8 @@ from recon.fit.flat import FlatGround
 from recon.fit.halves import ROOM, halves, outdone
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
-from recon.fit.model import Splats, draw, placed_groups
-from recon.fit.motion import Moment, Motion
+from recon.fit.model import Splats, dimmed_actors, draw
+from recon.fit.motion import Motion, Shot
 from recon.fit.openings import Openings
 from recon.fit.reach import reach_of
 from recon.fit.refill import REFILLED_AT, missed
@@ -39,8 +38,6 @@ from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.ground import Ground
-from scenes.poses import inverse
-from scenes.scene import dimmed
 from scenes.sky import sample_equirect
 
 SKY_PRIOR = 3e-6
@@ -140,14 +137,14 @@ class Fit:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
         self._tend()
         view = self.training[self.turns.next()]
-        camera = self.motion.camera(view).resized(*self.targets.size(view, self.shrink()))
-        target = self.targets.picture(view, self.shrink())
+        shot = self.motion.shot(view, self.targets.size(view, self.shrink()))
+        camera, target = shot.camera, self.targets.picture(view, self.shrink())
         aside = None
         if self.step_count % ASIDE_EVERY == 0:
-            aside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
-        ends = self.motion.readout(view, camera)
+            beside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
+            aside = self.motion.beside(shot, beside)
         rates = self._rates()
-        which = self._in_sight(view, camera, ends, aside)
+        which = self._in_sight(shot) if aside is None else self._in_sight(shot, aside)
         self.descent.catch_up(self.splats, which, self.sh_count(), rates)
         shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
         known, shade = self._known(view), shade_of(shown)
@@ -156,7 +153,7 @@ class Fit:
         blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
         sky = self.openings.backdrop(self.sky, self.generator)
         outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
-        drawn = self._render(by_lot, view, camera, ends, sky, shift, outputs, blank)
+        drawn = self._render(by_lot, shot, sky, shift, outputs, blank)
         rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
         lattice = (STEP, *torch.randint(0, STEP, (2,), generator=self.generator).tolist())
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, lattice)
@@ -166,11 +163,13 @@ class Fit:
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
             closing = shown.held(self.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
-            (solid,) = draw(self._placed(closing, view, aside), aside, "alpha", scale=scale_of(view, aside))
-            haze = haze + self.openings.gaps(solid, aside)
-        for weight, there in known:
-            haze = haze + self.config.depth_weight * weight * mistake(drawn["depth"], alpha, there)
-        unrest = self.limbs.unrest((i + 1 for i in self.motion.near(view, camera).tolist()), camera)
+            (solid,) = draw(self._placed(closing, aside), aside.camera, "alpha", scale=scale_of(view, aside.camera))
+            haze = haze + self.openings.gaps(solid, aside.camera)
+        if known:
+            weights, depths = zip(*known, strict=True)
+            mistakes = mistake(drawn["depth"], alpha, torch.stack(depths)).unbind()
+            haze = haze + sum(self.config.depth_weight * weight * each for weight, each in zip(weights, mistakes, strict=True))
+        unrest = self.limbs.unrest(shot.near, camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
         torch.autograd.backward([cost for cost in (whole, self.motion.unrest()) if cost.requires_grad])
@@ -209,42 +208,31 @@ class Fit:
 
     def _drawn(self, view: View, *outputs: str) -> dict[str, torch.Tensor]:
         """Outputs of a view at full size."""
-        camera = self.motion.camera(view)
-        ends = self.motion.readout(view, camera)
-        shown = self.splats.select(self._in_sight(view, camera, ends, None), self.sh_count())
-        return self._render(shown, view, camera, ends, partial(sample_equirect, self.sky), outputs=outputs)
+        shot = self.motion.shot(view)
+        shown = self.splats.select(self._in_sight(shot), self.sh_count())
+        return self._render(shown, shot, partial(sample_equirect, self.sky), outputs=outputs)
 
-    def _in_sight(self, view: View, camera: Camera, ends: list[Moment], aside: Camera | None) -> torch.Tensor:
-        """Indices of the splats that a picture of a view, and one from aside, may show."""
-        middle = inverse(camera.world_from_cam.detach())
-        first, last = (back for back, _ in ends) if ends else (middle, middle)
-        eyes: list[Eye] = [(camera, first, last)]
-        actors = self.motion.near(view, camera).tolist()
-        if aside is not None:
-            beside = inverse(aside.world_from_cam)
-            eyes.append((aside, beside, beside))
-            actors += self.motion.near(view, aside).tolist()
-        return in_sight(self.splats, eyes, [i + 1 for i in actors])
+    def _in_sight(self, *shots: Shot) -> torch.Tensor:
+        """Indices of the splats that any of the pictures may show."""
+        eyes: list[Eye] = [(shot.camera, *shot.backs()) for shot in shots]
+        return in_sight(self.splats, eyes, {i for shot in shots for i in shot.near})
 
     def _render(
         self,
         shown: Splats,
-        view: View,
-        camera: Camera,
-        ends: list[Moment],
+        shot: Shot,
         sky: Callable[[torch.Tensor], torch.Tensor],
         shift: Sequence[int] = (0, 0),
         outputs: Sequence[str] = ("rgb", "alpha"),
         features: torch.Tensor | None = None,
     ) -> dict[str, torch.Tensor]:
-        """Outputs of a view by the splats in sight, by name: "rgb" `[H, W, 3]`, with the sky behind, exposed as its camera does; "alpha";
+        """Outputs of a shot by the splats in sight, by name: "rgb" `[H, W, 3]`, with the sky behind, exposed as its camera does; "alpha";
         "depth", and what the picture shows of the splats' `features` `[N, C]`, where they are wanted. shift: of the sky's samples
         (`developed`)."""
-        placed = self._placed(shown, view, camera)
+        placed, view, camera = self._placed(shown, shot), shot.view, shot.camera
         of_groups = None if features is None else features.split(shown.sizes)
         theirs = None if of_groups is None else [of_groups[p.instance] for p in placed]
-        read = self.motion.as_read(placed, ends, view, camera)
-        drawn = draw(read, camera, *outputs, features=theirs, scale=scale_of(view, camera))
+        drawn = draw(placed, camera, *outputs, features=theirs, scale=scale_of(view, camera))
         found = dict(zip(outputs, drawn, strict=True))
         return found | {"rgb": developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)}
 
@@ -261,14 +249,12 @@ class Fit:
         opacity = torch.sigmoid(shown.fields["logits"])
         stays = upload(torch.rand(opacity.shape, generator=self.generator) >= share, opacity.device)
         denser = torch.where(stays, opacity / (1 - share), 0.0).clamp(1e-5, 0.999)
-        return Splats(shown.fields | {"logits": torch.logit(denser)}, shown.sizes, shown.reach)
+        return shown.changed(logits=torch.logit(denser))
 
-    def _placed(self, shown: Splats, view: View, camera: Camera) -> list[Placed]:
-        """The splats in sight where they are at a view's moment."""
-        placed = placed_groups(shown.groups(self.sh_count()), self.motion.actor_poses(view, camera))
-        gain = self._followed[view.time_us]
-        placed = [placed[0], *(replace(p, gaussians=dimmed(p.gaussians, gain)) for p in placed[1:])]
-        return self.limbs.bent(placed, view.time_us)
+    def _placed(self, shown: Splats, shot: Shot) -> list[Placed]:
+        """The splats in sight where they are at a shot's moment, each, where rows are read one after the other, at its own row's."""
+        splats = self.limbs.bent(dimmed_actors(shown, self._followed[shot.view.time_us]), shot.view.time_us)
+        return self.motion.as_read(splats, shot).placed(shot.poses())
 
     @torch.no_grad()
     def _guess(self) -> None:
@@ -286,10 +272,10 @@ class Fit:
         """What the picture shows that shows most of each splat `[N]`, and whether any has its middle in it, by `shown_parts`."""
         part, inside = torch.zeros_like(self.splats.reach), torch.zeros_like(self.splats.reach, dtype=torch.bool)
         for view in self.training:
-            camera = self.motion.camera(view).resized(*self.targets.size(view, 4))
-            which = self._in_sight(view, camera, [], None)
-            placed = self._placed(self.splats.select(which, 1), view, camera)
-            shown, within = shown_parts(placed, camera, scale_of(view, camera))
+            shot = self.motion.shot(view, self.targets.size(view, 4)).at_once()
+            which = self._in_sight(shot)
+            placed = self._placed(self.splats.select(which, 1), shot)
+            shown, within = shown_parts(placed, shot.camera, scale_of(view, shot.camera))
             part[which] = torch.maximum(part[which], shown)
             inside[which] |= within
         return part, inside

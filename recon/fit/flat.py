@@ -53,6 +53,7 @@ class FlatGround:
         self.heights = (ground.heights - SUNK).to(device).contiguous()
         self.grid = Grid()
         (self.grid.x, self.grid.y), self.grid.cell = ground.origin, ground.cell
+        self.origin = torch.tensor(ground.origin, device=device)
 
     def on(self, splats: Splats) -> torch.Tensor:
         """Which splats, bool `[N]`, are background and nearer than `NEAR` to the ground. To hide a gap there it would pay to rise and to
@@ -79,7 +80,7 @@ class FlatGround:
 
     def _cells(self, means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Row and column `[N]` of the cells nearest to means `[N, 3]`, those at the edge of what is beyond."""
-        (rows, columns), at = self.heights.shape, (means[:, :2] - means.new_tensor(self.ground.origin)) / self.ground.cell
+        (rows, columns), at = self.heights.shape, (means[:, :2] - self.origin) / self.ground.cell
         x, y = at.round().long().T
         return y.clamp(0, rows - 1), x.clamp(0, columns - 1)
 

@@ -7,12 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import torch
 
+from recon.fit.model import Splats
 from recon.fit.strides import gone, phase, waves
 from recon.log import Track
 from scenes.camera import Camera
 from scenes.deformation import Deformation, Lattice, between
-from scenes.gaussians import Placed
-from scenes.scene import bend
 
 MODES = 4
 """A walk's mean posture and four more hold 98 % of it: the stride's two phases and twice its frequency's (Troje 2002)."""
@@ -84,9 +83,12 @@ class Limbs:
         groups = [{"params": [limb.modes for limb in self.of.values()]}, {"params": [limb.added for limb in self.of.values()]}]
         self._adam = torch.optim.Adam(groups, lr=RATE, eps=1e-12) if self.of else None
 
-    def bent(self, placed: list[Placed], time_us: int) -> list[Placed]:
-        """What is placed as it is bent at a time; differentiable."""
-        return [bend(p, self.of[p.instance].at(time_us)) if p.instance in self.of else p for p in placed]
+    def bent(self, splats: Splats, time_us: int) -> Splats:
+        """The splats of all groups as those with limbs are bent at a time; differentiable."""
+        means, moves = list(splats.fields["means"].split(splats.sizes)), [i for i in self.of if splats.sizes[i]]
+        for i in moves:
+            means[i] = means[i] + self.of[i].at(time_us).at(means[i])
+        return splats.changed(means=torch.cat(means)) if moves else splats
 
     def unrest(self, groups: Iterable[int], camera: Camera) -> torch.Tensor | float:
         """`Limb.unrest` of those of the groups that have limbs: what a picture does not show is left as it is."""

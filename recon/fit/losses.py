@@ -10,6 +10,10 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
+import warp as wp
+
+from recon.kernels.similarity import similar_kernel
+from render.launch import run, stage, view
 
 WINDOW, HALF = 11, 5
 SIGMA = 1.5
@@ -79,8 +83,9 @@ def _band(size: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     return torch.where(near, _taps(dtype)[away.clamp(0, WINDOW - 1)], 0.0).to(device)
 
 
+@lru_cache(maxsize=8)
 def _kernels(count: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """The window across a row and down a column, of `count` channels."""
+    """The window across a row and down a column, of `count` channels; shared, not to be written to."""
     across = _taps(dtype).expand(count, 1, 1, WINDOW).contiguous()
     return across, across.transpose(2, 3).contiguous()
 
@@ -93,16 +98,14 @@ def _taps(dtype: torch.dtype) -> torch.Tensor:
 
 def similarity(a: torch.Tensor, b: torch.Tensor, lattice: Lattice = EVERYWHERE) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean structural similarity (Wang et al. 2004) of pictures `[H, W, C]` with peak 1 at a lattice's points, and its gradient in `a`."""
-    mu_a, mu_b, aa, bb, ab = (m.contiguous() for m in _blur(torch.cat([a, b, a * a, b * b, a * b], -1), lattice).split(a.shape[-1], -1))
-    mean_product, mean_squares = mu_a * mu_b, mu_a * mu_a + mu_b * mu_b
-    top_mean, top = 2 * mean_product + C1, 2 * (ab - mean_product) + C2
-    bottom_mean, bottom = mean_squares + C1, aa + bb - mean_squares + C2
-    below = 1 / (bottom_mean * bottom)
-    value = top_mean * top * below
-    by_aa = -value / bottom
-    by_ab = 2 * top_mean * below
-    by_mean = 2 * mu_b * (top - top_mean) * below - 2 * mu_a * value * (1 / bottom_mean - 1 / bottom)
-    back = _blur_back(torch.cat([by_mean, by_aa, by_ab], -1), lattice, *a.shape[:2])
+    real = wp.float64 if a.dtype == torch.float64 else wp.float32
+    maps = _blur(torch.cat([a, b, a * a, b * b, a * b], -1), lattice)
+    (rows, columns), channels = maps.shape[:2], a.shape[-1]
+    value, slopes = maps.new_empty(rows, columns, channels), maps.new_empty(rows, columns, 3 * channels)
+    with stage(maps.device):
+        args = [view(maps, real), C1, C2, view(value, real), view(slopes, real)]
+        run(similar_kernel(real), rows * columns, args, maps.device)
+    back = _blur_back(slopes, lattice, *a.shape[:2])
     g_mean, g_aa, g_ab = back.split(a.shape[-1], -1)
     return value.mean(), (g_mean + 2 * a * g_aa + b * g_ab) / value.numel()
 

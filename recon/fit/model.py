@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +13,7 @@ from render import rasterize
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
+from scenes.harmonics import brighter
 from scenes.poses import interpolate
 from scenes.trajectory import Trajectory
 
@@ -49,6 +51,17 @@ class Splats:
         sh = sh if sh.shape[1] == sh_count else sh[:, :sh_count]
         return [Gaussians(*part) for part in zip(*(torch.split(t, self.sizes) for t in (*rest, sh)), strict=True)]
 
+    def placed(self, poses: dict[int, torch.Tensor]) -> list[Placed]:
+        """The background, and the groups that have splats and a pose; the instance is the group's index."""
+        there = [i for i, size in enumerate(self.sizes) if size or not i]
+        parts = zip(*(self.fields[name].split([self.sizes[i] for i in there]) for name in FIELDS), strict=True)
+        poses = {0: _STILL} | poses
+        return [Placed(Gaussians(*part), poses[i], instance=i) for i, part in zip(there, parts, strict=True) if i in poses]
+
+    def changed(self, **fields: torch.Tensor) -> Splats:
+        """The same splats with other fields."""
+        return Splats(self.fields | fields, self.sizes, self.reach)
+
     def select(self, which: torch.Tensor, sh_count: int) -> Splats:
         """Copies of the splats at rising indices `which`, with the first `sh_count` coefficients, for a step to differentiate."""
         fields = {k: (v[:, :sh_count] if k == "sh" else v).detach().index_select(0, which).requires_grad_() for k, v in self.fields.items()}
@@ -59,19 +72,34 @@ class Splats:
         """The same splats, of which some, bool `[N]`, are not differentiated by these fields."""
         of = {name: self.fields[name] for name in names}
         still = {name: torch.where(which.view(-1, *[1] * (field.ndim - 1)), field.detach(), field) for name, field in of.items()}
-        return Splats(self.fields | still, self.sizes, self.reach)
+        return self.changed(**still)
 
     def group_of(self) -> torch.Tensor:
         """Group index `[N]` of every splat."""
         return torch.repeat_interleave(torch.arange(len(self.sizes)), torch.tensor(self.sizes)).to(self.reach.device)
 
 
+_STILL = torch.eye(4, dtype=torch.float64)
+
+_GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
+"""What turning about each axis, and moving along it, adds to a small motion's matrix."""
+for _axis, (_i, _j) in enumerate(((2, 1), (0, 2), (1, 0))):
+    _GENERATORS[_axis, _i, _j], _GENERATORS[_axis, _j, _i], _GENERATORS[3 + _axis, _axis, 3] = 1, -1, 1
+
+_POWERS = torch.arange(20, dtype=torch.float64)
+_SERIES = torch.tensor([[(-1) ** k / math.factorial(2 * k + n) for n in (2, 3)] for k in range(20)], dtype=torch.float64)
+"""Of (1 - cos a) / a^2 and (a - sin a) / a^3 in powers of a^2: to float64's last digits for up to a whole turn, and smooth at 0."""
+
+
 def small_poses(deltas: torch.Tensor) -> torch.Tensor:
-    """Poses `[..., 4, 4]` of small motions `[..., 6]`: rotation vector (radians), then translation (metres), by the exponential map."""
-    x, y, z, u, v, w = deltas.to(torch.float64).unbind(-1)
-    o = torch.zeros_like(x)
-    rows = [torch.stack(r, -1) for r in ([o, -z, y, u], [z, o, -x, v], [-y, x, o, w], [o, o, o, o])]
-    return torch.linalg.matrix_exp(torch.stack(rows, -2))
+    """Poses `[..., 4, 4]` of small motions `[..., 6]`: rotation vector (radians, less than a turn), then translation (metres), by the
+    exponential map, which of such a matrix is a cubic (Rodrigues' formula)."""
+    deltas = deltas.to(torch.float64)
+    once = (deltas @ _GENERATORS.flatten(1)).unflatten(-1, (4, 4))
+    twice = once @ once
+    square = deltas[..., :3].square().sum(-1, keepdim=True)
+    second, third = (square**_POWERS @ _SERIES)[..., None, None].unbind(-3)
+    return _STILL + once + second * twice + third * (twice @ once)
 
 
 def scaled(raw: torch.Tensor, radians: float, metres: float) -> torch.Tensor:
@@ -124,6 +152,15 @@ class Knots:
         return (d[2:] - 2 * d[1:-1] + d[:-2]).square().sum() if len(d) > 2 else d.sum() * 0
 
 
+def dimmed_actors(splats: Splats, gain: torch.Tensor | None) -> Splats:
+    """The splats of all groups, those of actors so much less bright as cameras were exposed more, by a gain `[3]`; as they are where that
+    is None."""
+    if gain is None:
+        return splats
+    sh, still = splats.fields["sh"], splats.sizes[0]
+    return splats.changed(sh=torch.cat([sh[:still], brighter(sh[still:], 1 / gain.to(sh))]))
+
+
 MODEL = SplatModel(projection="ewa")
 """What is trained: EWA costs less than UT, and splats this small look the same under both."""
 
@@ -135,9 +172,3 @@ def draw(
     that the finished splats are fitted to."""
     frame = rasterize(placed, camera, outputs, model=MODEL.at_scale(scale), features=features)
     return [getattr(frame, name) for name in outputs]
-
-
-def placed_groups(groups: list[Gaussians], poses: dict[int, torch.Tensor]) -> list[Placed]:
-    """The background, and the actors that have a pose; the instance is the group's index."""
-    world = torch.eye(4, dtype=torch.float64)
-    return [Placed(groups[0], world)] + [Placed(groups[i], pose, instance=i) for i, pose in poses.items()]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from recon.fit.model import Knots, scaled, small_poses
-from recon.fit.shutter import shifts_of
+from recon.fit.model import Knots, Splats, scaled, small_poses
+from recon.fit.shutter import readout_shifts
 from recon.frames import Frames
 from recon.log import Track
 from recon.view import View
 from scenes.camera import Camera, RigCamera
-from scenes.gaussians import Placed
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -37,8 +37,48 @@ NEARBY_US = 50_000
 """Half the time over which a speed is taken."""
 
 
-Moment = tuple[torch.Tensor, dict[int, torch.Tensor]]
-"""cam_from_world `[4, 4]`, and the actors' poses by group."""
+@dataclass(frozen=True)
+class Shot:
+    """What a camera sees of a view's moment.
+
+    actors: poses `[4, 4]` by group of all there are; near: the groups that may be in the camera's view; read: cam_from_local float64
+    `[2, 1 + A, 4, 4]` of the world and of all actors, as the readout of the view begins and as it ends; None where it is instant.
+    """
+
+    view: View
+    camera: Camera
+    actors: dict[int, torch.Tensor]
+    near: list[int]
+    read: torch.Tensor | None = None
+
+    def poses(self) -> dict[int, torch.Tensor]:
+        """Of those that may be in view."""
+        return {i: self.actors[i] for i in self.near}
+
+    def backs(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """cam_from_world `[4, 4]` as the readout begins and as it ends."""
+        if self.read is not None:
+            return self.read[0, 0], self.read[1, 0]
+        back = inverse(self.camera.world_from_cam.detach())
+        return back, back
+
+    def at_once(self) -> Shot:
+        """The same without a readout."""
+        return replace(self, read=None)
+
+
+class _Around(NamedTuple):
+    """The body at a view's moment and, behind it, the actors that there are: their groups (the body's is 0), uncorrected poses
+    `[1 + A, 4, 4]`, shares `[1 + A, 1]` of the later of their `knots` `[2, 1 + A]` among all corrections, drifts `[1 + A, 6]`, units
+    `[1 + A, 6]` of corrections, and radii."""
+
+    groups: list[int]
+    bases: torch.Tensor
+    shares: torch.Tensor
+    drifts: torch.Tensor
+    knots: torch.Tensor
+    units: torch.Tensor
+    radii: np.ndarray
 
 
 class Motion:
@@ -57,81 +97,92 @@ class Motion:
         views = frames.views
         times = np.array([v.time_us for v in views])
         self.row = {(v.camera, v.index): i for i, v in enumerate(views)}
-        self._body = ego.base(times)
-        self._drift = drift(ego, times)
-        # of all actors at every view `[V, A, ...]`
-        counts = [len(knots.deltas) for knots in actors]
+        # of the body and, one after the other behind it, all actors at every view
+        all_knots = [ego, *actors]
+        counts = [len(knots.deltas) for knots in all_knots]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        self.paths = torch.zeros(int(self._first[-1]), 6)
-        between = [torch.arange(a + 1, a + n - 1) for a, n in zip(self._first.tolist(), counts, strict=False) if n > 2]
+        self.paths = torch.zeros(int(self._first[-1] - self._first[1]), 6)
+        between = [torch.arange(a, a + n - 2) for a, n in zip(self._first[1:-1] - self._first[1], counts[1:], strict=True) if n > 2]
         self._inner = torch.cat([torch.zeros(0, dtype=torch.int64), *between])
-        bases = [knots.base(times) for knots in actors]
-        self._boxes, knot, share = (torch.stack(parts, 1) for parts in zip(*bases, strict=True)) if bases else _nobody(len(times))
+        bases, knot, share = (torch.stack(parts, 1) for parts in zip(*(knots.base(times) for knots in all_knots), strict=True))
         first, last = torch.from_numpy(self._first[:-1]), torch.from_numpy(self._first[1:] - 1)
-        self._knots, self._shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)]), share.float()[..., None]
-        self._drifts = torch.stack([drift(knots, times) for knots in actors], 1) if actors else torch.zeros(len(times), 0, 6)
-        self._covers = torch.tensor([[k.trajectory.covers(t) for k in actors] for t in times], dtype=torch.bool).view(
-            len(times), len(actors)
-        )
-        self._radii = torch.tensor([float(np.linalg.norm(box)) for box in boxes], dtype=torch.float64)
+        knots, shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)], 1), share.float()[..., None]
+        drifts = torch.stack([drift(knots, times) for knots in all_knots], 1)
+        units = torch.tensor([[unit[0]] * 3 + [unit[1]] * 3 for unit in (EGO, *[ACTOR] * len(actors))])
+        radii = np.array([0.0, *(np.linalg.norm(box) for box in boxes)])
+        self._speeds = drifts[:, 0, 3:].norm(dim=1) * (1e6 / CLOCK_US)
+        self._around = []
+        for row, time in enumerate(times):
+            there = [0, *(i for i, k in enumerate(actors, 1) if k.trajectory.covers(time))]
+            base, part, way = (of[row, there] for of in (bases, shares, drifts))
+            self._around.append(_Around(there, base, part, way, knots[row][:, there], units[there], radii[there]))
 
     def speeds(self) -> torch.Tensor:
         """Metres a second `[V]` of the body at every view."""
-        return self._drift[:, 3:].norm(dim=1) * (1e6 / CLOCK_US)
+        return self._speeds
 
-    def camera(self, view: View, later_us: float = 0.0) -> Camera:
-        """The view's camera at its corrected pose, or where it is `later_us` after its moment."""
-        rig, row = self.rig[view.camera], self.row[view.camera, view.index]
-        poses, knots, shares = self._body
-        late = self.clocks[view.camera] + later_us / CLOCK_US
-        delta = scaled(self.ego.correction(knots[row], shares[row]), *EGO) + self._drift[row] * late
-        mount = rig.body_from_cam @ small_poses(scaled(self.extrinsics[view.camera], *EXTRINSIC))
-        return Camera(rig.lens, rig.width, rig.height, poses[row] @ small_poses(delta) @ mount, time_us=view.time_us)
+    def camera(self, view: View) -> Camera:
+        """The view's camera at its corrected pose."""
+        return self._rig_at(view, self._poses(view, [0.0])[0][0, 0])
 
-    def near(self, view: View, camera: Camera) -> torch.Tensor:
-        """Which actors may be in a camera's view at the view's moment, int64."""
-        row = self.row[view.camera, view.index]
-        from_world = inverse(camera.world_from_cam.detach())
-        x, _, z = (self._boxes[row, :, :3, 3] @ from_world[:3, :3].T + from_world[:3, 3]).unbind(-1)
-        aside = x.abs() - 1.5 * self._radii < z.clamp_min(0) * (camera.width / (1.6 * camera.lens.focal()[0])) + self._radii
-        return (self._covers[row] & (z > -self._radii) & aside).nonzero()[:, 0]
+    def shot(self, view: View, size: tuple[int, int] | None = None) -> Shot:
+        """The view's camera at its corrected pose, of pictures of this width and height, and what it sees."""
+        moves = self._speeds[self.row[view.camera, view.index]] >= SLOW
+        half = self.rig[view.camera].readout_us / 2 if moves else 0.0
+        poses, groups = self._poses(view, [0.0, -half, half] if half else [0.0])
+        camera = self._rig_at(view, poses[0, 0])
+        camera = camera if size is None else camera.resized(*size)
+        read = None
+        if half:
+            there, still = poses[1:].detach(), torch.eye(4, dtype=torch.float64).expand(2, 1, 4, 4)
+            read = inverse(there[:, :1]) @ torch.cat([still, there[:, 1:]], 1)
+        return Shot(view, camera, dict(zip(groups, poses[0, 1:].unbind(), strict=True)), self.near(view, camera), read)
 
-    def actor_poses(self, view: View, camera: Camera, later_us: float = 0.0) -> dict[int, torch.Tensor]:
-        """Poses by group of the actors that may be in the camera's view at the view's moment, or `later_us` after it."""
-        row, near = self.row[view.camera, view.index], self.near(view, camera)
-        before, after = self._knots[:, row, near]
-        share, late = self._shares[row, near], self.clocks[view.camera] + later_us / CLOCK_US
-        deltas = self.paths[before] * (1 - share) + self.paths[after] * share
-        poses = self._boxes[row, near] @ small_poses(scaled(deltas, *ACTOR) + self._drifts[row, near] * late)
-        return {i + 1: pose for i, pose in zip(near.tolist(), poses.unbind(), strict=True)}
+    def beside(self, shot: Shot, camera: Camera) -> Shot:
+        """What another camera sees of the same moment at one go."""
+        return replace(shot, camera=camera, near=self.near(shot.view, camera), read=None)
 
-    @torch.no_grad()
-    def readout(self, view: View, camera: Camera) -> list[Moment]:
-        """cam_from_world, and the actors' poses, as the readout of a view begins and as it ends; nothing where it is instant."""
-        half = self.rig[view.camera].readout_us / 2
-        if not half or self.speeds()[self.row[view.camera, view.index]] < SLOW:
-            return []
-        return [(inverse(self.camera(view, late).world_from_cam), self.actor_poses(view, camera, late)) for late in (-half, half)]
+    def as_read(self, splats: Splats, shot: Shot) -> Splats:
+        """What stands before a view's camera, its splats moved to where they were when their rows were read."""
+        if shot.read is None:
+            return splats
+        row = {0: 0} | {group: k for k, group in enumerate(shot.actors, 1)}
+        there = [i for i, size in enumerate(splats.sizes) if size]
+        first, last = shot.read[:, [row.get(i, 0) for i in there]]  # who is not there is not placed either
+        means, shutter = splats.fields["means"], self.rig[shot.view.camera].shutter
+        shifts = readout_shifts(means, [splats.sizes[i] for i in there], first, last, shot.camera, shutter)
+        return splats.changed(means=means + shifts)
 
-    def as_read(self, placed: list[Placed], ends: list[Moment], view: View, camera: Camera) -> list[Placed]:
-        """What stands before a view's camera, its splats moved to where they were when their rows were read; ends: of `readout`."""
-        if not ends:
-            return placed
-        shutter = self.rig[view.camera].shutter
-        first, last = (
-            torch.stack([back @ (poses[p.instance] if p.instance else p.world_from_local) for p in placed]) for back, poses in ends
-        )
-        # all actors at once, which are many and small, and beside them what stands still, which is one and large
-        shifts: dict[int, torch.Tensor] = {}
-        for group in ([k for k, p in enumerate(placed) if not p.instance], [k for k, p in enumerate(placed) if p.instance]):
-            if group:
-                means = [placed[k].gaussians.means for k in group]
-                shifts |= zip(group, shifts_of(means, first[group], last[group], camera, shutter), strict=True)
-        return [replace(p, gaussians=replace(p.gaussians, means=p.gaussians.means + shifts[k])) for k, p in enumerate(placed)]
+    def near(self, view: View, camera: Camera) -> list[int]:
+        """Groups of the actors that may be in a camera's view at the view's moment."""
+        around = self._around[self.row[view.camera, view.index]]
+        pose, places, radii = camera.world_from_cam.detach().numpy(), around.bases.numpy()[1:, :3, 3], around.radii[1:]
+        x, _, z = ((places - pose[:3, 3]) @ pose[:3, :3]).T
+        aside = np.abs(x) - 1.5 * radii < np.maximum(z, 0) * (camera.width / (1.6 * camera.lens.focal()[0])) + radii
+        return [group for group, seen in zip(around.groups[1:], (z > -radii) & aside, strict=True) if seen]
+
+    def _rig_at(self, view: View, world_from_cam: torch.Tensor) -> Camera:
+        rig = self.rig[view.camera]
+        return Camera(rig.lens, rig.width, rig.height, world_from_cam, time_us=view.time_us)
+
+    def _poses(self, view: View, later_us: list[float]) -> tuple[torch.Tensor, list[int]]:
+        """Corrected poses `[T, 1 + A, 4, 4]` of the view's camera and of the actors that there are, so much later than the view's moment;
+        and these actors' groups."""
+        around = self._around[self.row[view.camera, view.index]]
+        late = self.clocks[view.camera] + torch.tensor(later_us) / CLOCK_US
+        corrections = torch.cat([self.ego.deltas, self.paths]).index_select(0, around.knots.flatten())
+        before, after = corrections.view(*around.knots.shape, 6)
+        deltas = (before * (1 - around.shares) + after * around.shares) * around.units
+        deltas = deltas + around.drifts * late[:, None, None]
+        mount = scaled(self.extrinsics[view.camera], *EXTRINSIC)
+        small = small_poses(torch.cat([deltas.flatten(0, 1), mount[None]]))
+        poses = around.bases @ small[:-1].view(*deltas.shape[:2], 4, 4)
+        cameras = poses[:, :1] @ (self.rig[view.camera].body_from_cam @ small[-1])
+        return torch.cat([cameras, poses[:, 1:]], 1), around.groups[1:]
 
     def left(self, view: View) -> torch.Tensor:
         """The direction `[3]` to the body's left at a view."""
-        return self._body[0][self.row[view.camera, view.index]][:3, 1]
+        return self._around[self.row[view.camera, view.index]].bases[0, :3, 1]
 
     def parameters(self, refine: Sequence[str] = REFINED) -> list[torch.Tensor]:
         """What a fit corrects of what `refine` names; mounts and clocks only where there are several cameras, since the body's poses make
@@ -145,7 +196,7 @@ class Motion:
 
     def unrest(self) -> torch.Tensor:
         """What corrections cost that shake, and clocks that are off."""
-        bend = self.paths[self._inner + 1] - 2 * self.paths[self._inner] + self.paths[self._inner - 1]
+        bend = (self.paths[2:] - 2 * self.paths[1:-1] + self.paths[:-2]).index_select(0, self._inner)
         return CALM * (self.ego.unrest() + bend.square().sum() + self.clocks.square().sum())
 
     # ---- what it comes to
@@ -156,7 +207,8 @@ class Motion:
 
     def trajectory(self, actor: int) -> Trajectory:
         """An actor's corrected trajectory."""
-        self.actors[actor].deltas = self.paths[self._first[actor] : self._first[actor + 1]].detach()
+        first, last = self._first[actor + 1 : actor + 3] - self._first[1]
+        self.actors[actor].deltas = self.paths[first:last].detach()
         return self.actors[actor].corrected(*ACTOR)
 
     def mounted(self, camera: int, times_us: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -174,11 +226,6 @@ class Motion:
 
     def restore(self, state: dict) -> None:
         self.extrinsics, self.clocks, self.ego.deltas, self.paths = (state[k] for k in ("extrinsics", "clocks", "ego", "actors"))
-
-
-def _nobody(views: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """As `Knots.base`, of no actor."""
-    return torch.zeros(views, 0, 4, 4, dtype=torch.float64), torch.zeros(views, 0, dtype=torch.int64), torch.zeros(views, 0)
 
 
 def drift(knots: Knots, times_us: np.ndarray) -> torch.Tensor:

@@ -8,14 +8,13 @@ from dataclasses import replace
 import torch
 import torch.nn.functional as F
 
+from recon.fit.behind import masked, sampled
 from recon.fit.motion import Motion
 from recon.frames import Frames
-from recon.skies import always_hidden, cells
+from recon.skies import always_hidden
 from recon.view import View
-from render.launch import upload
 from render.rays import world_directions
 from scenes.camera import Camera
-from scenes.sky import sample_equirect
 from scenes.spread import spread
 
 SKY_WEIGHT = 0.03
@@ -53,13 +52,13 @@ class Openings:
         """What lies behind everything, colours `[h, w, 3]` by directions `[h, w, 3]` in the world: the sky `[H, 2H, 3]`, and where no
         picture shows it any one grey, another one each time. A bright sky below the road would be the cheapest light at the edges of shade,
         and leave holes there."""
-        grey = upload(torch.rand(1, generator=generator), self.device)
+        grey = float(torch.rand(1, generator=generator))
 
         def behind(directions: torch.Tensor) -> torch.Tensor:
-            open_ = ~self.hidden[cells(directions, len(self.hidden))]
+            open_ = ~masked(self.hidden, directions)
             # what is looked up between directions is of both: no grey beside a direction that is open
             beside = F.max_pool2d(open_[None, None].float(), 3, 1, 1)[0, 0, :, :, None] > 0
-            return torch.where(beside, sample_equirect(sky, directions), grey)
+            return torch.where(beside, sampled(sky, directions), grey)
 
         return behind
 
@@ -80,5 +79,5 @@ class Openings:
     def gaps(self, alpha: torch.Tensor, camera: Camera) -> torch.Tensor:
         """What it costs that alpha `[H, W]`, as a camera from aside sees it, is below 1 under the horizon or where the sky is hidden."""
         directions = world_directions(camera, self.device)
-        closed = (directions[..., 2] < HORIZON) | self.hidden[cells(directions, len(self.hidden))]
+        closed = (directions[..., 2] < HORIZON) | masked(self.hidden, directions)
         return ASIDE_WEIGHT * ((1 - alpha) * closed).mean()

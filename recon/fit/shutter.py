@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+import warp as wp
 
-from render.launch import upload
+from recon.kernels.shutter import carry
+from render.launch import run, stage, upload, view
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 
@@ -27,32 +29,25 @@ def as_read(splats: Gaussians, first: torch.Tensor, last: torch.Tensor, camera: 
     return replace(splats, means=splats.means + readout_shift(splats.means, first, last, camera, shutter))
 
 
+def readout_shift(points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> torch.Tensor:
+    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`."""
+    return readout_shifts(points, [len(points)], first[None], last[None], camera, shutter)
+
+
 @torch.no_grad()
-def readout_shift(
-    points: torch.Tensor, first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str, counts: list[int] | None = None
+def readout_shifts(
+    points: torch.Tensor, counts: list[int], first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str
 ) -> torch.Tensor:
-    """How far points `[N, 3]` are, from where they are at the middle row's moment, when their own row is read; else as `as_read`. counts:
-    where first and last are several poses `[P, 4, 4]`, of how many of the points each is."""
+    """The same of several groups of points, so many each, with poses of their own `[P, 4, 4]`."""
+    device = points.device
     middle, travel = (0.5 * (first + last)).float(), (last - first).float()
-    middle, local = (upload(m, points.device) for m in (middle[..., :3, :], middle[..., :3, :3].mT @ travel[..., :3, :]))
-
-    def carried(by: torch.Tensor) -> torch.Tensor:
-        if counts is None:
-            return points @ by[:, :3].T + by[:, 3]
-        return torch.cat([torch.addmm(m[:, 3], p, m[:, :3].T) for p, m in zip(points.split(counts), by, strict=True)])
-
-    seen = carried(middle)
-    ahead = seen[:, 2:] > NEAR
+    by = upload(torch.cat([middle, middle[:, :3, :3].mT @ travel[:, :3]], 1), device)
+    ends = upload(torch.tensor(counts).cumsum(0, dtype=torch.int32), device)
+    seen, moved = torch.empty(2, *points.shape, device=device)
+    with stage(device):
+        args = [view(points.contiguous(), wp.vec3), view(ends, int), view(by, float), NEAR, view(seen, wp.vec3), view(moved, wp.vec3)]
+        run(carry, len(points), args, device)
     axis, extent = (1, camera.height) if shutter == "rows" else (0, camera.width)
-    share = camera.lens.project(torch.where(ahead, seen, 1.0))[:, axis : axis + 1] / extent
+    share = camera.lens.project(seen)[:, axis : axis + 1] / extent
     # the row is that of the middle's moment: a splat that moves by a hundredth of the picture is off by a hundredth of that
-    share = torch.where(ahead, share.clamp(0, 1) - 0.5, 0.0)
-    return share * carried(local)
-
-
-def shifts_of(means: list[torch.Tensor], first: torch.Tensor, last: torch.Tensor, camera: Camera, shutter: str) -> tuple[torch.Tensor, ...]:
-    """`readout_shift` of several groups of points, each with poses of its own `[P, 4, 4]`."""
-    if len(means) == 1:
-        return (readout_shift(means[0], first[0], last[0], camera, shutter),)
-    counts = [len(m) for m in means]
-    return readout_shift(torch.cat(means), first, last, camera, shutter, counts).split(counts)
+    return (share.clamp(0, 1) - 0.5) * moved

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -18,23 +19,22 @@ Eye = tuple[Camera, torch.Tensor, torch.Tensor]
 """A camera, and cam_from_world `[4, 4]` as the readout of its picture begins and as it ends."""
 
 
-def in_sight(splats: Splats, eyes: Sequence[Eye], actors: Sequence[int]) -> torch.Tensor:
+def in_sight(splats: Splats, eyes: Sequence[Eye], actors: Collection[int]) -> torch.Tensor:
     """Indices int64 `[M]`, rising, of the background's splats that one of `eyes` may see, and of all splats of the groups `actors`."""
     still, device = splats.sizes[0], splats.reach.device
     seen = torch.zeros(len(splats), dtype=torch.uint8, device=device)
     if all(isinstance(camera.lens, Pinhole | OpenCV) for camera, *_ in eyes):
-        sides = upload(torch.stack([torch.stack([_planes(camera, way) for way in ways]) for camera, *ways in eyes]), device)
+        sides = upload(torch.stack([_sides(*eye) for eye in eyes]), device)
         with stage(device):
             fields = [view(splats.fields[name], wp.vec3) for name in ("means", "log_scales")]
             run(mark, still, [*fields, view(sides, wp.vec4), view(seen, wp.uint8)], device)
     else:
         seen[:still] = 1
-    for group in actors:
-        begin = sum(splats.sizes[:group])
-        seen[begin : begin + splats.sizes[group]] = 1
+    there = np.isin(np.arange(1, len(splats.sizes)), list(actors))
+    seen[still:] = upload(torch.from_numpy(np.repeat(there.view(np.uint8), splats.sizes[1:])), device)
     return seen.nonzero()[:, 0]
 
 
-def _planes(camera: Camera, cam_from_world: torch.Tensor) -> torch.Tensor:
-    """The sides of the view in the world, float32 `[S, 4]`: unit normal and distance."""
-    return (view_sides(camera, MODEL) @ cam_from_world[:3]).float()
+def _sides(camera: Camera, first: torch.Tensor, last: torch.Tensor) -> torch.Tensor:
+    """The sides of the view in the world, float32 `[2, S, 4]`: unit normal and distance."""
+    return (view_sides(camera, MODEL) @ torch.stack([first, last])[:, :3]).float()

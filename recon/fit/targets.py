@@ -7,6 +7,7 @@ import torch.nn.functional as F
 
 from recon.frames import SMALLEST
 from recon.view import View
+from render.kept import kept_beside
 from scenes.camera import Camera
 
 
@@ -35,9 +36,14 @@ class Targets:
 
 
 def ego_at(view: View, camera: Camera) -> torch.Tensor:
-    """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`."""
+    """What of a picture of the view, of the camera's size, shows the recording car: bool `[H, W, 1]`; shared, not to be written to."""
     assert view.ego is not None
-    return F.adaptive_max_pool2d(view.ego[None].float(), (camera.height, camera.width))[0, :, :, None] > 0
+    return _shrunk(view.ego, camera.height, camera.width)
+
+
+@kept_beside
+def _shrunk(mask: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    return F.adaptive_max_pool2d(mask[None].float(), (height, width))[0, :, :, None] > 0
 
 
 def scale_of(view: View, camera: Camera) -> float:

@@ -146,11 +146,11 @@ def as_known(depth: np.ndarray) -> torch.Tensor:
 
 
 def mistake(depth: torch.Tensor, alpha: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
-    """What rendered depth `[H, W]` costs that is not as measured `[h, w]`, mean over what is known and drawn (the logarithm of Turkulainen
-    et al. 2024, "DN-Splatter", of relative errors): 0 for none, 0.7 at `SLACK`."""
+    """What rendered depth `[H, W]` costs `[M]` that is not as each of M measured it, `[M, h, w]`: mean over what is known and drawn (the
+    logarithm of Turkulainen et al. 2024, "DN-Splatter", of relative errors), 0 for none, 0.7 at `SLACK`."""
     # unlike indexing, whose gradients several threads add up in any order where a picture is smaller than the grid
-    shown, solid = F.interpolate(torch.stack([depth, alpha.detach()])[None], measured.shape, mode="nearest-exact")[0]
-    measured = measured.float()
-    known = measured.isfinite() & (solid > 0.5) & shown.isfinite()
-    off = (torch.where(known, shown, 1.0) / torch.where(known, measured, 1.0) - 1).abs()
-    return torch.log1p(off / SLACK).sum() / known.sum().clamp_min(1)
+    shown, solid = F.interpolate(torch.stack([depth, alpha.detach()])[None], measured.shape[1:], mode="nearest-exact")[0]
+    known = measured.isfinite() & ((solid > 0.5) & shown.isfinite())
+    # by infinity where nobody knows: what is left out has a gradient of 0, which by NaN would be none
+    off = (torch.where(known, shown / torch.where(known, measured.float(), torch.inf), 1.0) - 1).abs()
+    return torch.log1p(off / SLACK).sum((1, 2)) / known.sum((1, 2)).clamp_min(1)

@@ -29,8 +29,8 @@ from recon.fit.openings import Openings
 from render.bridge import Rasterize
 
 PARTS = [
-    (Fit, "step"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Motion, "readout"), (Fit, "_render"),
-    (Motion, "actor_poses"), (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
+    (Fit, "step"), (Motion, "shot"), (Fit, "_in_sight"), (recon.fit.fit, "in_sight"), (Descent, "catch_up"), (Fit, "_render"),
+    (Motion, "as_read"), (Rasterize, "forward"), (render.bridge, "draw"), (Develop, "forward"),
     (PictureLoss, "forward"), (Openings, "gaps"), (torch.Tensor, "backward"), (Rasterize, "backward"), (render.bridge, "draw_backward"),
     (Openings, "haze"), (Develop, "backward"), (Descent, "follow"), (FlatGround, "press"), (Fit, "_follow"),
 ]  # fmt: skip

@@ -1,3 +1,4 @@
+import math
 import os
 import signal
 import sys
@@ -370,11 +371,11 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
     fit.step_count = BLAME_EVERY * 4
     view = fit.training[0]
     fit.turns.shares = torch.eye(len(fit.training))[0]  # the view that is drawn
-    camera = fit.motion.camera(view).resized(*fit.targets.size(view, fit.shrink()))
+    shot = fit.motion.shot(view, fit.targets.size(view, fit.shrink()))
     everything = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-    ones, ends, sky = torch.ones(len(fit.splats), 1), fit.motion.readout(view, camera), partial(sample_equirect, fit.sky)
+    ones, sky = torch.ones(len(fit.splats), 1), partial(sample_equirect, fit.sky)
     with torch.no_grad():
-        drawn = fit._render(everything, view, camera, ends, sky, outputs=("rgb", "alpha", "features"), features=ones)
+        drawn = fit._render(everything, shot, sky, outputs=("rgb", "alpha", "features"), features=ones)
     alpha = drawn["alpha"]
     torch.testing.assert_close(drawn["features"][..., 0], alpha)  # a picture's weights of all splats are its alpha
     wrong = (drawn["rgb"] - fit.targets.picture(view, fit.shrink())).abs().mean(-1)
@@ -393,11 +394,10 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
 def _mistakes(fit):
     found = []
     for view in fit.training:
-        camera = fit.motion.camera(view).resized(*SIZE)
+        shot = fit.motion.shot(view, SIZE)
         shown = fit.splats.select(torch.arange(len(fit.splats)), fit.sh_count())
-        sky, ends = partial(sample_equirect, fit.sky), fit.motion.readout(view, camera)
-        drawn = fit._render(shown, view, camera, ends, sky, outputs=("rgb", "alpha", "depth"))
-        found.append(float(mistake(drawn["depth"], drawn["alpha"], fit.measured[0].views[view.camera, view.index])))
+        drawn = fit._render(shown, shot, partial(sample_equirect, fit.sky), outputs=("rgb", "alpha", "depth"))
+        found.append(float(mistake(drawn["depth"], drawn["alpha"], fit.measured[0].views[view.camera, view.index][None])))
     return np.mean(found)
 
 
@@ -470,6 +470,22 @@ def test_small_poses_are_the_exponential_map():
     torch.testing.assert_close(poses[1], torch.eye(4, dtype=torch.float64))
     assert float(torch.atan2(poses[0, 1, 0], poses[0, 0, 0])) == pytest.approx(0.3, abs=1e-6)
     torch.testing.assert_close(small_poses(-delta[0]) @ poses[0], torch.eye(4, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.02, 1.0, math.pi - 1e-9, math.pi, 6.2])
+def test_small_poses_and_their_gradients_are_those_of_the_matrix_exponential(angle):
+    generator = torch.Generator().manual_seed(2)
+    deltas, weights = (torch.randn(20, *shape, dtype=torch.float64, generator=generator) for shape in ((6,), (4, 4)))
+    deltas[:, :3] *= angle / deltas[:, :3].norm(dim=1, keepdim=True)
+    deltas.requires_grad_()
+    found = small_poses(deltas)
+    x, y, z, *moved = deltas.unbind(1)
+    o = torch.zeros_like(x)
+    rows = ([o, -z, y, moved[0]], [z, o, -x, moved[1]], [-y, x, o, moved[2]], [o] * 4)
+    exact = torch.linalg.matrix_exp(torch.stack([torch.stack(row, 1) for row in rows], 1))
+    torch.testing.assert_close(found, exact, atol=1e-13, rtol=0)
+    slopes = [torch.autograd.grad((poses * weights).sum(), deltas, retain_graph=True)[0] for poses in (found, exact)]
+    torch.testing.assert_close(*slopes, atol=1e-12, rtol=0)
 
 
 def test_corrections_between_knots_are_between_theirs():

@@ -167,15 +167,17 @@ def test_pictures_depths_come_to_the_pixels_of_their_lens(lens):
 
 def test_a_mistake_costs_where_something_is_known_and_drawn():
     depth = torch.full((8, 16), 10.0, requires_grad=True)
-    alpha, known = torch.ones(8, 16), torch.full((4, 8), 10.0).half()
+    alpha, known = torch.ones(8, 16), torch.full((1, 4, 8), 10.0).half()
     assert mistake(depth, alpha, known) == 0
-    known[0, 0], known[1] = 10 / (1 + SLACK), torch.nan
+    known[0, 0, 0], known[0, 1] = 10 / (1 + SLACK), torch.nan
     alpha[4:] = 0.2
     cost = mistake(depth, alpha, known)
+    both = mistake(depth, alpha, torch.cat([torch.full_like(known, 10), known]))
+    assert both.tolist() == [0, cost]
     assert float(cost.detach()) == pytest.approx(np.log(2) / 8, rel=1e-2)  # half of the rows are drawn, half of those known
     cost.backward()
     assert depth.grad is not None and (depth.grad != 0).sum() == 1 and depth.grad[1, 1] > 0
-    nothing = torch.full((4, 8), torch.nan)
+    nothing = torch.full((1, 4, 8), torch.nan)
     empty = mistake(torch.full((8, 16), torch.inf, requires_grad=True), alpha, nothing)
     assert empty == 0
     empty.backward()

@@ -7,7 +7,7 @@ from randomized import gaussians
 from street import START_US, rig, street
 
 from recon.album import at_once
-from recon.fit.model import Knots
+from recon.fit.model import Knots, Splats
 from recon.fit.motion import EGO, Motion
 from recon.fit.shutter import as_read
 from recon.frames import Frames
@@ -77,10 +77,11 @@ def motion(readout_us=0):
 def test_a_late_clock_stands_farther_along_the_path_and_so_do_the_actors_it_sees():
     scene, views, path = motion()
     path.clocks = torch.tensor([4.0])
-    camera = path.camera(views[3])
+    shot = path.shot(views[3])
     later = scene.camera("front_camera", views[3].time_us + 4000)
-    torch.testing.assert_close(camera.world_from_cam, later.world_from_cam, atol=1e-6, rtol=0)
-    (pose,) = path.actor_poses(views[3], camera).values()
+    torch.testing.assert_close(shot.camera.world_from_cam, later.world_from_cam, atol=1e-6, rtol=0)
+    assert torch.equal(path.camera(views[3]).world_from_cam, shot.camera.world_from_cam)
+    (pose,) = shot.poses().values()
     torch.testing.assert_close(pose, scene.actors[0].trajectory.at(views[3].time_us + 4000), atol=1e-6, rtol=0)
     mount, times = path.mounted(0, [v.time_us for v in views])
     assert times.tolist() == [v.time_us + 4000 for v in views]
@@ -95,12 +96,27 @@ def test_corrections_move_the_camera_in_the_bodys_own_frame():
     torch.testing.assert_close(off[:3, 3], torch.tensor([-EGO[1], 0, 0], dtype=torch.float64), atol=1e-9, rtol=0)
 
 
+def splats_of(scene):
+    groups = [scene.background.gaussians, *(a.asset.gaussians for a in scene.actors)]
+    return Splats.of(groups, [torch.ones(len(g)) for g in groups])
+
+
 def test_a_shutter_that_takes_all_rows_at_once_moves_nothing():
     scene, views, path = motion()
-    placed = scene.placed(views[3].time_us)
-    camera = path.camera(views[3])
-    assert path.as_read(placed, path.readout(views[3], camera), views[3], camera) is placed
+    splats = splats_of(scene)
+    assert path.as_read(splats, path.shot(views[3])) is splats
     _, views, path = motion(30_000)
-    camera = path.camera(views[3])
-    moved = path.as_read(placed, path.readout(views[3], camera), views[3], camera)
-    assert all(not torch.equal(a.gaussians.means, b.gaussians.means) for a, b in zip(placed, moved, strict=True))
+    shot = path.shot(views[3])
+    moved = path.as_read(splats, shot)
+    assert all((a != b).any() for a, b in zip(*(s.fields["means"].split(s.sizes) for s in (splats, moved)), strict=True))
+    assert path.as_read(splats, path.beside(shot, shot.camera)) is splats is path.as_read(splats, shot.at_once())
+
+
+def test_groups_that_are_read_together_move_as_each_does_alone():
+    scene, views, path = motion(30_000)
+    splats, shot = splats_of(scene), path.shot(views[3], (48, 27))
+    together = path.as_read(splats, shot).groups(splats.fields["sh"].shape[1])
+    assert len(together) > 1 and set(shot.actors) == set(range(1, len(together)))
+    for k, (group, moved) in enumerate(zip(splats.groups(splats.fields["sh"].shape[1]), together, strict=True)):
+        alone = as_read(group, *shot.read[:, k], shot.camera, "rows")
+        torch.testing.assert_close(moved.means, alone.means, atol=0, rtol=0)

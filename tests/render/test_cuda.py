@@ -7,10 +7,13 @@ import pytest
 import torch
 import warp as wp
 
+from recon.kernels import behind as behind_kernels
 from recon.kernels import descent as descent_kernels
 from recon.kernels import develop as develop_kernels
 from recon.kernels import press as press_kernels
+from recon.kernels import shutter as shutter_kernels
 from recon.kernels import sight as sight_kernels
+from recon.kernels.similarity import similar_kernel
 from render import block_compositing, rasterize
 from render.block_compositing import draw_blocks, draw_blocks_backward
 from render.bridge import Rasterize
@@ -58,6 +61,9 @@ KERNELS = {
     "shadow": lambda: shadow_kernels.fall,
     "press": lambda: press_kernels.press,
     "sight": lambda: sight_kernels.mark,
+    "similarity": lambda: similar_kernel(wp.float32),
+    "shutter": lambda: shutter_kernels.carry,
+    "behind": lambda: behind_kernels.find_corners,
     "frames": lambda: canonical_kernels.make_frames,
     "settled": lambda: settled_kernels.settle,
     "composite": lambda: composite_blocks(EVERYTHING, False, False, TILE),
