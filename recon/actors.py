@@ -10,6 +10,7 @@ import torch
 
 from recon.log import Log, Sweep, Track
 from scenes.poses import inverse
+from scenes.trajectory import all_at, all_near
 
 MARGIN = 0.15
 """Metres around a box within which points count as the object's: annotators cut close."""
@@ -46,13 +47,11 @@ class Split:
 
     def moved(self, sweep: int, time_us: int) -> np.ndarray:
         """Points `[N, 3]` that the sweep of an index has of what moves, where that is at a moment, in the world."""
+        paths = {t.name: path for t in self.tracks if t.name in self.actors and (path := t.trajectory()).covers(time_us)}
         placed = [np.zeros((0, 3))]
-        for track in self.tracks:
-            if track.name not in self.actors or not (path := track.trajectory()).covers(time_us):
-                continue
-            local, of = self.actors[track.name]
-            pose = path.at(time_us).numpy()
-            placed.append(local[of == sweep] @ pose[:3, :3].T + pose[:3, 3])
+        for name, pose in zip(paths, all_at(list(paths.values()), time_us), strict=True):
+            local, of = self.actors[name]
+            placed.append(local[of == sweep] @ pose[:3, :3].numpy().T + pose[:3, 3].numpy())
         return np.concatenate(placed)
 
 
@@ -107,12 +106,10 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
         keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
         # some stamp a sweep as it begins, others as it ends
         middle = (int(times.min()) + int(times.max())) // 2 if len(times) else sweep.time_us
-        for track, smooth in retimed:
-            at = stamps[track.name].get(sweep.time_us)
-            if at is None and not _placed(track, middle):
-                continue
+        there = [(t, smooth, at) for t, smooth in retimed if (at := stamps[t.name].get(sweep.time_us)) is not None or _placed(t, middle)]
+        for (track, smooth, at), pose in zip(there, all_near([t.trajectory() for t, *_ in there], middle), strict=True):
             path = track.trajectory()
-            which = near.of(track, path.near(middle), REACH)
+            which = near.of(track, pose, REACH)
             if not len(which):
                 continue
             taken, of = np.unique(times[which], return_inverse=True)

@@ -122,10 +122,20 @@ class Trajectory:
 
 def all_at(trajectories: Sequence[Trajectory], time_us: int) -> list[torch.Tensor]:
     """Each trajectory's pose `[4, 4]` at a time that all cover, as `at` gives them one by one, interpolated together."""
+    return _together(trajectories, [int(time_us)] * len(trajectories))
+
+
+def all_near(trajectories: Sequence[Trajectory], time_us: int) -> list[torch.Tensor]:
+    """Each trajectory's pose `[4, 4]` at a time, or at the nearest that it covers, as `near` gives them one by one."""
+    spans = [t.span_us() for t in trajectories]
+    return _together(trajectories, [min(max(int(time_us), first), last) for first, last in spans])
+
+
+def _together(trajectories: Sequence[Trajectory], times_us: Sequence[int]) -> list[torch.Tensor]:
     poses = [t.world_from_body[0] for t in trajectories]
     moving = [i for i, t in enumerate(trajectories) if len(t) > 1]
     if moving:
-        before, after, share = zip(*(trajectories[i]._around(int(time_us)) for i in moving), strict=True)
+        before, after, share = zip(*(trajectories[i]._around(times_us[i]) for i in moving), strict=True)
         for i, pose in zip(
             moving, interpolate(torch.stack(before), torch.stack(after), torch.tensor(share, dtype=torch.float64)), strict=True
         ):

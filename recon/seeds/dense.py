@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from recon.project import project
 from recon.seeds.measured import PICTURES, Measured, by_pictures
 from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.stereo import Plate, plate_of, swept
+from recon.side_by_side import side_by_side
 from recon.view import View
 from render.progress import Progress
 from scenes.camera import Camera
@@ -145,8 +147,7 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
         points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
         chosen = _chosen(plates, points)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
-            for i in chosen:
-                depth = _depth_of(i, plates, points[i], ground)
+            for i, depth in zip(chosen, side_by_side(partial(_depth_of, plates=plates, points=points, ground=ground), chosen), strict=True):
                 found += [Depths(views[i], cameras[i], plates[i], depth)] if depth is not None else []
                 steps.step()
     return found
@@ -172,18 +173,19 @@ def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
     return z[z > 0]
 
 
-def _depth_of(i: int, plates: list[Plate], points: np.ndarray, ground: Ground) -> np.ndarray | None:
-    """Depth z of one of the plates; nothing where it shows no points or resembles no other."""
-    z = _before(plates[i], points)
+def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Ground) -> np.ndarray | None:
+    """Depth z of one of the plates; nothing where it shows none of its points or resembles no other."""
+    shown = points[i]
+    z = _before(plates[i], shown)
     others = companions(i, plates, float(np.median(z))) if len(z) else []
     if not others:
         return None
     deepest = ground_depth(plates[i], ground)
-    if (points[:, 2] < ground.height(torch.from_numpy(points[:, :2])).numpy() - DUG).mean() > BURIED:
+    if (shown[:, 2] < ground.height(torch.from_numpy(shown[:, :2])).numpy() - DUG).mean() > BURIED:
         deepest = np.full_like(deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
     nearest = min(near, max(near / 3, 0.95 * float(deepest.min())))
-    return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, points, deepest), FARTHEST)
+    return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, shown, deepest), FARTHEST)
 
 
 def companions(i: int, plates: list[Plate], typical: float) -> list[int]:

@@ -127,11 +127,13 @@ def test_trained_weights_are_trained_further_with_their_autoencoder(pairs, tmp_p
 @ON_A_GPU
 @pytest.mark.parametrize(("first", "second"), [("cpu", "cuda"), ("cuda", "cpu")])
 def test_a_training_goes_on_on_another_device(pairs, tmp_path, first, second):
-    train(pairs, tmp_path, steps=10, config=QUICK, net=SMALL, device=first)
-    weights = train(pairs, tmp_path, steps=20, config=QUICK, net=SMALL, device=second, resume=True)
-    stayed = train(pairs, tmp_path / "stayed", steps=20, config=QUICK, net=SMALL)
-    net, about = load_net(weights)
-    assert about["steps"] == load_net(stayed)[1]["steps"] and all(value.isfinite().all() for value in net.state_dict().values())
+    def trained(name: str, devices: tuple[str, str]) -> Path:
+        train(pairs, tmp_path / name, steps=10, config=QUICK, net=SMALL, device=devices[0])
+        return train(pairs, tmp_path / name, steps=20, config=QUICK, net=SMALL, device=devices[1], resume=True)
+
+    net, about = load_net(trained("moved", (first, second)))
+    assert about["steps"] == load_net(trained("stayed", ("cpu", "cpu")))[1]["steps"]
+    assert all(value.isfinite().all() for value in net.state_dict().values())
 
 
 @ON_A_GPU

@@ -13,7 +13,7 @@ import scenes
 from scenes import Actor, Asset, Camera, Gaussians, Ground, Pinhole, Placed, RigCamera, Sky, SplatModel
 from scenes.poses import pose_from, translation
 from scenes.sky import linear_from_srgb, srgb_from_linear
-from scenes.trajectory import Trajectory, all_at
+from scenes.trajectory import Trajectory, all_at, all_near
 
 EYE = torch.eye(4, dtype=torch.float64)
 LENS = Pinhole(500.0, 510.0, 320.5, 200.25)
@@ -201,6 +201,9 @@ def test_poses_of_many_trajectories_are_those_of_each():
         for mine, alone in zip(all_at(paths, time), [p.at(time) for p in paths], strict=True):
             torch.testing.assert_close(mine, alone, atol=1e-12, rtol=0)
     assert all_at([], 0) == []
+    for time in (-(10**9), 2345, 10**9):
+        for mine, alone in zip(all_near(paths, time), [p.near(time) for p in paths], strict=True):
+            torch.testing.assert_close(mine, alone, atol=1e-9, rtol=1e-9)
 
 
 def test_a_trajectory_at_many_times_is_the_trajectory_at_each():
