@@ -3,7 +3,7 @@
 A cluster is a run of splats that lie side by side in memory; its bound is a sphere around their means and their ellipsoids. Bounds are
 made once for a set of splats and kept beside it, so that the cameras of a rig and the frames of a clip share them. What remains is
 projected in the same order: the picture is the same bits. Splats in no spatial order have clusters as large as the scene, of which none is
-left out; then this costs the test of a few spheres.
+left out; then this costs the test of a few spheres. A GPU, which waits for the host, has projected `FEW` splats sooner than that.
 
 Only for what is not differentiated: a splat that is not drawn would still need its gradient of zeros.
 """
