@@ -162,6 +162,12 @@ def stage(device: torch.device):
             _stages.open -= 1
 
 
+def stream_of(device: torch.device) -> int:
+    """Which of a GPU's streams this thread's work goes to now; 0 on the CPU. What was made on one is there for it alone, until it is asked
+    whether it is done: of what is kept, each has its own."""
+    return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+
+
 class _Cores(threading.local):
     """What a thread has of the cores, and whether it had a stage before."""
 

@@ -10,6 +10,7 @@ import torch
 
 from render.frame_types import RenderConfig
 from render.kernels.types import TILE, Wanted
+from render.launch import stream_of
 from render.room import Room
 from scenes.gaussians import SplatModel
 from scenes.lenses import Lens, Orthographic, Pinhole
@@ -70,7 +71,7 @@ class Settings:
     def drawn_tiles(self, device: torch.device) -> torch.Tensor:
         """int32 `[rows, columns]` of all the image's tiles: 0 for those without a pixel of the mask."""
         if self.mask is None:
-            return _all_tiles(-(-self.height // TILE), -(-self.width // TILE), device)
+            return _all_tiles(-(-self.height // TILE), -(-self.width // TILE), device, stream_of(device))
         pixels = self.mask[None, None].to(device, torch.float32)
         return torch.nn.functional.max_pool2d(pixels, TILE, ceil_mode=True)[0, 0].to(torch.int32)
 
@@ -109,6 +110,6 @@ class Settings:
 
 
 @lru_cache(maxsize=16)
-def _all_tiles(rows: int, columns: int, device: torch.device) -> torch.Tensor:
+def _all_tiles(rows: int, columns: int, device: torch.device, _stream: int) -> torch.Tensor:
     """Kept: nobody writes to it."""
     return torch.ones(rows, columns, dtype=torch.int32, device=device)

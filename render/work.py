@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from render.kernels.types import FIRST, ITEM
-from render.launch import upload
+from render.launch import stream_of, upload
 
 SMALL = 8192
 """Splats below which an instance is put together with others: its copy then costs less than a launch."""
@@ -50,7 +50,7 @@ def work(instances: Sequence[Fields], seen: Sequence[np.ndarray | None] | None =
     sizes, device = tuple(len(fields[0]) for fields in instances), instances[0][0].device
     together = tuple(tuple(members) for members in _together(instances))
     if seen is None or all(s is None or s.all() for s in seen):
-        items, per_instance, records = _all_items(sizes, together, copies, device)
+        items, per_instance, records = _all_items(sizes, together, copies, device, stream_of(device))
     else:
         items, per_instance, records = _items(sizes, together, copies, device, seen)
     groups = []
@@ -68,7 +68,7 @@ Items = tuple[list[list[torch.Tensor]], list[int], int]
 
 
 @lru_cache(maxsize=16)
-def _all_items(sizes: tuple[int, ...], together: tuple[tuple[int, ...], ...], copies: int, device: torch.device) -> Items:
+def _all_items(sizes: tuple[int, ...], together: tuple[tuple[int, ...], ...], copies: int, device: torch.device, _stream: int) -> Items:
     """Kept: nobody writes to them."""
     return _items(sizes, together, copies, device, None)
 

@@ -214,7 +214,7 @@ def pretend() -> None:
     torch.cuda.is_available = lambda: True
     torch.cuda.is_bf16_supported = lambda *_: True
     torch.cuda.get_device_name = lambda *_: "a GPU that is not there"
-    torch.cuda.current_stream = lambda *_: SimpleNamespace()
+    torch.cuda.current_stream = lambda *_: SimpleNamespace(cuda_stream=0)
     torch.cuda.synchronize = lambda *_: None
     torch.cuda.Event = _Event
     torch.Generator = _Generator
