@@ -246,9 +246,8 @@ def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
     given = [camera.world_from_cam, camera.world_from_cam_end]
     for p in placed:
         given += [p.world_from_local, p.world_from_local_end]
-    stacked = (
-        torch.stack([pose for pose in given if pose is not None]).detach().cpu().numpy()
-    )  # numpy's small sums take a third of torch's time
+    # numpy's small sums take a third of torch's time
+    stacked = torch.stack([pose for pose in given if pose is not None]).detach().cpu().numpy()
     with np.errstate(invalid="ignore"):
         turn = stacked[:, :3, :3]
         off = np.abs(turn @ turn.transpose(0, 2, 1) - _UNIT).sum((1, 2))

@@ -10,7 +10,8 @@ if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
     # before anything loads torch: where each has a thread for every core, they wait for one another, and tests take 1.6 times as long
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // int(workers))))
 
-import render  # noqa: E402, F401 - says how OpenMP's workers wait, before anything loads torch
+import render  # noqa: E402, F401, I001 - says how OpenMP's workers wait, before anything loads torch
+import torch  # noqa: E402
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a script's background jobs do; some tests send it, and it is to be heard
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -20,6 +21,14 @@ REPOSITORY = Path(__file__).parents[1]
 
 def shared_root() -> Path:
     return Path(os.environ.get("SIDESTEP_SHARED") or REPOSITORY.parent / "shared")
+
+
+@pytest.fixture
+def torch_threads():
+    """Sets how many threads torch has, for one test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -2,32 +2,19 @@
 
 import warp as wp
 
+from render.kernels.equirect import corners
 from render.kernels.types import OPTIONS
 
 wp.set_module_options(OPTIONS)
 
-PI = wp.constant(3.14159265358979)
-
 
 @wp.func
 def looked_up(sky: wp.array2d[wp.vec3], d: wp.vec3):
-    """Bilinear; columns wrap around, rows end at the poles."""
-    height = sky.shape[0]
-    width = sky.shape[1]
-    column = (0.5 - wp.atan2(d[1], d[0]) / (2.0 * PI)) * float(width) - 0.5
-    row = (0.5 - wp.atan2(d[2], wp.sqrt(d[0] * d[0] + d[1] * d[1])) / PI) * float(height) - 0.5
-    row = wp.clamp(row, 0.0, float(height - 1))
-    left = wp.floor(column)
-    top = wp.min(wp.floor(row), float(wp.max(height - 2, 0)))
-    fc = column - left
-    fr = row - top
-    c0 = (int(left) + width) % width
-    c1 = (c0 + 1) % width
-    r0 = int(top)
-    r1 = wp.min(r0 + 1, height - 1)
-    upper = sky[r0, c0] * (1.0 - fc) + sky[r0, c1] * fc
-    lower = sky[r1, c0] * (1.0 - fc) + sky[r1, c1] * fc
-    return upper * (1.0 - fr) + lower * fr
+    """Bilinear."""
+    k, f = corners(d, sky.shape[0], sky.shape[1])
+    upper = sky[k[0], k[2]] * (1.0 - f[0]) + sky[k[0], k[3]] * f[0]
+    lower = sky[k[1], k[2]] * (1.0 - f[0]) + sky[k[1], k[3]] * f[0]
+    return upper * (1.0 - f[1]) + lower * f[1]
 
 
 @wp.kernel

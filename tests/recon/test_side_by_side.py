@@ -8,15 +8,8 @@ import torch
 from recon.side_by_side import side_by_side
 
 
-@pytest.fixture
-def two_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
-
-
-def test_results_come_in_the_order_of_the_jobs_and_all_work_at_once(two_threads):
+def test_results_come_in_the_order_of_the_jobs_and_all_work_at_once(torch_threads):
+    torch_threads(2)
     both = threading.Barrier(2, timeout=30)
 
     def work(job: int) -> tuple[int, int]:
@@ -27,7 +20,9 @@ def test_results_come_in_the_order_of_the_jobs_and_all_work_at_once(two_threads)
     assert torch.get_num_threads() == 2
 
 
-def test_what_fails_is_told_and_leaves_the_threads_as_they_were(two_threads):
+def test_what_fails_is_told_and_leaves_the_threads_as_they_were(torch_threads):
+    torch_threads(2)
+
     def work(job: int) -> int:
         if job == 1:
             raise ValueError("not this one")

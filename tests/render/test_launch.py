@@ -53,11 +53,8 @@ def in_stage() -> tuple[int, int]:
 
 
 @pytest.fixture
-def three_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
+def three_threads(torch_threads):
+    torch_threads(3)
 
 
 def test_a_thread_that_begins_during_anothers_stage_has_all_threads(three_threads):
