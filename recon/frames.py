@@ -13,7 +13,7 @@ import torch
 from recon.egomask import at_size, ego_mask
 from recon.exposed import balanced, exposed
 from recon.log import Log, LogCamera
-from recon.skies import fine_sky
+from recon.skies import WIRE, fine_sky, like_sky
 from recon.sky_told import coarse_sky, under_their_sky
 from recon.view import View
 from scenes.camera import Camera, followed
@@ -56,6 +56,12 @@ class Frames:
     def sky_of(self, view: View) -> np.ndarray:
         """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
         found = fine_sky(view.image.numpy(), view.sky.numpy())
+        return found if view.ego is None else found & ~view.ego.numpy()
+
+    def sky_with_rim(self, view: View) -> np.ndarray:
+        """The same, and what looks like it as near by as the gaps between wires are: bool `[H, W]`."""
+        image = view.image.numpy()
+        found = like_sky(image, self.sky_of(view), max(1, image.shape[1] // WIRE))
         return found if view.ego is None else found & ~view.ego.numpy()
 
     def followed(self, time_us: int) -> torch.Tensor | None:

@@ -34,6 +34,9 @@ WIRE = 80
 RATHER, SPREAD, NEAR = 8.0, 2.5, 4.0
 """Levels by which a pixel may differ from the sky about it, and how many times what that varies there; and the cells about it."""
 
+BELOW = 4 * round(NEAR) + 1
+"""Cells from a sky downwards about which it says anything."""
+
 
 def sky_mask(image: np.ndarray) -> np.ndarray:
     """Pixels `[H, W]` of a uint8 image that are sky whatever else is known: smooth, bright enough, bluish, and joined to the image's top
@@ -65,8 +68,15 @@ def closed(mask: np.ndarray) -> np.ndarray:
 def fine_sky(image: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     """Pixels `[H, W]` of a uint8 image that are surely sky where a coarse mask `[h, w]` says so: they look like what of it is about them,
     and do not change as at an edge where the mask ends."""
+    found = np.zeros(image.shape[:2], bool)
     rows, columns = (np.arange(n) * of // n for n, of in zip(image.shape[:2], coarse.shape, strict=True))
     step = image.shape[1] // coarse.shape[1]
+    # all of it is at the top, where a picture is looked at no farther down than has a say
+    end = int(np.flatnonzero(coarse.any(1)).max(initial=-BELOW)) + BELOW
+    rows, coarse = rows[rows < end], coarse[:end]
+    image = image[: len(rows)]
+    if not len(rows):
+        return found
     rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
     small = rgb[step // 2 :: step, step // 2 :: step][: coarse.shape[0], : coarse.shape[1]]
     weight = ndimage.gaussian_filter(coarse.astype(np.float32), NEAR) + 1e-6
@@ -81,7 +91,8 @@ def fine_sky(image: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
     alike = (np.abs(rgb - over(mean)) < over(RATHER + SPREAD * varies)).all(-1) & (dips < over(RATHER + varies.mean(-1)))
     alike &= over(ndimage.binary_dilation(coarse, iterations=2))
-    return alike & (even(grey) | over(ndimage.binary_erosion(coarse, border_value=1)))
+    found[: len(rows)] = alike & (even(grey) | over(ndimage.binary_erosion(coarse, border_value=1)))
+    return found
 
 
 def like_sky(image: np.ndarray, sky: np.ndarray, reach: int = 40) -> np.ndarray:
@@ -89,9 +100,12 @@ def like_sky(image: np.ndarray, sky: np.ndarray, reach: int = 40) -> np.ndarray:
     would float."""
     if not sky.any():
         return sky
-    rgb = ndimage.uniform_filter(image.astype(np.float32), (3, 3, 1))
-    away, nearest = ndimage.distance_transform_edt(~sky, return_indices=True)
-    return sky | ((np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 14) & (away < reach))
+    end = int(np.flatnonzero(sky.any(1)).max()) + reach + 1  # no row below has any
+    rgb = ndimage.uniform_filter(image[:end].astype(np.float32), (3, 3, 1))
+    away, nearest = ndimage.distance_transform_edt(~sky[:end], return_indices=True)
+    found = sky.copy()
+    found[:end] |= (np.abs(rgb - rgb[tuple(nearest)]).max(-1) < 14) & (away < reach)
+    return found
 
 
 class SkyPicture:

@@ -26,7 +26,7 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at, scale_of
 from recon.fit.turns import Turns
-from recon.fit.unseen import LOW, as_neighbours, curtains, off_ground, shown_parts
+from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pennants
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
@@ -260,25 +260,23 @@ class Fit:
     def _guess(self) -> None:
         """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray is gone."""
         self._renew(*kept(self.splats, self.descent.tensors(), ~(self.swept.holds(self.splats) | self.clear.holds(self.splats))))
-        part, inside = self._shown()
-        stays = ~curtains(self.splats, inside, self.descent.coloured(), self.ground)
-        self._renew(*kept(self.splats, self.descent.tensors(), stays))
-        part = self._completed(part[stays])
+        shown = self._shown()
+        hang = curtains(self.splats, shown.inside, self.descent.coloured(), self.ground) | pennants(self.splats, shown, self.ground)
+        self._renew(*kept(self.splats, self.descent.tensors(), ~hang))
+        part = self._completed(shown.part[~hang])
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
         self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
         self.descent.still_colours(self.guessed)
 
-    def _shown(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the picture shows that shows most of each splat `[N]`, and whether any has its middle in it, by `shown_parts`."""
-        part, inside = torch.zeros_like(self.splats.reach), torch.zeros_like(self.splats.reach, dtype=torch.bool)
+    def _shown(self) -> Shown:
+        """What the pictures, a quarter as large, show of each splat."""
+        shown = Shown.none(len(self.splats), self.device)
         for view in self.training:
             shot = self.motion.shot(view, self.targets.size(view, 4)).at_once()
             which = self._in_sight(shot)
-            placed = self._placed(self.splats.select(which, 1), shot)
-            shown, within = shown_parts(placed, shot.camera, scale_of(view, shot.camera))
-            part[which] = torch.maximum(part[which], shown)
-            inside[which] |= within
-        return part, inside
+            placed, camera = self._placed(self.splats.select(which, 1), shot), shot.camera
+            shown.add(which, placed, camera, self.openings.beside_sky(view, camera), scale_of(view, camera))
+        return shown
 
     def _completed(self, part: torch.Tensor) -> torch.Tensor:
         """Give vehicles the halves that no picture shows. part: what pictures show of each splat `[N]`; returned of all there are then."""
@@ -288,7 +286,7 @@ class Fit:
         splats, carried = joined(self.splats, self.descent.tensors() | {"part": part, "old": torch.ones_like(part)}, more, reach)
         part, old = carried.pop("part"), carried.pop("old") > 0
         self._renew(splats, carried)
-        stays = ~outdone(self.splats, part, old, self._shown()[0], self.config.budget)
+        stays = ~outdone(self.splats, part, old, self._shown().part, self.config.budget)
         self._renew(*kept(self.splats, self.descent.tensors(), stays))
         return part[stays]
 

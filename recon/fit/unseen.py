@@ -8,7 +8,7 @@ and is seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
@@ -24,6 +24,9 @@ from scenes.poses import inverse, matrix_from_quat
 SEEN = 0.05
 """Part of a splat that the picture showing most of it must show for its colour to be known."""
 
+HARDLY, AT_EDGE = 0.1, 0.15
+"""Part of a splat up to which pictures may show it, and part of that which is beside the sky at least, for it to be dropped."""
+
 LOW = 0.2
 """Metres above the ground up to which a splat is part of the street."""
 
@@ -35,18 +38,40 @@ CELL, CELLS = 0.5, 32
 what is hidden of it. The nearest splats are many small ones of a rim, or of a parked car's sill: black, pale, or as blue as that."""
 
 
-def shown_parts(placed: Sequence[Placed], camera: Camera, scale: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of all groups' splats `[N]`, the part of its weight that a picture shows, what stands before it taken off, and whether its middle is
-    in the picture, without which that part is 0. More than 1 where a splat is narrower than a pixel, or at the border of a wide picture
-    (`footprint`). scale: as of `draw`."""
-    groups = [p.gaussians.detach() for p in placed]
-    blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
-    drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
-    with torch.enable_grad():
-        (rgb,) = draw(drawn, camera, "rgb", scale=scale)
-        weights = torch.autograd.grad(rgb[..., 0].sum() / C0, blank)
-    whole = torch.cat([footprint(p, camera) for p in placed])
-    return torch.where(whole > 0, torch.cat(weights)[:, 0, 0] / whole, 0.0), whole > 0
+@dataclass
+class Shown:
+    """What pictures show of splats `[N]`.
+
+    part: of each one's weight, what stands before it taken off, in the picture that shows most of it: more than 1 where it is narrower than
+    a pixel, or at the border of a wide picture (`footprint`), and 0 where its middle is in none. inside: whether that is in any. weight:
+    its weight in all pictures, and beside_sky: what of that is in pixels that are, or touch, sky.
+    """
+
+    part: torch.Tensor
+    inside: torch.Tensor
+    weight: torch.Tensor
+    beside_sky: torch.Tensor
+
+    @staticmethod
+    def none(count: int, device: torch.device | str = "cpu") -> Shown:
+        part, weight, beside_sky = torch.zeros(3, count, device=device)
+        return Shown(part, torch.zeros(count, dtype=torch.bool, device=device), weight, beside_sky)
+
+    def add(self, which: torch.Tensor, placed: Sequence[Placed], camera: Camera, beside_sky: torch.Tensor, scale: float = 1.0) -> None:
+        """Another picture: of splats `which` `[M]`, `placed` as it sees them, with pixels `[H, W]` that are 1 `beside_sky`. scale: as of
+        `draw`."""
+        groups = [p.gaussians.detach() for p in placed]
+        blank = [torch.zeros(len(g), 1, 3, device=g.means.device, requires_grad=True) for g in groups]
+        drawn = [replace(p, gaussians=replace(g, sh=sh)) for p, g, sh in zip(placed, groups, blank, strict=True)]
+        with torch.enable_grad():
+            (rgb,) = draw(drawn, camera, "rgb", scale=scale)
+            weights = torch.autograd.grad((rgb[..., 0].sum() + (rgb[..., 1] * beside_sky).sum()) / C0, blank)
+        weight, beside = torch.cat(weights)[:, 0, :2].unbind(1)
+        whole = torch.cat([footprint(p, camera) for p in placed])
+        self.part[which] = torch.maximum(self.part[which], torch.where(whole > 0, weight / whole, 0.0))
+        self.inside[which] |= whole > 0
+        self.weight[which] += weight
+        self.beside_sky[which] += beside
 
 
 def footprint(placed: Placed, camera: Camera) -> torch.Tensor:
@@ -81,6 +106,16 @@ def curtains(splats: Splats, inside: torch.Tensor, pulled: torch.Tensor, ground:
     curtain. What lies on the ground stays: it is the street beyond the border.
     """
     return pulled & ~inside & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
+
+
+def pennants(splats: Splats, shown: Shown, ground: Ground) -> torch.Tensor:
+    """Which splats of the background, bool `[N]`, pictures hardly show, and that beside the sky: over a roof, or between wires.
+
+    They begin where a picture had no depth, or grow there, as what stands behind that edge. What little shows of them may be of any colour
+    and place, and from aside they hang before the sky.
+    """
+    at_edge = shown.beside_sky > AT_EDGE * shown.weight
+    return (shown.part < HARDLY) & at_edge & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
 
 
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:

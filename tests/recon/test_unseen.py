@@ -10,7 +10,7 @@ from recon import open_log
 from recon.build import begin, choose
 from recon.fit.fit import GUESSED_FROM
 from recon.fit.model import Splats
-from recon.fit.unseen import NEIGHBOURS, SEEN, as_neighbours, curtains, footprint, shown_parts
+from recon.fit.unseen import HARDLY, NEIGHBOURS, SEEN, Shown, as_neighbours, curtains, footprint, pennants
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
@@ -32,13 +32,53 @@ def balls(places: list[tuple[float, float, float]], metres: list[float], opacity
     return Gaussians(torch.tensor(places), quats, scales, torch.logit(torch.tensor(opacity)), torch.zeros(len(places), 1, 3))
 
 
+def shown_ahead(splats: Gaussians, sky: torch.Tensor | None = None) -> Shown:
+    """What one picture shows of splats; sky: its pixels beside the sky, none where None."""
+    shown = Shown.none(len(splats))
+    beside = torch.zeros(AHEAD.height, AHEAD.width) if sky is None else sky
+    shown.add(torch.arange(len(splats)), [Placed(splats, torch.eye(4, dtype=torch.float64))], AHEAD, beside)
+    return shown
+
+
 def test_what_stands_before_a_splat_is_taken_off():
     splats = balls([(0.0, 0, 10), (0.0, 0, 4), (2.0, 2, 8), (60.0, 0, 8)], [0.5, 0.4, 0.4, 0.4], [0.9, 0.95, 0.7, 0.9])
-    behind, before, free, outside = shown_parts([Placed(splats, torch.eye(4, dtype=torch.float64))], AHEAD)[0].tolist()
+    behind, before, free, outside = shown_ahead(splats).part.tolist()
     assert before == pytest.approx(1, abs=0.05) and free == pytest.approx(1.2, abs=0.1) and outside == 0
     assert behind == pytest.approx(1 - 0.95 * 0.8, abs=0.02), "two Gaussians, one twice as wide"
-    alone = shown_parts([Placed(splats.select(torch.tensor([0])), torch.eye(4, dtype=torch.float64))], AHEAD)[0]
-    assert float(alone) == pytest.approx(1, abs=0.05)
+    assert float(shown_ahead(splats.select(torch.tensor([0]))).part) == pytest.approx(1, abs=0.05)
+
+
+def test_of_several_pictures_the_one_that_shows_most_counts_and_weights_add_up():
+    splats = balls([(0.0, 0, 10), (60.0, 0, 8)], [0.5, 0.4], [0.9, 0.9])
+    once, both = shown_ahead(splats), shown_ahead(splats)
+    hidden = balls([(0.0, 0, 10), (0.0, 0, 2)], [0.5, 1.0], [0.9, 0.999])
+    both.add(torch.tensor([0, 1]), [Placed(hidden, torch.eye(4, dtype=torch.float64))], AHEAD, torch.ones(AHEAD.height, AHEAD.width))
+    assert float(both.part[0]) == pytest.approx(float(once.part[0])) and both.inside.tolist() == [True, True]
+    assert 0 < float(both.weight[0] - once.weight[0]) < 0.05 * float(once.weight[0])
+    torch.testing.assert_close(both.beside_sky, both.weight - once.weight)
+
+
+def test_what_peeps_over_a_roof_before_the_sky_hangs_there_from_aside():
+    """A wall below the sky, and behind its edge what shows a little over it; the same behind the wall's middle; what stands free beside the
+    sky; and an actor's."""
+    edge = torch.zeros(AHEAD.height, AHEAD.width)
+    edge[:132] = 1
+    places = [(x, 1.3 + 0.1 * y, 6.0) for x in torch.linspace(-3, 3, 60).tolist() for y in range(30)]
+    behind = [(0.0, 3.1, 12.0), (0.0, 5.5, 12.0), (4.0, -3.0, 12.0)]
+    splats = balls([*places, *behind], [0.1] * len(places) + [0.3] * 3, [0.95] * (len(places) + 3))
+    shown = shown_ahead(splats, edge)
+    peeps, hidden, free = shown.part[-3:].tolist()
+    assert 0.001 < peeps < HARDLY and hidden < 0.001 and free > 0.9
+    high = Ground(torch.full((9, 9), -50.0), (-4.0, -4.0), 1.0)
+    found = pennants(Splats.of([splats], [torch.ones(len(splats))]), shown, high)
+    assert found[-3:].tolist() == [True, False, False] and not found[:-3].any()
+    some = Splats.of(
+        [splats.select(torch.arange(len(places))), splats.select(torch.arange(3) + len(places))], [torch.ones(len(places)), torch.ones(3)]
+    )
+    assert not pennants(some, shown, high).any(), "an actor is whole"
+    assert not pennants(Splats.of([splats], [torch.ones(len(splats))]), shown, Ground(torch.full((9, 9), 12.0), (-4.0, -4.0), 1.0))[
+        -3:
+    ].any()
 
 
 def test_a_splats_whole_weight_is_that_of_its_ellipse():
