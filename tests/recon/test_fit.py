@@ -431,6 +431,23 @@ def test_from_aside_nothing_may_be_open_where_the_sky_is_never_seen(drive):
     assert float(fit.openings.gaps(1 - nothing, camera)) == 0
 
 
+def test_of_opaque_splats_before_the_sky_each_is_asked_to_go(drive):
+    """The one behind another, too, without which the picture would not be one bit clearer."""
+    log = open_log(drive)
+    names, span = choose(log)
+    _, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    view = fit.training[0]
+    camera = fit.motion.camera(view)
+    assert 0.05 < float(fit.openings.sky[view.camera, view.index].float().mean()) < 0.9
+    pulls = []
+    for other in (0.0, 0.9):
+        opacity = torch.tensor(0.9, requires_grad=True)
+        alpha = (1 - (1 - opacity) * (1 - other)).expand(camera.height, camera.width)
+        fit.openings.haze(alpha, view, camera).backward()
+        pulls.append(float(opacity.grad))
+    assert pulls[1] > pulls[0] / 3 > 0, "alpha itself would pull a tenth as much"
+
+
 def test_behind_what_always_hides_the_sky_is_no_light_to_rely_on(drive):
     log = open_log(drive)
     names, span = choose(log)

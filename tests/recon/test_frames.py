@@ -10,9 +10,11 @@ from PIL import Image
 
 from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
-from recon.frames import load_frames, size_like
+from recon.frames import Frames, load_frames, size_like
 from recon.log import LidarPoints, Log, LogCamera, Packed, SparsePoints, Sweep
+from recon.skies import fine_sky, like_sky
 from recon.sky_told import under_their_sky
+from recon.view import View
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse
 from scenes.trajectory import Trajectory
@@ -48,6 +50,35 @@ def _log(
 def _skies(log: Log) -> tuple[np.ndarray, np.ndarray]:
     frames = load_frames(log, ["front"], ALL, SIZE, 0)
     return frames.views[0].sky.numpy(), frames.sky_of(frames.views[0])
+
+
+def test_beyond_a_wire_what_looks_like_the_sky_is_sky_and_a_window_that_mirrors_it_is_none():
+    image = np.full((240, 480, 3), 60, np.uint8)
+    image[:84] = image[160:200, 100:140] = (150, 180, 225)
+    image[80] = 40  # a wire, and under it a strip that the coarse mask is not sure of
+    coarse = np.zeros((120, 240), bool)
+    coarse[:39] = True
+    view = View(0, 0, 0, torch.from_numpy(image), False, torch.from_numpy(coarse))
+    frames = Frames(["front"], [(480, 240)], [view])
+    sure, rim = frames.sky_of(view), frames.sky_with_rim(view)
+    assert sure[:78].all() and not sure[80:].any()
+    assert (rim | ~sure).all() and rim[82].all() and not rim[80].any() and not rim[85:].any()
+    bonnet = torch.zeros(240, 480, dtype=torch.bool)
+    bonnet[82:, :99] = True
+    assert not frames.sky_with_rim(replace(view, ego=bonnet))[82, :99].any()
+
+
+def test_a_sky_is_looked_for_where_it_may_be_and_no_farther_down():
+    """The same pixels as of a picture that goes on below."""
+    image = np.random.default_rng(1).integers(0, 40, (90, 160, 3)).astype(np.uint8)
+    image[:20] += 150
+    coarse = np.zeros((45, 80), bool)
+    coarse[:9, 10:70] = True
+    taller = np.concatenate([image, image[40:]])
+    found, more = fine_sky(image, coarse), fine_sky(taller, np.concatenate([coarse, np.zeros((25, 80), bool)]))
+    assert found.any() and (found == more[:90]).all() and not more[90:].any()
+    assert (like_sky(image, found) == like_sky(taller, more)[:90]).all()
+    assert not fine_sky(image, np.zeros_like(coarse)).any()
 
 
 @pytest.mark.parametrize("sky", [(240, 238, 236), (226, 150, 96), (92, 84, 100), (9, 8, 11), (150, 180, 225)])
