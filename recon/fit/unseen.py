@@ -24,8 +24,8 @@ from scenes.poses import inverse, matrix_from_quat
 SEEN = 0.05
 """Part of a splat that the picture showing most of it must show for its colour to be known."""
 
-HARDLY, AT_EDGE = 0.1, 0.15
-"""Part of a splat up to which pictures may show it, and part of that which is beside the sky at least, for it to be dropped."""
+AT_EDGE = 0.15
+"""Part of what pictures show of a splat that is beside the sky, from which on it may be that it stands before the sky."""
 
 LOW = 0.2
 """Metres above the ground up to which a splat is part of the street."""
@@ -115,7 +115,7 @@ def pennants(splats: Splats, shown: Shown, ground: Ground) -> torch.Tensor:
     and place, and from aside they hang before the sky.
     """
     at_edge = shown.beside_sky > AT_EDGE * shown.weight
-    return (shown.part < HARDLY) & at_edge & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
+    return (shown.part < SEEN) & at_edge & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
 
 
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:
