@@ -22,6 +22,7 @@ from recon.fit.fit import Fit
 from recon.fit.limbs import Limbs
 from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
+from recon.fit.population import Population
 from recon.fit.run import run
 from recon.fit.strides import stride_of
 from recon.frames import Frames, check_size, load_frames
@@ -329,8 +330,8 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
-    splats = start.splats.to(device)
-    return Fit(frames, motion, splats, start.sky, start.exposures, limbs, config, start.measured, start.ground, start.swept, clear)
+    population = Population(start.splats.to(device), motion, config, start.ground, start.swept, clear)
+    return Fit(frames, motion, population, start.sky, start.exposures, limbs, config, start.measured)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

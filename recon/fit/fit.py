@@ -8,36 +8,30 @@ from functools import partial
 
 import torch
 
-from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, grow, hold_shade, joined, kept, shade_of
-from recon.fit.descent import Descent, rates_at
+from recon.fit.densify import hold_shade, shade_of
+from recon.fit.descent import rates_at
 from recon.fit.develop import developed
-from recon.fit.flat import FlatGround
-from recon.fit.halves import ROOM, halves, outdone
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
 from recon.fit.motion import Motion, Shot
 from recon.fit.openings import Openings
-from recon.fit.reach import reach_of
+from recon.fit.population import Population
 from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
-from recon.fit.swept import Swept
 from recon.fit.targets import Targets, ego_at, scale_of
 from recon.fit.turns import Turns
-from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pennants
+from recon.fit.unseen import Shown
 from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
-from recon.seeds.points import fewer
 from recon.view import View
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
-from scenes.ground import Ground
 from scenes.sky import sample_equirect
 
 SKY_PRIOR = 3e-6
@@ -77,34 +71,27 @@ class Fit:
         self,
         frames: Frames,
         motion: Motion,
-        splats: Splats,
+        population: Population,
         sky: torch.Tensor,
         exposures: torch.Tensor,
         limbs: Limbs,
         config: FitConfig,
         measured: Sequence[Measured],
-        ground: Ground,
-        swept: Swept,
-        clear: Clear,
     ):
-        self.device = splats.reach.device
-        self.frames, self.motion, self.limbs, self.config = frames, motion, limbs, config
+        self.device = population.device
+        self.frames, self.motion, self.population, self.limbs, self.config = frames, motion, population, limbs, config
         self.measured = [m.to(self.device) for m in measured]
-        self.splats, self.sky, self.exposures = splats, sky.to(self.device), exposures.to(self.device)
+        self.sky, self.exposures = sky.to(self.device), exposures.to(self.device)
         self.first_sky = self.sky.clone()
         self.step_count = 0
         self.training = [view.to(self.device) for view in frames.training()]
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.recent_loss = 0.0
         self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
         self.openings = Openings(frames, motion, self.device)
-        self.ground, self.swept, self.clear = ground, swept.to(self.device), clear
-        self.flat_ground = FlatGround(ground, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
-        self.guessed: torch.Tensor | None = None
         self._optimise()
 
     def _weights(self) -> torch.Tensor:
@@ -119,6 +106,10 @@ class Fit:
             tensor.requires_grad_(True)
         self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": exposures, "lr": 5e-4}], eps=1e-12)
         self.pose_adam = adam([{"params": poses, "lr": 0.03}], eps=1e-12)
+
+    @property
+    def splats(self) -> Splats:
+        return self.population.splats
 
     @property
     def progress(self) -> float:
@@ -136,6 +127,7 @@ class Fit:
     def step(self) -> float:
         """Draw a view, render it, compare, and follow the gradient. Returns the loss."""
         self._tend()
+        there, descent = self.population, self.population.descent
         view = self.training[self.turns.next()]
         shot = self.motion.shot(view, self.targets.size(view, self.shrink()))
         camera, target = shot.camera, self.targets.picture(view, self.shrink())
@@ -145,8 +137,8 @@ class Fit:
             aside = self.motion.beside(shot, beside)
         rates = self._rates()
         which = self._in_sight(shot) if aside is None else self._in_sight(shot, aside)
-        self.descent.catch_up(self.splats, which, self.sh_count(), rates)
-        shown = self.splats.select(which, self.sh_count())  # copies, to be differentiated
+        descent.catch_up(there.splats, which, self.sh_count(), rates)
+        shown = there.splats.select(which, self.sh_count())  # copies, to be differentiated
         known, shade = self._known(view), shade_of(shown)
         by_lot = self._drawn_by_lot(shown)
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
@@ -162,7 +154,7 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            closing = shown.held(self.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
+            closing = shown.held(there.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
             (solid,) = draw(self._placed(closing, aside), aside.camera, "alpha", scale=scale_of(view, aside.camera))
             haze = haze + self.openings.gaps(solid, aside.camera)
         if known:
@@ -174,14 +166,14 @@ class Fit:
         # beside one another, not added up: the poses' unrest is on the host
         torch.autograd.backward([cost for cost in (whole, self.motion.unrest()) if cost.requires_grad])
         colours = shown.fields["sh"].grad
-        if self.guessed is not None and colours is not None:
-            colours.mul_(~self.guessed[which, None, None])
+        if there.guessed is not None and colours is not None:
+            colours.mul_(~there.guessed[which, None, None])
         hold_shade(shown, shade)
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
-        self.descent.follow(self.splats, which, shown, rates, self.growth)
-        self.flat_ground.press(self.splats, which, self.descent, rates, self._settled(), camera.world_from_cam.detach()[:3, 3])
+        descent.follow(there.splats, which, shown, rates, there.growth)
+        there.flat_ground.press(there.splats, which, descent, rates, self._settled(), camera.world_from_cam.detach()[:3, 3])
         if blank is not None and blank.grad is not None:
-            self.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
+            there.growth.blame(which, blank.grad[:, 0] * self.shrink() ** 2)
         self._follow()
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
@@ -256,40 +248,6 @@ class Fit:
         splats = self.limbs.bent(dimmed_actors(shown, self._followed[shot.view.time_us]), shot.view.time_us)
         return self.motion.as_read(splats, shot).placed(shot.poses())
 
-    @torch.no_grad()
-    def _guess(self) -> None:
-        """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray is gone."""
-        self._renew(*kept(self.splats, self.descent.tensors(), ~(self.swept.holds(self.splats) | self.clear.holds(self.splats))))
-        shown = self._shown()
-        hang = curtains(self.splats, shown.inside, self.descent.coloured(), self.ground) | pennants(self.splats, shown, self.ground)
-        self._renew(*kept(self.splats, self.descent.tensors(), ~hang))
-        part = self._completed(shown.part[~hang])
-        self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
-        self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
-        self.descent.still_colours(self.guessed)
-
-    def _shown(self) -> Shown:
-        """What the pictures, a quarter as large, show of each splat."""
-        shown = Shown.none(len(self.splats), self.device)
-        for view in self.training:
-            shot = self.motion.shot(view, self.targets.size(view, 4)).at_once()
-            which = self._in_sight(shot)
-            placed, camera = self._placed(self.splats.select(which, 1), shot), shot.camera
-            shown.add(which, placed, camera, self.openings.beside_sky(view, camera), scale_of(view, camera))
-        return shown
-
-    def _completed(self, part: torch.Tensor) -> torch.Tensor:
-        """Give vehicles the halves that no picture shows. part: what pictures show of each splat `[N]`; returned of all there are then."""
-        more, reach = halves(self.splats, part, self.motion.tracks)
-        if not any(map(len, more)):
-            return part
-        splats, carried = joined(self.splats, self.descent.tensors() | {"part": part, "old": torch.ones_like(part)}, more, reach)
-        part, old = carried.pop("part"), carried.pop("old") > 0
-        self._renew(splats, carried)
-        stays = ~outdone(self.splats, part, old, self._shown().part, self.config.budget)
-        self._renew(*kept(self.splats, self.descent.tensors(), stays))
-        return part[stays]
-
     def _settled(self) -> float:
         """How long steps still are: towards the end they become ever shorter."""
         return 0.1 ** max(0.0, (self.progress - 0.6) / 0.4)
@@ -313,16 +271,17 @@ class Fit:
             optimiser.zero_grad(set_to_none=True)
         self.limbs.follow(self.progress)
 
-    # ---- growth
+    # ---- which splats there are
 
+    @torch.no_grad()
     def _tend(self) -> None:
         """Add, drop and colour splats where it is time to."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
-            self._grow()
+            self.population.grow(self.progress)
         if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
             self._refill()
-        if self.guessed is None and self.progress >= GUESSED_FROM:
-            self._guess()
+        if self.population.guessed is None and self.progress >= GUESSED_FROM:
+            self.population.guess(self._shown)
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""
@@ -331,43 +290,35 @@ class Fit:
     def _growing(self) -> bool:
         return self.config.grow_span[0] <= self.progress <= self.config.grow_span[1]
 
-    def _grow(self) -> None:
-        """Split where most is wrong and pictures pull, drop what does not show."""
-        left = max(1, int((self.config.grow_span[1] - self.progress) * self.config.steps / self.config.grow_every) + 1)
-        carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
-        budget = round(self.config.budget * (1 - ROOM)) if self.motion.tracks else self.config.budget
-        self._renew(*grow(self.splats, carried, self.growth, budget, left, self.motion.boxes, astray))
-
     @torch.no_grad()
     def _refill(self) -> None:
         """Add splats where the sky stands in for what pictures show, once what stands where lidar looked through is gone."""
-        self._renew(*kept(self.splats, self.descent.tensors(), ~self.clear.holds(self.splats)))
-        path, sh_count = self.motion.path(), self.splats.fields["sh"].shape[1]
+        there = self.population
+        there.drop(there.clear.holds(there.splats))
+        sh_count = there.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
             cameras = [self.motion.camera(v) for v in views]
-            search = Search(views, cameras, gain, self.ground, self.motion.tracks)
+            search = Search(views, cameras, gain, there.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
-                more = fewer(more, max(0, self.config.budget - len(self.splats)))
-                reach = reach_of(more, path, self.motion.rig).to(self.device)
-                self._renew(*joined(self.splats, self.descent.tensors(), [more], [reach]))
+                there.add(more)
 
-    def _renew(self, splats: Splats, carried: dict[str, torch.Tensor]) -> None:
-        """Go on with other splats, and what each carries with it."""
-        self.splats, self.descent = splats, Descent(**carried)
-        self.growth, self.guessed = Growth.none(len(splats), self.device), None
+    @torch.no_grad()
+    def _shown(self) -> Shown:
+        """What the pictures, a quarter as large, show of each splat."""
+        shown = Shown.none(len(self.splats), self.device)
+        for view in self.training:
+            shot = self.motion.shot(view, self.targets.size(view, 4)).at_once()
+            which = self._in_sight(shot)
+            placed, camera = self._placed(self.splats.select(which, 1), shot), shot.camera
+            shown.add(which, placed, camera, self.openings.beside_sky(view, camera), scale_of(view, camera))
+        return shown
 
     # ---- checkpoints
 
     def tensors(self) -> dict:
         """All that changes, as tensors and numbers: what a checkpoint holds."""
-        return {
-            "fields": self.splats.fields,
-            "sizes": self.splats.sizes,
-            "reach": self.splats.reach,
-            "growth": self.growth.tensors(),
-            "descent": self.descent.tensors(),
-            "guessed": self.guessed,
+        return self.population.tensors() | {
             "sky": self.sky.detach(),
             "first_sky": self.first_sky,
             "exposures": self.exposures.detach(),
@@ -382,10 +333,8 @@ class Fit:
 
     def restore(self, state: dict) -> None:
         """Go on from `tensors()` of another run, on whichever device: the same steps follow as would have followed there."""
-        self.splats = Splats(state["fields"], state["sizes"], state["reach"]).to(self.device)
-        self.growth, self.descent = Growth(**self._here(state["growth"])), Descent(**self._here(state["descent"]))
-        self.guessed = None if state["guessed"] is None else state["guessed"].to(self.device)
-        self.sky, self.first_sky, self.exposures = self._here({k: state[k] for k in ("sky", "first_sky", "exposures")}).values()
+        self.population.restore(state)
+        self.sky, self.first_sky, self.exposures = (state[name].to(self.device) for name in ("sky", "first_sky", "exposures"))
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])
         self._optimise()
@@ -394,10 +343,6 @@ class Fit:
         self.turns.due = state["due"]
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
-
-    def _here(self, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Tensors on the fit's device."""
-        return {name: tensor.to(self.device) for name, tensor in tensors.items()}
 
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:

@@ -19,7 +19,6 @@ from recon.build import _span, assemble, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
 from recon.fit.config import FitConfig
-from recon.fit.densify import kept
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
@@ -266,24 +265,25 @@ def test_nothing_is_left_standing_where_something_drove(drive, monkeypatch):
     track = start.tracks[0]
     middle = track.world_from_box[len(track.world_from_box) // 2, :3, 3].float() + torch.tensor([0, 0, 0.6 * float(track.size[2])])
     fit.splats.fields["means"][:20] = middle
-    assert fit.swept.holds(fit.splats)[:20].all()
+    assert fit.population.swept.holds(fit.splats)[:20].all()
     split = split_points(log, log.sweeps_within(span), [t for t in log.tracks if t.moving])
     tracks = [*split.tracks, *(t for t in log.tracks if not t.moving)]
     taken = np.array([s.time_us for s in log.sweeps])[np.searchsorted([s.index for s in log.sweeps], split.static_sweep)]
     assert torch.equal(start.swept.keys, Swept.by(tracks, span, start.ground, split.static, taken).keys)
-    fit._grow()
-    assert not fit.swept.holds(fit.splats).any()
+    fit.population.grow(fit.progress)
+    assert not fit.population.swept.holds(fit.splats).any()
     fit.splats.fields["means"][:20] = middle
-    count, tensors = len(fit.splats), fit.descent.tensors()
+    count, tensors = len(fit.splats), fit.population.descent.tensors()
     squares, last = tensors["moments"][:, 1].uniform_().clone(), tensors["last"].random_(90).clone()
-    stays = ~(fit.swept.holds(fit.splats) | fit.clear.holds(fit.splats))
+    stays = ~(fit.population.swept.holds(fit.splats) | fit.population.clear.holds(fit.splats))
     assert not stays[:20].any() and stays[20:].float().mean() > 0.9
-    monkeypatch.setattr("recon.fit.fit.halves", lambda *told: ([], []))  # which would change the cars
-    fit._guess()
-    tensors = fit.descent.tensors()
+    monkeypatch.setattr("recon.fit.population.halves", lambda *told: ([], []))  # which would change the cars
+    monkeypatch.setattr("recon.fit.population.pennants", lambda splats, *told: torch.zeros(len(splats), dtype=torch.bool))
+    fit.population.guess(fit._shown)
+    tensors = fit.population.descent.tensors()
     assert torch.equal(tensors["moments"][:, 1], squares[stays]) and torch.equal(tensors["last"], last[stays])
-    assert fit.guessed.shape == (int(stays.sum()),) and len(fit.splats) == stays.sum() < count, "nothing is split"
-    assert not fit.swept.holds(fit.splats).any(), "what came later, too"
+    assert fit.population.guessed.shape == (int(stays.sum()),) and len(fit.splats) == stays.sum() < count, "nothing is split"
+    assert not fit.population.swept.holds(fit.splats).any(), "what came later, too"
 
 
 def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, tmp_path):
@@ -317,18 +317,18 @@ def test_what_the_sky_stands_in_for_comes_back(drive):
     view = fit.training[3]
     whole = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
     above = (fit.splats.fields["means"][:, 2] > 1.0) & (fit.splats.group_of() == 0)
-    fit._renew(*kept(fit.splats, fit.descent.tensors(), ~above))
+    fit.population.drop(above)
     count, end = len(fit.splats), fit.splats.sizes[0]
-    rest = {k: t.clone() for k, t in (fit.splats.fields | fit.descent.tensors()).items()}
+    rest = {k: t.clone() for k, t in (fit.splats.fields | fit.population.descent.tensors()).items()}
     torn = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
     lost = (whole > 0.9) & (torn < 0.1)
     assert lost.sum() > 40
     fit._refill()
     new = len(fit.splats) - count
-    assert new > 5 and fit.splats.sizes[0] == end + new and len(fit.growth.errors) == len(fit.splats)
-    after = fit.splats.fields | fit.descent.tensors()
+    assert new > 5 and fit.splats.sizes[0] == end + new and len(fit.population.growth.errors) == len(fit.splats)
+    after = fit.splats.fields | fit.population.descent.tensors()
     assert all(torch.equal(torch.cat([t[:end], t[end + new :]]), rest[k]) for k, t in after.items())
-    assert not fit.descent.moments[end : end + new].any()
+    assert not fit.population.descent.moments[end : end + new].any()
     found = fit._drawn(view, "rgb", "alpha")["alpha"].detach()
     assert (found[lost] > 0.5).float().mean() > 0.6
     fit._refill()
@@ -380,14 +380,14 @@ def test_splats_are_blamed_for_what_is_wrong_in_the_pixels_that_show_them(drive)
     torch.testing.assert_close(drawn["features"][..., 0], alpha)  # a picture's weights of all splats are its alpha
     wrong = (drawn["rgb"] - fit.targets.picture(view, fit.shrink())).abs().mean(-1)
     fit.step()
-    assert abs(float(fit.growth.errors.sum() / (wrong * alpha).sum()) / fit.shrink() ** 2 - 1) < 0.1, (
+    assert abs(float(fit.population.growth.errors.sum() / (wrong * alpha).sum()) / fit.shrink() ** 2 - 1) < 0.1, (
         "but for what the backdrop changes where alpha is low"
     )
-    assert (fit.growth.errors >= 0).all()
-    assert fit.growth.shown.max() == 1
-    before = fit.growth.errors.clone()
+    assert (fit.population.growth.errors >= 0).all()
+    assert fit.population.growth.shown.max() == 1
+    before = fit.population.growth.errors.clone()
     fit.step()
-    assert torch.equal(fit.growth.errors, before), "only now and then"
+    assert torch.equal(fit.population.growth.errors, before), "only now and then"
 
 
 @torch.no_grad()

@@ -189,7 +189,7 @@ def test_a_fit_presses_its_road(drive, monkeypatch):
             fit.step()
         means = fit.splats.fields["means"][: fit.splats.sizes[0]]
         on = (means[:, 2] - start.ground.height(means[:, :2])).abs() < ON
-        on &= fit.descent.coloured()[: len(on)]  # seen by pictures, not from aside alone
+        on &= fit.population.descent.coloured()[: len(on)]  # seen by pictures, not from aside alone
         return covariance(fit.splats)[: len(on)][on][:, 2, 2].sqrt().median()
 
     flat = thickness()

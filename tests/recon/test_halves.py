@@ -100,11 +100,11 @@ def test_a_fit_completes_what_it_knows_one_side_of_and_changes_no_picture(drive,
     for _ in range(30):
         fit.step()
     pictures, given = [fit.picture(v) for v in fit.training], []
-    monkeypatch.setattr("recon.fit.fit.halves", lambda *told: given.append(halves(*told)) or given[-1])
-    fit._guess()
-    part, _ = fit._shown()
+    monkeypatch.setattr("recon.fit.population.halves", lambda *told: given.append(halves(*told)) or given[-1])
+    fit.population.guess(fit._shown)
+    part = fit._shown().part
     after = [fit.picture(v) for v in fit.training]
-    assert len(fit.descent.last) == len(fit.splats) <= CONFIG.budget
+    assert len(fit.population.descent.last) == len(fit.splats) <= CONFIG.budget
     half = given[0][0][car].means
     mine = fit.splats.group_of() == car
     left = (fit.splats.fields["means"][mine][:, None] == half[None]).all(2).any(1)

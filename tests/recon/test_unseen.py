@@ -117,7 +117,7 @@ def test_a_fit_of_one_standing_camera_hangs_no_curtain_beside_its_pictures(stree
     for view in fit.training:
         placed = Placed(background.groups(1)[0].detach(), torch.eye(4, dtype=torch.float64))
         inside |= footprint(placed, fit.motion.camera(view).resized(*SIZE)) > 0
-    left = curtains(background, inside, fit.descent.coloured()[: len(background)], fit.ground)
+    left = curtains(background, inside, fit.population.descent.coloured()[: len(background)], fit.population.ground)
     assert float(left.float().mean()) < 0.0015, "none but what went beyond the border since; 0.0035 where they stay"
 
 
@@ -180,10 +180,10 @@ def test_a_fit_keeps_them_to_its_end(drive):
     log = open_log(drive)
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
-    while fit.guessed is None:
+    while fit.population.guessed is None:
         fit.step()
     assert fit.progress == pytest.approx(GUESSED_FROM, abs=1.5 / CONFIG.steps)
-    some = fit.guessed
+    some = fit.population.guessed
     assert 0 < some.float().mean() < 0.7  # half of so small a scene is street that no picture shows
     before = {name: field.clone() for name, field in fit.splats.fields.items()}
     while fit.step_count < CONFIG.steps:
