@@ -72,7 +72,9 @@ class Openings:
 
     def haze(self, alpha: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
         """What it costs that alpha `[H, W]`, as a view's camera sees it, is above 0 before the sky and below 1 under the horizon."""
-        sky = F.interpolate(self.sky[view.camera, view.index][None, None].float(), alpha.shape, mode="area")[0, 0]
+        sky = self.sky[view.camera, view.index]
+        if sky.shape != alpha.shape:
+            sky = F.interpolate(sky[None, None].float(), alpha.shape, mode="area")[0, 0]
         before = -(sky * torch.log1p(LEFT - alpha)).mean()
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])

@@ -5,8 +5,8 @@
 
 DRIVE's own sky must be blue: what of its pictures surely is, is the truth; 2 pixels at its rim, and holes of wires in it, do not count.
 The other skies stand still in the world, as the real one does, and move through the pictures as the car turns. Precision and recall in
-percent of pixels that count and lie above the horizon, over every eighth picture, of the mask that fits are held to (coarse) and of
-that by which the sky's image is made (fine).
+percent of pixels that count and lie above the horizon, over every eighth picture, of the mask on a grid of cells (coarse), of that by which
+the sky's image is made (fine), and of that which fits are held to (rim).
 """
 
 from __future__ import annotations
@@ -216,14 +216,15 @@ def counted(truth: np.ndarray, camera: Camera) -> np.ndarray:
 
 def scores(frames: Frames, log: Log, truth: list[np.ndarray]) -> dict[str, tuple[float, float]]:
     """Precision and recall of the masks of a one-camera drive, in percent."""
-    sums = {"coarse": np.zeros(3), "fine": np.zeros(3)}
+    sums = {kind: np.zeros(3) for kind in ("coarse", "fine", "rim")}
     for view in frames.views[:: max(1, len(frames.views) // 10)]:
         camera = frames.camera(log, view)
         w, h = camera.width, camera.height
         true = np.asarray(Image.fromarray(truth[view.index]).resize((w, h), Image.Resampling.NEAREST))
         counts = counted(true, camera)
         rows, columns = (np.arange(n) * of // n for n, of in zip((h, w), view.sky.shape, strict=True))
-        for kind, mask in (("coarse", view.sky.numpy()[rows[:, None], columns]), ("fine", frames.sky_of(view))):
+        masks = view.sky.numpy()[rows[:, None], columns], frames.sky_of(view), frames.sky_with_rim(view)
+        for kind, mask in zip(sums, masks, strict=True):
             sums[kind] += (mask & true & counts).sum(), (mask & counts).sum(), (true & counts).sum()
     return {kind: (100 * both / max(found, 1), 100 * both / there) for kind, (both, found, there) in sums.items()}
 
@@ -258,7 +259,7 @@ def main() -> None:
     asked = parser.parse_args()
     log, name, size = opened(asked.drive), asked.camera, (asked.size[0], asked.size[1])
     truth = known(log, name)
-    print(f"{'':<28} {'coarse':>14} {'fine':>14}   (precision, recall; percent)")
+    print(f"{'':<28} {'coarse':>14} {'fine':>14} {'rim':>14}   (precision, recall; percent)")
     for sky, look in looks(asked.envmaps, _ahead(log)).items():
         if asked.only and sky not in asked.only:
             continue

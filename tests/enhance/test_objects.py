@@ -191,15 +191,17 @@ def test_objects_are_looked_at_a_pixel_over_their_edge():
     assert torch.equal(reaching_over(all_of_it), all_of_it)
 
 
-def test_a_car_of_the_street_that_is_put_into_it_keeps_its_colours():
-    """At its edge, where pixels are a mixture of it and the street, it differs from what is around; that is no wrong light."""
+def test_cars_of_the_street_that_are_put_into_it_keep_their_colours_in_a_clip():
+    """At their edges, where pixels are a mixture of them and the street, they differ from what is around; that is no wrong light. (Of
+    single frames one in six is taken to be a few levels off: what is done is the mean over a clip's.)"""
     street, net = load(DATA / "drive002"), Enhancer.load("builtin").net.objects
     start = int(street.frame_times(CAMERA)[0])
     for text in (PARKED, MOVING):
         placement = parse_placement(text)
         street = insert(street, Databank(DATA / "databank").load(placement.asset), placement, start).scene
-    (frame,) = render_clip(street, CAMERA, SHIFT, [start + 1_200_000], 640, 360, outputs=("rgb", "instance"))
-    told = telling(frame, street.anew())
-    rgb = told.rgb.permute(2, 0, 1).clamp(0, 1)
-    better, _ = correct(net, rgb, told.instance, {})
-    assert (told.instance > 0).sum() > 5000 and torch.equal(better[:, told.instance > 0], rgb[:, told.instance > 0])
+    before, times = {}, [start + 400_000 + 100_000 * k for k in range(10)]
+    for frame in render_clip(street, CAMERA, SHIFT, times, 640, 360, outputs=("rgb", "instance")):
+        told = telling(frame, street.anew())
+        rgb = told.rgb.permute(2, 0, 1).clamp(0, 1)
+        better, before = correct(net, rgb, told.instance, before)
+        assert (told.instance > 0).sum() > 5000 and torch.equal(better[:, told.instance > 0], rgb[:, told.instance > 0])
