@@ -19,10 +19,10 @@ from scenes.camera import Camera
 from scenes.spread import spread
 
 SKY_WEIGHT, LEFT = 0.1, 0.02
-"""Of the cross entropy of alpha with none, in pixels that are surely sky, beside the picture's loss; and what is left of the light where no
-more is asked for. In the picture splats of the sky's colour are as good as the sky: at a roof's edge, or between wires, they would stay,
-and from elsewhere hang beside it in white streaks. Of opaque ones before one another each has its part so; alpha itself, which the last of
-them alone could change, left 1.3 % of drive 002's sky opaque, now 0.1 %."""
+"""Of the cross entropy of alpha with none, in pixels that are surely sky, beside the picture's loss; and the light that shines through even
+where alpha is 1, so that it is finite. In the picture splats of the sky's colour are as good as the sky: at a roof's edge, or between
+wires, they would stay, and from elsewhere hang beside it in white streaks. Of opaque ones before one another each has its part so; alpha
+itself, which the last of them alone could change, left 1.3 % of drive 002's sky opaque, now 0.1 %."""
 
 SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
@@ -75,7 +75,7 @@ class Openings:
         sky = self.sky[view.camera, view.index]
         if sky.shape != alpha.shape:
             sky = F.interpolate(sky[None, None].float(), alpha.shape, mode="area")[0, 0]
-        before = -(sky * torch.log1p(LEFT - alpha)).mean()
+        before = -(sky * torch.log1p(-alpha / (1 + LEFT))).mean()
         coarse = F.interpolate(alpha[None, None], view.sky.shape)[0, 0]
         small = camera.resized(view.sky.shape[1], view.sky.shape[0])
         solid = (world_directions(small, self.device)[..., 2] < 0) & ~view.sky
