@@ -331,7 +331,7 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
     population = Population(start.splats.to(device), motion, config, start.ground, start.swept, clear)
-    return Fit(frames, motion, population, start.sky, start.exposures, limbs, config, start.measured)
+    return Fit(frames, population, start.sky, start.exposures, limbs, start.measured)
 
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:

@@ -55,14 +55,12 @@ class Frames:
 
     def sky_of(self, view: View) -> np.ndarray:
         """What of a view is surely sky, pixel by pixel: bool `[H, W]`."""
-        found = fine_sky(view.image.numpy(), view.sky.numpy())
-        return found if view.ego is None else found & ~view.ego.numpy()
+        return view.without_ego(fine_sky(view.image.numpy(), view.sky.numpy()))
 
     def sky_with_rim(self, view: View) -> np.ndarray:
         """The same, and what looks like it as near by as the gaps between wires are: bool `[H, W]`."""
         image = view.image.numpy()
-        found = like_sky(image, self.sky_of(view), max(1, image.shape[1] // WIRE))
-        return found if view.ego is None else found & ~view.ego.numpy()
+        return view.without_ego(like_sky(image, self.sky_of(view), max(1, image.shape[1] // WIRE)))
 
     def followed(self, time_us: int) -> torch.Tensor | None:
         """The gain `[3]` at a time that the cameras have in the mean, None where none varies."""

@@ -37,6 +37,10 @@ class View:
         image = self.image.numpy()[pixels] / np.float32(255)
         return image if self.gain is None else image / self.gain.numpy()
 
+    def without_ego(self, mask: np.ndarray) -> np.ndarray:
+        """What of a mask `[H, W]` of the image is not the recording car."""
+        return mask if self.ego is None else mask & ~self.ego.numpy()
+
     def shows_street(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Whether pixels of the image are neither surely sky nor the recording car; bool of the shape of `row` and `column`."""
         step = np.array(self.image.shape[:2]) / self.sky.shape

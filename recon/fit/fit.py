@@ -8,14 +8,13 @@ from functools import partial
 
 import torch
 
-from recon.fit.config import FitConfig
 from recon.fit.densify import hold_shade, shade_of
 from recon.fit.descent import rates_at
 from recon.fit.develop import developed
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
-from recon.fit.motion import Motion, Shot
+from recon.fit.motion import Shot
 from recon.fit.openings import Openings
 from recon.fit.population import Population
 from recon.fit.refill import REFILLED_AT, missed
@@ -70,26 +69,24 @@ class Fit:
     def __init__(
         self,
         frames: Frames,
-        motion: Motion,
         population: Population,
         sky: torch.Tensor,
         exposures: torch.Tensor,
         limbs: Limbs,
-        config: FitConfig,
         measured: Sequence[Measured],
     ):
-        self.device = population.device
-        self.frames, self.motion, self.population, self.limbs, self.config = frames, motion, population, limbs, config
+        self.device, self.motion, self.config = population.device, population.motion, population.config
+        self.frames, self.population, self.limbs = frames, population, limbs
         self.measured = [m.to(self.device) for m in measured]
         self.sky, self.exposures = sky.to(self.device), exposures.to(self.device)
         self.first_sky = self.sky.clone()
         self.step_count = 0
         self.training = [view.to(self.device) for view in frames.training()]
-        self.generator = torch.Generator().manual_seed(config.seed)
+        self.generator = torch.Generator().manual_seed(self.config.seed)
         self.recent_loss = 0.0
         self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
-        self.openings = Openings(frames, motion, self.device)
+        self.openings = Openings(frames, self.motion, self.device)
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self._optimise()
@@ -273,7 +270,6 @@ class Fit:
 
     # ---- which splats there are
 
-    @torch.no_grad()
     def _tend(self) -> None:
         """Add, drop and colour splats where it is time to."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
@@ -295,13 +291,13 @@ class Fit:
         """Add splats where the sky stands in for what pictures show, once what stands where lidar looked through is gone."""
         there = self.population
         there.drop(there.clear.holds(there.splats))
-        sh_count = there.splats.fields["sh"].shape[1]
+        path, sh_count = self.motion.path(), there.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()
             cameras = [self.motion.camera(v) for v in views]
             search = Search(views, cameras, gain, there.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
-                there.add(more)
+                there.add(more, path)
 
     @torch.no_grad()
     def _shown(self) -> Shown:

@@ -20,6 +20,7 @@ from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pe
 from recon.seeds.points import fewer
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
+from scenes.trajectory import Trajectory
 
 
 class Population:
@@ -42,16 +43,17 @@ class Population:
         budget = round(self.config.budget * (1 - ROOM)) if self.motion.tracks else self.config.budget
         self._renew(*grow(self.splats, carried, self.growth, budget, left, self.motion.boxes, astray))
 
-    def add(self, more: Gaussians) -> None:
-        """Some more of the background, as many as the budget leaves room for."""
+    def add(self, more: Gaussians, path: Trajectory) -> None:
+        """Some more of the background, as many as the budget leaves room for. path: of the body, along which cameras see them."""
         more = fewer(more, max(0, self.config.budget - len(self.splats)))
-        reach = reach_of(more, self.motion.path(), self.motion.rig).to(self.device)
+        reach = reach_of(more, path, self.motion.rig).to(self.device)
         self._renew(*joined(self.splats, self.descent.tensors(), [more], [reach]))
 
     def drop(self, which: torch.Tensor) -> None:
         """Go on without some, bool `[N]`."""
         self._renew(*kept(self.splats, self.descent.tensors(), ~which))
 
+    @torch.no_grad()
     def guess(self, shown: Callable[[], Shown]) -> None:
         """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray is gone. shown:
         what pictures show of the splats there are by then."""

@@ -85,10 +85,10 @@ def unexplained(
     down = np.minimum(rays @ pose[2, :3], -1e-3)
     z = np.minimum(z, np.maximum(0.5, (floor - pose[2, 3]) / down))
     local = rays * z[:, None]
-    # the mean of what of the block is no sky: of what the sky shines into, from aside a pale rim would be seen before it
+    # the mean of what of the block is no sky, half of it at least: what the sky shines into would be a pale rim before it, from aside
     street = (~sky[..., None]).astype(np.float32)
     colour, share = (ndimage.uniform_filter(x, (STEP, STEP, 1))[rows[want], columns[want]] for x in (view.evenly() * street, street))
-    colour = colour / np.maximum(share, 1e-3) / gain
+    colour = colour / share / gain
     return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / camera.lens.focal()[0]
 
 

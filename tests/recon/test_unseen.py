@@ -70,15 +70,13 @@ def test_what_peeps_over_a_roof_before_the_sky_hangs_there_from_aside():
     peeps, hidden, free = shown.part[-3:].tolist()
     assert 0.001 < peeps < SEEN and hidden < 0.001 and free > 0.9
     high = Ground(torch.full((9, 9), -50.0), (-4.0, -4.0), 1.0)
-    found = pennants(Splats.of([splats], [torch.ones(len(splats))]), shown, high)
+    alone = Splats.of([splats], [torch.ones(len(splats))])
+    found = pennants(alone, shown, high)
     assert found[-3:].tolist() == [True, False, False] and not found[:-3].any()
-    some = Splats.of(
-        [splats.select(torch.arange(len(places))), splats.select(torch.arange(3) + len(places))], [torch.ones(len(places)), torch.ones(3)]
-    )
-    assert not pennants(some, shown, high).any(), "an actor is whole"
-    assert not pennants(Splats.of([splats], [torch.ones(len(splats))]), shown, Ground(torch.full((9, 9), 12.0), (-4.0, -4.0), 1.0))[
-        -3:
-    ].any()
+    groups = [splats.select(which) for which in torch.arange(len(splats)).split([len(places), 3])]
+    assert not pennants(Splats.of(groups, [torch.ones(len(g)) for g in groups]), shown, high).any(), "an actor is whole"
+    street = Ground(torch.full((9, 9), 12.0), (-4.0, -4.0), 1.0)
+    assert not pennants(alone, shown, street)[-3:].any()
 
 
 def test_a_splats_whole_weight_is_that_of_its_ellipse():
