@@ -19,6 +19,7 @@ from recon.exposed import exposed_by
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
+from recon.fit.flat import FlatGround
 from recon.fit.limbs import Limbs
 from recon.fit.model import MODEL, Knots
 from recon.fit.motion import Motion
@@ -330,7 +331,8 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     strides = {group: stride for group, track in limbed if (stride := stride_of(track, frames, motion))}
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
-    population = Population(start.splats.to(device), motion, config, start.ground, start.swept, clear)
+    ground = FlatGround(start.ground, start.ground_shown, torch.device(device))
+    population = Population(start.splats.to(device), motion, config, ground, start.swept, clear)
     return Fit(frames, population, start.sky, start.exposures, limbs, start.measured)
 
 

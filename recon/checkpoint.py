@@ -21,7 +21,7 @@ from scenes.lenses import LENSES
 from scenes.state import load_state, save_state
 from scenes.trajectory import Trajectory
 
-VERSION = 15
+VERSION = 16
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -73,6 +73,7 @@ def _plain_start(start: Start) -> dict:
         "tracks": plain_tracks(start.tracks),
         "ego": [start.ego.times_us, start.ego.world_from_body],
         "ground": [start.ground.heights, list(start.ground.origin), start.ground.cell],
+        "ground_shown": start.ground_shown,
         "rig": {n: _plain_camera(r) for n, r in start.rig.items()},
         "measured": [[m.views, m.weight] for m in start.measured],
         "swept": start.swept.keys,
@@ -121,4 +122,5 @@ def _start(plain: dict, fit: dict) -> Start:
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
     measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
-    return Start(splats, tracks_of(plain["tracks"]), fit["sky"], fit["exposures"], ego, ground, rig, measured, swept, tuple(plain["gains"]))
+    told = (fit["sky"], fit["exposures"], ego, ground, plain["ground_shown"], rig, measured, swept, tuple(plain["gains"]))
+    return Start(splats, tracks_of(plain["tracks"]), *told)

@@ -30,6 +30,12 @@ STEP = 0.4
 NOISE, TELLING = 0.1, 4
 """Metres that lidar's points of the ground are off it at most, by their noise and that of poses, and how many of a cell tell its height."""
 
+GROUND, BARE = 1, 2
+"""What is known of a cell (`shown_ground`)."""
+
+CLEAR, STRAY = (0.15, 1.5), 0.02
+"""Metres above the ground between which nothing may stand where it is bare, and points that may, of those that lie on it: lidar strays."""
+
 STEEPEST = 0.2
 """Metres by which ground may rise or fall with every metre away from the path."""
 
@@ -64,6 +70,24 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     heights = level + _filled(_without_objects(heights - level, distance, cell), 0.0, cell)
     ground = Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
     return replace(ground, heights=ground.heights + _noise_under(points, place, ground)) if len(points) else ground
+
+
+def shown_ground(points: np.ndarray, ground: Ground) -> torch.Tensor:
+    """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it, `BARE` where
+    besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess."""
+    at = (points[:, :2] - np.array(ground.origin)) / ground.cell
+    column, row = np.round(at).astype(np.int64).T
+    rows, columns = ground.heights.shape
+    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+
+    def count(which: np.ndarray) -> np.ndarray:
+        which = which & inside
+        return np.bincount(row[which] * columns + column[which], minlength=rows * columns).reshape(rows, columns)
+
+    lying, standing = count(np.abs(off) < NOISE), count((off > CLEAR[0]) & (off < CLEAR[1]))
+    stands = ndimage.binary_dilation(standing > STRAY * lying, np.ones((3, 3)))
+    return torch.from_numpy(np.where(lying >= TELLING, np.where(stands, GROUND, BARE), 0).astype(np.uint8))
 
 
 def _noise_under(points: np.ndarray, place: np.ndarray, ground: Ground) -> torch.Tensor:

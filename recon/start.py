@@ -14,7 +14,7 @@ from recon.fit.model import Splats, draw
 from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.frames import Frames
-from recon.ground import estimate_ground
+from recon.ground import estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
 from recon.movers.traffic import traffic
 from recon.seeds.beyond import beyond_lidar
@@ -55,8 +55,8 @@ WIDEST_SEED = 0.012
 
 @dataclass
 class Start:
-    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground, rig, the
-    depths that were measured in views, where nothing stands, and the views' gains."""
+    """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground and what is
+    known of it, rig, the depths that were measured in views, where nothing stands, and the views' gains."""
 
     splats: Splats
     tracks: list[Track]
@@ -64,6 +64,7 @@ class Start:
     exposures: torch.Tensor
     ego: Trajectory
     ground: Ground
+    ground_shown: torch.Tensor
     rig: dict[str, RigCamera]
     measured: tuple[Measured, ...]
     swept: Swept
@@ -147,7 +148,8 @@ def prepare(
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
     told_gains = tuple(v.gain for v in frames.views)
-    return Start(splats, tracks, sky, exposures, ego, ground, rig, tuple(measured), swept, told_gains)
+    ground_shown = shown_ground(split.static if sparse is None else cloud.xyz, ground)
+    return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(measured), swept, told_gains)
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:

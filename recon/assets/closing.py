@@ -15,11 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from recon.assets.patching import CLEARANCE, OPAQUE, STEP, in_colours_of, patched, shown_alone
+from recon.assets.patching import OPAQUE, STEP, in_colours_of, patched, shown_alone
 from recon.mirror import SOLID, THERE
+from recon.outline import outline
 from recon.tracks import VEHICLES
 from scenes.asset import Asset
 from scenes.gaussians import Gaussians
@@ -28,17 +28,11 @@ from scenes.seen import unseen_sides
 ENDS = {"front": 1.0, "rear": -1.0}
 """Sides that are closed, and where they are along x."""
 
-ROW = 0.08
-"""Metres between the heights at which a vehicle's outline is taken."""
-
 HOLE = 6
 """Points within two steps of one, itself among them, from which on what lets light through is a hole; 13 where all do."""
 
 ROUND = 0.75
 """Metres over which an end curves into the sides."""
-
-FEWEST = 20
-"""Splats in a row from which on its outline is known."""
 
 LAMPS = 0.6
 """Metres from the other end whose colours, lamps' and a plate's, an end that nobody saw does not get."""
@@ -63,10 +57,10 @@ def hull_of_end(splats: Gaussians, size: np.ndarray, end: float, seen: bool = Fa
     end that was not seen, where there are none. They have one colour from all sides."""
     solid = splats.select(torch.sigmoid(splats.logit_opacities) > SOLID)
     points = solid.means.double().numpy() * [end, 1, 1]
-    outline = _outline(points, size)
-    if outline is None:
+    shape = outline(points, size)
+    if shape is None:
         return Gaussians.empty(splats.sh.shape[1])
-    surface = _ruled(*outline)
+    surface = _ruled(*shape)
     lacking = lets_through(splats, size, end, surface * [end, 1, 1])
     if not seen:
         lacking |= cKDTree(points).query(surface)[0] > THERE
@@ -88,26 +82,6 @@ def lets_through(splats: Gaussians, size: np.ndarray, end: float, points: np.nda
     pose, rows, columns = camera.world_from_cam, camera.height, camera.width
     column, row = camera.lens.project((torch.from_numpy(points) - pose[:3, 3]) @ pose[:3, :3]).floor().long().unbind(1)
     return (frame.alpha[row.clamp(0, rows - 1), column.clamp(0, columns - 1)] < OPAQUE).numpy()
-
-
-def _outline(points: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Of points `[N, 3]`: heights, how far ahead they reach at each (what is higher up has something below it), and how far to the sides
-    there; None of too few."""
-    heights = np.arange(CLEARANCE, size[2], ROW)
-    ahead, beside = np.full((2, len(heights)), np.nan)
-    for i, z in enumerate(heights):
-        row = points[np.abs(points[:, 2] - z) < ROW]
-        if len(row) >= FEWEST:
-            ahead[i] = np.percentile(row[:, 0], 98)
-            near = row[row[:, 0] > ahead[i] - size[1] / 2]
-            beside[i] = np.percentile(np.abs(near[:, 1]), 95)
-    known = np.isfinite(ahead)
-    if known.sum() < 3:
-        return None
-    top = np.flatnonzero(known)[-1] + 1
-    heights, ahead, beside = (np.interp(heights[:top], heights[known], a[known]) for a in (heights, ahead, beside))
-    ahead, beside = (ndimage.median_filter(a, 3, mode="nearest") for a in (ahead, beside))
-    return heights, np.maximum.accumulate(ahead[::-1])[::-1], beside
 
 
 def _ruled(heights: np.ndarray, ahead: np.ndarray, beside: np.ndarray) -> np.ndarray:

@@ -15,15 +15,13 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from recon.mirror import SOLID
+from recon.outline import CLEARANCE
 from recon.seeds.points import Cloud, splats_from
 from render import Frame, rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh
 from scenes.lenses import Orthographic
-
-CLEARANCE = 0.25
-"""Metres above the ground at which a vehicle's ends and sides begin."""
 
 STEP = 0.05
 """Metres between the splats that close something."""

@@ -39,7 +39,7 @@ class Growth:
     errors: sum of pictures' errors times its weights in them (Bulò et al. 2024, equation 1), of as many pictures as it was `shown` in.
     pull: sum of its place's gradients, of all costs, times its reach (Kerbl et al. 2023, who take pixels), of as many steps as it was
     `pulled` in. What no splat can show better is wrong however many there are, and pulls cancel where a splat is too large for what it
-    shows: each alone sends splats where they bring less (tests/bench/README.md).
+    shows: each alone sends splats where they bring less (tests/bench/reconstruction.md).
     """
 
     errors: torch.Tensor

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from recon.fit.descent import COLOURS, Descent
 from recon.fit.model import Splats
+from recon.ground import BARE
 from recon.kernels.descent import Rates
 from recon.kernels.press import Grid, press
 from render.launch import run, stage, view
@@ -23,10 +24,15 @@ road is; seen at a grazing angle the upper sides of thick splats hide what is be
 PULLED, SUNK = 0.01, 0.012
 """Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays; and metres
 that its middle then lies lower, since of splats that overlap the nearer is drawn first. Pictures of a straight drive do not tell a line
-painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds."""
+painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds. Sunk by 0.02 depth is a
+thirtieth nearer to lidar's, and the road's colours 3 m aside are 0.3 dB farther from the photo's."""
 
 ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
+
+UNDER, OVER = 1.0, 0.3
+"""The same below where lidar shows the ground, and above where it shows it bare (`recon.ground.shown_ground`): nothing else is there. What
+pictures of a straight drive leave there is a fifth of what they show of the road, and from 2 m aside as far off as it is deep."""
 
 NEAR = 0.3
 """Metres from the ground within which what hides a gap there is the street, and stays where and as it lies."""
@@ -43,14 +49,15 @@ SMOOTH = 1.0
 
 
 class FlatGround:
-    """Presses splats onto a ground, on its device."""
+    """Presses splats onto a ground, on its device. shown: what is known of it, uint8 `[Y, X]` (`recon.ground.shown_ground`)."""
 
-    def __init__(self, ground: Ground, device: torch.device):
+    def __init__(self, ground: Ground, shown: torch.Tensor, device: torch.device):
         self.ground = ground
         smooth = ndimage.gaussian_filter(ground.heights.double().numpy(), SMOOTH / ground.cell, mode="nearest")
         along_y, along_x = np.gradient(smooth, ground.cell)
         self.slopes = torch.from_numpy(np.stack([along_x, along_y], -1)).float().to(device)
-        self.heights = (ground.heights - SUNK).to(device).contiguous()
+        self.heights = ground.heights.to(device).contiguous()
+        self.near = torch.stack([torch.where(shown > 0, UNDER, ON), torch.where(shown == BARE, OVER, ON)], 2).to(device)
         self.grid = Grid()
         (self.grid.x, self.grid.y), self.grid.cell = ground.origin, ground.cell
         self.origin = torch.tensor(ground.origin, device=device)
@@ -90,7 +97,7 @@ class FlatGround:
         fields = [view(splats.fields[name], kind) for name, kind in (("means", wp.vec3), ("quats", wp.vec4), ("log_scales", wp.vec3))]
         with stage(which.device):
             moved = [view(which, wp.int64), splats.sizes[0], view(descent.last, float), rates.now]
-            ground = [self.grid, view(self.heights, float), view(self.slopes, wp.vec2), settle * PRESSED, ON]
-            pull = [wp.vec3(*eye.tolist()), settle * PULLED]
+            ground = [self.grid, view(self.heights, float), view(self.slopes, wp.vec2), view(self.near, wp.vec2), settle * PRESSED]
+            pull = [wp.vec3(*eye.tolist()), settle * PULLED, SUNK]
             unseen = [view(descent.moments, float), COLOURS, settle * UNSEEN_PRESSED]
             run(press, len(which), [*moved, *ground, *pull, *unseen, *fields], which.device)

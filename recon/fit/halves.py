@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.fit.densify import LARGEST, shade_of
+from recon.fit.flanks import flanks
 from recon.fit.model import Splats
 from recon.fit.unseen import SEEN
 from recon.log import Track
@@ -22,8 +23,8 @@ from scenes.gaussians import Gaussians
 INSTEAD = 0.3
 """Metres from a mirror image within which it stands for what no picture shows."""
 
-ROOM = 0.01
-"""Of the splat budget that is kept for halves."""
+ROOM = 0.02
+"""Of the splat budget that is kept for halves and sides."""
 
 
 def halves(splats: Splats, part: torch.Tensor, tracks: Sequence[Track]) -> tuple[list[Gaussians], list[torch.Tensor]]:
@@ -34,7 +35,9 @@ def halves(splats: Splats, part: torch.Tensor, tracks: Sequence[Track]) -> tuple
     more, reach = [g.select(torch.zeros(0, dtype=torch.int64)) for g in groups], [r[:0] for r in reaches]
     for i, track in enumerate(tracks, 1):
         if track.label in VEHICLES and known[i].any():
-            more[i] = other_half(groups[i].select(known[i]), torch.from_numpy(track.size))
+            mine = groups[i].select(known[i])
+            image = other_half(mine, torch.from_numpy(track.size))
+            more[i] = Gaussians.cat([image, flanks(Gaussians.cat([mine, image]), track.size, track.label)])
             usual = reaches[i].median()
             reach[i] = torch.maximum(more[i].log_scales.exp().amax(1).to(usual) / LARGEST, usual)
     return more, reach

@@ -16,10 +16,9 @@ from recon.fit.model import Splats
 from recon.fit.motion import Motion
 from recon.fit.reach import reach_of
 from recon.fit.swept import Swept
-from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pennants
+from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pennants, swollen
 from recon.seeds.points import fewer
 from scenes.gaussians import Gaussians
-from scenes.ground import Ground
 from scenes.trajectory import Trajectory
 
 
@@ -29,10 +28,10 @@ class Population:
     splats; descent, growth: of each of them; guessed: bool `[N]`, whose colours are their neighbours', to keep; None before any is.
     """
 
-    def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: Ground, swept: Swept, clear: Clear):
+    def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear):
         self.device = splats.reach.device
-        self.splats, self.motion, self.config, self.ground = splats, motion, config, ground
-        self.swept, self.clear, self.flat_ground = swept.to(self.device), clear, FlatGround(ground, self.device)
+        self.splats, self.motion, self.config = splats, motion, config
+        self.swept, self.clear, self.flat_ground, self.ground = swept.to(self.device), clear, ground, ground.ground
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.guessed: torch.Tensor | None = None
 
@@ -60,6 +59,7 @@ class Population:
         self.drop(self.swept.holds(self.splats) | self.clear.holds(self.splats))
         seen = shown()
         hang = curtains(self.splats, seen.inside, self.descent.coloured(), self.ground) | pennants(self.splats, seen, self.ground)
+        hang |= swollen(self.splats, seen.part)
         self.drop(hang)
         part = self._complete(seen.part[~hang], shown)
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)

@@ -7,12 +7,14 @@ and is seen.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
 
+from recon.fit.densify import shade_of
 from recon.fit.flat import ON
 from recon.fit.model import Splats, draw
 from scenes.camera import Camera
@@ -29,6 +31,9 @@ AT_EDGE = 0.15
 
 LOW = 0.2
 """Metres above the ground up to which a splat is part of the street."""
+
+SWOLLEN = 0.25
+"""Metres of standard deviation beyond which a mover's splat that no picture shows has swollen: it began with 0.15 at most."""
 
 NEIGHBOURS = 16
 """Splats of known colour beside one of unknown, whose mean it is given."""
@@ -116,6 +121,16 @@ def pennants(splats: Splats, shown: Shown, ground: Ground) -> torch.Tensor:
     """
     at_edge = shown.beside_sky > AT_EDGE * shown.weight
     return (shown.part < SEEN) & at_edge & (off_ground(splats, ground) > LOW) & (splats.group_of() == 0)
+
+
+def swollen(splats: Splats, part: torch.Tensor) -> torch.Tensor:
+    """Which splats of movers, bool `[N]`, none of the pictures shows to `SEEN`, and that are large all the same.
+
+    What another car hides of one ahead is seen by rims, as that sways; these hold such a splat no more than the pictures' borders do a
+    curtain, and from aside it lies in a streak over the street.
+    """
+    large = splats.fields["log_scales"].detach().amax(1) > math.log(SWOLLEN)
+    return (part < SEEN) & large & (splats.group_of() > 0) & ~shade_of(splats)
 
 
 def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, ground: Ground) -> torch.Tensor:

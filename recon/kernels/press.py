@@ -23,14 +23,15 @@ class Grid:
 @wp.kernel
 def press(
     which: wp.array[wp.int64], count: int, last: wp.array[float], now: float,
-    grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], part: float, near: float, eye: wp.vec3, pull: float,
+    grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], near: wp.array2d[wp.vec2],
+    part: float, eye: wp.vec3, pull: float, sunk: float,
     moments: wp.array3d[float], colour: int, part_unseen: float,
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
-    """Of splats `which`, those of the first `count` that moved `now`, are nearer than `near` to the ground and no thicker than that lose
-    `part` of their extent along its normal, and `pull` of their height, along the ray to the eye. Those that no picture has pulled at,
-    as moments from `colour` on tell, lose another part, however thick they are.
+    """Of splats `which`, those of the first `count` that moved `now`, are less than `near` says below and above the ground, and no thicker
+    than it says above, lose `part` of their extent along its normal, and `pull` of how far they are above what lies `sunk` below it, along
+    the ray to the eye. Those that no picture has pulled at, as moments from `colour` on tell, lose another part, however thick they are.
 
     With D = 1 - part n n^T a covariance becomes D C D, to first order in `part`: in the splat's own axes its diagonal is what its scales
     lose, and the rest is a turn of its axes.
@@ -52,10 +53,13 @@ def press(
         heights[r + 1, c] * (1.0 - u) + heights[r + 1, c + 1] * u
     ) * v
     rise = p[2] - height
-    if wp.abs(rise) > near:
+    nearest_r = int(row + 0.5)
+    nearest_c = int(column + 0.5)
+    limits = near[nearest_r, nearest_c]
+    if rise < -limits[0] or rise > limits[1]:
         return
     unseen = moments[i, 1, colour] + moments[i, 1, colour + 1] + moments[i, 1, colour + 2] == 0.0
-    slope = slopes[int(row + 0.5), int(column + 0.5)]
+    slope = slopes[nearest_r, nearest_c]
     up = wp.normalize(wp.vec3(-slope[0], -slope[1], 1.0))
 
     q = quats[i]
@@ -68,11 +72,11 @@ def press(
     thick = wp.length(wp.vec3(n[0] * wp.exp(scales[0]), n[1] * wp.exp(scales[1]), n[2] * wp.exp(scales[2])))
     if unseen:
         part = part_unseen
-    elif thick > near:
+    elif thick > limits[1]:
         return
     drop = eye[2] - p[2]
     if drop > LOWEST:
-        means[i] = p + (pull * rise / drop) * (p - eye)
+        means[i] = p + (pull * (rise + sunk) / drop) * (p - eye)
     turn = wp.vec3()
     for k in range(3):
         a = (k + 1) % 3

@@ -8,8 +8,9 @@ from randomized import gaussians
 from recon import open_log
 from recon.build import begin, choose
 from recon.fit.descent import COLOURS, Descent, rates_at
-from recon.fit.flat import ON, PRESSED, SUNK, THIN, FlatGround
+from recon.fit.flat import ON, OVER, PRESSED, SUNK, THIN, UNDER, FlatGround
 from recon.fit.model import Splats
+from recon.ground import BARE, GROUND
 from scenes.ground import Ground
 from scenes.poses import matrix_from_quat
 from tests.recon.test_fit import CONFIG, SIZE
@@ -42,8 +43,12 @@ def lying(on: Ground, count=60, height=0.0) -> Splats:
     return Splats.of([first, second], [torch.ones(half), torch.ones(count - half)])
 
 
-def pressed(splats: Splats, on: Ground, settle=1.0, times=1, moved=None, unseen=None) -> None:
-    descent, flat = Descent.begin(splats), FlatGround(on, torch.device("cpu"))
+def flat_on(ground: Ground, shown=0) -> FlatGround:
+    return FlatGround(ground, torch.full(ground.heights.shape, shown, dtype=torch.uint8), torch.device("cpu"))
+
+
+def pressed(splats: Splats, on: Ground, settle=1.0, times=1, moved=None, unseen=None, shown=0) -> None:
+    descent, flat = Descent.begin(splats), flat_on(on, shown)
     descent.moments[:, 1, COLOURS:] = 1
     if unseen is not None:
         descent.moments[unseen, 1, COLOURS:] = 0
@@ -122,17 +127,27 @@ def test_beyond_the_ground_nothing_is_pressed():
     assert not changed(splats, before).any()
 
 
-@pytest.mark.parametrize("height", [0.06, -0.06])
-def test_what_lies_off_the_ground_is_drawn_to_it_along_the_rays_to_the_eye(height):
+@pytest.mark.parametrize(("shown", "lowest", "highest"), [(0, -ON, ON), (GROUND, -UNDER, ON), (BARE, -UNDER, OVER)])
+def test_where_the_ground_is_known_what_is_farther_off_lies_on_it_too(shown, lowest, highest):
+    bumpy = ground_of(lambda x, y: torch.sin(x) + torch.cos(0.7 * y) * x / 5)
+    for height in (-1.1 * UNDER, -0.9 * UNDER, -0.9 * ON, 0.9 * ON, 0.8 * OVER, 1.2 * OVER):
+        splats = lying(bumpy, height=height)
+        before = covariance(splats)
+        pressed(splats, bumpy, shown=shown)
+        assert changed(splats, before)[:30].tolist() == [lowest < height < highest] * 30, height
+
+
+@pytest.mark.parametrize(("height", "shown"), [(0.05, 0), (-0.05, 0), (0.25, BARE), (-0.8, GROUND)])
+def test_what_lies_off_the_ground_is_drawn_to_it_along_the_rays_to_the_eye(height, shown):
     splats = lying(hillside(), height=height)
     before = splats.fields["means"].clone()
-    pressed(splats, hillside(), times=10)
+    pressed(splats, hillside(), times=10, shown=shown)
     after = splats.fields["means"]
     off = after[:, 2] - hillside().height(after[:, :2]).float()
     assert (off[:30] * np.sign(height) < 0.95 * abs(height)).all() and torch.equal(after[30:], before[30:])
     ways = [torch.nn.functional.normalize(at - EYE.float(), dim=1) for at in (before, after)]
     torch.testing.assert_close(*ways, atol=1e-5, rtol=0)
-    pressed(splats, hillside(), times=1500)
+    pressed(splats, hillside(), times=1500, shown=shown)
     at = splats.fields["means"][:30]
     torch.testing.assert_close(at[:, 2].double(), hillside().height(at[:, :2]) - SUNK, atol=0.001, rtol=0)
 
@@ -142,7 +157,7 @@ def test_what_is_laid_onto_the_ground_is_thin_and_lies_along_it():
     splats.fields["log_scales"] += 2
     before, wide = splats.fields["means"].clone(), covariance(splats)
     which = torch.arange(60) % 3 == 0
-    FlatGround(hillside(), torch.device("cpu")).lay(splats, which)
+    flat_on(hillside()).lay(splats, which)
     at, after = splats.fields["means"], covariance(splats)
     assert torch.equal(at[~which], before[~which]) and torch.equal(after[~which], wide[~which])
     assert torch.equal(at[:, :2], before[:, :2]) and float((at[which, 2] - hillside().height(at[which, :2])).abs().max()) < 1e-5
@@ -168,7 +183,7 @@ def test_what_no_picture_shows_is_no_fog_however_thick():
 def test_what_closes_a_gap_on_the_ground_stays_where_it_lies():
     splats = lying(hillside(), height=0.2)
     splats.fields["means"][:5, 2] += 1
-    low = FlatGround(hillside(), torch.device("cpu")).on(splats)
+    low = flat_on(hillside()).on(splats)
     assert low.tolist() == [False] * 5 + [True] * 25 + [False] * 30, "what stands, the street, an actor"
     shown = splats.select(torch.arange(60), 1)
     held = shown.held(low, ("means", "quats"))

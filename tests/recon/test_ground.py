@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.ground import MOST, estimate_ground
+from recon.ground import BARE, GROUND, MOST, estimate_ground, shown_ground
 from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
@@ -24,6 +24,27 @@ def test_a_sloped_street_is_found_under_cars_and_beside_walls():
     ground = estimate_ground(np.concatenate([points, car, wall]), path())
     for x, y in ((0, 0), (10, 4), (20, -8), (-15, 5), (30, 10)):
         assert abs(float(ground.height(torch.tensor([x, y]))) - 0.02 * x) < 0.08
+
+
+def test_a_street_is_bare_where_lidar_shows_it_and_nothing_on_it():
+    generator = np.random.default_rng(3)
+    points = street_points(generator, 1_000_000)
+    unseen = (points[:, 0] > 28) & (points[:, 1] > 8)
+    car = generator.uniform([7.8, 3, 0.4], [12.2, 5, 1.9], (3000, 3))
+    kerb = generator.uniform([-30, 10, 0.1], [50, 10.2, 0.7], (20_000, 3))
+    wire = generator.uniform([-30, -8, 5], [50, -7.9, 5.1], (3000, 3))
+    stray = np.array([[-5.0, -3.0, 0.6]])
+    points = np.concatenate([points[~unseen], car, kerb, wire, stray])
+    ground = estimate_ground(points, path())
+    shown = shown_ground(points, ground)
+
+    def at(x: float, y: float) -> int:
+        return int(shown[round((y - ground.origin[1]) / ground.cell), round((x - ground.origin[0]) / ground.cell)])
+
+    assert at(0, 0) == at(20, -3) == at(-5, -3) == BARE, "one stray point stands for nothing"
+    assert at(10, 4) == at(7.4, 4) == at(0, 10) == GROUND, "below a car, next to it, at a kerb"
+    assert at(0, -8) == BARE, "below a wire"
+    assert at(40, 15) == 0, "where lidar shows nothing, nothing is known"
 
 
 def test_every_cell_is_filled_even_far_from_any_point():

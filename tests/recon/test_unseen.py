@@ -10,7 +10,8 @@ from recon import open_log
 from recon.build import begin, choose
 from recon.fit.fit import GUESSED_FROM
 from recon.fit.model import Splats
-from recon.fit.unseen import NEIGHBOURS, SEEN, Shown, as_neighbours, curtains, footprint, pennants
+from recon.fit.unseen import NEIGHBOURS, SEEN, SWOLLEN, Shown, as_neighbours, curtains, footprint, pennants, swollen
+from recon.seeds.shade import BLACK
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
@@ -117,6 +118,17 @@ def test_a_fit_of_one_standing_camera_hangs_no_curtain_beside_its_pictures(stree
         inside |= footprint(placed, fit.motion.camera(view).resized(*SIZE)) > 0
     left = curtains(background, inside, fit.population.descent.coloured()[: len(background)], fit.population.ground)
     assert float(left.float().mean()) < 0.0015, "none but what went beyond the border since; 0.0035 where they stay"
+
+
+def test_what_swells_behind_a_car_ahead_goes_and_seeds_and_shade_stay():
+    metres = [1.2 * SWOLLEN, 0.8 * SWOLLEN, 1.2 * SWOLLEN]
+    some = balls([(0.0, 0, 10), (1.0, 0, 10), (2.0, 0, 10)], metres, [0.9] * 3)
+    coloured = replace(some, sh=sh_from_rgb(torch.full((3, 1, 3), 0.6)))
+    shade = replace(some, sh=torch.full((3, 1, 3), sh_from_rgb(BLACK)))
+    splats = Splats.of([coloured, Gaussians.cat([coloured, shade])], [torch.full((3,), 20.0), torch.full((6,), 20.0)])
+    hidden, known = torch.zeros(9), torch.full((9,), SEEN)
+    assert swollen(splats, hidden).tolist() == [False] * 3 + [True, False, True] + [False] * 3, "the street, a car, its shade"
+    assert not swollen(splats, known).any()
 
 
 def splats_of(groups: list[list[float]], colour) -> tuple[Splats, torch.Tensor]:

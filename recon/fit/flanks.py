@@ -1,0 +1,85 @@
+"""The sides of a vehicle that pictures show from its rear or front alone, as of the one that the recording car follows all the way.
+
+From two metres aside it is a shell: the street shows where its side should be, and what little is known of that, a wing mirror, hangs
+beside it. So the outline of the end that is known is drawn along the vehicle's length, in the middle colour that the end has at each
+height: paint, glass and bumper go round the corner, lamps and a plate do not. A guess, as mirror images are (`halves.py`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from recon.mirror import SOLID
+from recon.outline import outline
+from scenes.gaussians import Gaussians
+from scenes.harmonics import rgb_from_sh, sh_from_rgb
+
+END = 1.0
+"""Metres from the front or rear within which a splat is of that end."""
+
+ALONG, UP = 0.4, 0.1
+"""Metres between the splats of a side, along it and upwards."""
+
+WIDE, THICK, LOGIT = 0.6, 0.02, 3.0
+"""Their standard deviations along these two, in what is between them, and in metres across; the logit of their opacity."""
+
+THERE, OPEN = 0.12, 0.3
+"""Metres along and up within which something known of the outer half tells that a side is there, and the part of it that is not, from which
+on it is taken as never seen."""
+
+BONNET, BONNETED = ((0.6, 1.0), (0.28, 0.05)), {"car", "pickup", "vehicle"}
+"""Parts of the height, and how far ahead of the middle vehicles reach there, in lengths, of those classes that end in a bonnet."""
+
+COLUMN = 0.1
+"""Metres of an end's width, each of which counts once in the colour of a height, however many splats it has."""
+
+
+def flanks(known: Gaussians, size: np.ndarray, label: str) -> Gaussians:
+    """Splats for those sides of a vehicle in a box `[length, width, height]` of which next to nothing is `known`, by its rear or front,
+    whichever more is known of."""
+    solid = known.select(torch.sigmoid(known.logit_opacities) > SOLID)
+    means, colours = solid.means.double().cpu().numpy(), rgb_from_sh(solid.sh[:, 0]).double().cpu().numpy()
+    at_ends = {end: means[:, 0] * end > size[0] / 2 - END for end in (1.0, -1.0)}
+    end = max(at_ends, key=lambda end: int(at_ends[end].sum()))
+    shape = outline(means * [end, 1, 1], size)
+    if shape is None:
+        return Gaussians.empty(known.sh.shape[1])
+    places, rgb = [], []
+    for z in np.arange(shape[0][0], shape[0][-1], UP):
+        ahead, half = (float(np.interp(z, shape[0], reach)) for reach in shape[1:])
+        x = np.arange(ahead - WIDE * ALONG, -_other_end(z / size[2], end, label) * size[0], -ALONG)
+        places.append(np.stack([x * end, np.full(len(x), half), np.full(len(x), z)], 1))
+        rgb.append(np.tile(_middle_colour(means, colours, z, at_ends[end]), (len(x), 1)))
+    left, made = np.concatenate(places), []
+    for side in (1.0, -1.0):
+        outer = means[means[:, 1] * side > left[:, 1].max(initial=0) / 2]
+        away = cKDTree(outer[:, [0, 2]]).query(left[:, [0, 2]])[0] if len(outer) else np.full(len(left), np.inf)
+        lacking = away > THERE
+        if len(left) and lacking.mean() > OPEN:
+            made.append(_panels(left[lacking] * [1, side, 1], np.concatenate(rgb)[lacking], known.sh.shape[1]))
+    return Gaussians.cat(made) if made else Gaussians.empty(known.sh.shape[1])
+
+
+def _other_end(height: float, end: float, label: str) -> float:
+    """How far beyond its middle a vehicle reaches, in lengths, at its other end, at a part of its height."""
+    bonnet = end < 0 and label in BONNETED and height > BONNET[0][0]
+    return float(np.interp(height, *BONNET)) if bonnet else 0.5
+
+
+def _middle_colour(means: np.ndarray, colours: np.ndarray, z: float, at_end: np.ndarray) -> np.ndarray:
+    """The median over an end's columns of the colour `[3]` that splats have about a height: of those nearest to it."""
+    near = at_end & (np.abs(means[:, 2] - z) <= max(UP, np.abs(means[at_end, 2] - z).min()))
+    _, column = np.unique(np.round(means[near, 1] / COLUMN), return_inverse=True)
+    total = np.stack([np.bincount(column, colours[near, k]) for k in range(3)], 1)
+    return np.median(total / np.bincount(column)[:, None], axis=0)
+
+
+def _panels(places: np.ndarray, rgb: np.ndarray, sh_count: int) -> Gaussians:
+    """Upright splats `[M]` along x at places `[M, 3]`, of one colour from all sides."""
+    n = len(places)
+    sh = torch.zeros(n, sh_count, 3)
+    sh[:, 0] = sh_from_rgb(torch.from_numpy(rgb).float())
+    scales = torch.tensor([WIDE * ALONG, THICK, WIDE * UP]).log().repeat(n, 1)
+    return Gaussians(torch.from_numpy(places).float(), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), scales, torch.full((n,), LOGIT), sh)
