@@ -89,7 +89,7 @@ class Insert:
         from scenes.alone import alone
         from scenes.insert import insert
         from scenes.seen import seeing, unseen_warning
-        from scenes.usd_edit import add_edit
+        from scenes.usd.edit import add_edit
 
         placement = Placement(self.asset, *(self.at or (0.0, 0.0)), self.yaw, self.speed, self.path, self.trajectory)
         straight = {"at_m": self.at, "yaw_rad": self.yaw, "speed_m_s": self.speed, "path": self.path}

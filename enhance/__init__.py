@@ -15,14 +15,14 @@ _HOME = {
     "Enhancer": "enhancer",
     "Memory": "enhancer",
     "enhance_video": "clip",
-    "Grade": "grade",
-    "Graded": "grade",
-    "Isp": "isp",
-    "random_isp": "isp",
-    "make_pairs": "pairs",
-    "PairSet": "shards",
-    "train": "train",
-    "TrainConfig": "run",
+    "Grade": "correcting.grade",
+    "Graded": "correcting.grade",
+    "Isp": "pairs.isp",
+    "random_isp": "pairs.isp",
+    "make_pairs": "pairs.make",
+    "PairSet": "pairs.shards",
+    "train": "training.train",
+    "TrainConfig": "training.run",
     "evaluate": "evaluate",
 }
 
@@ -30,17 +30,17 @@ __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
     from enhance.clip import enhance_video as enhance_video
+    from enhance.correcting.grade import Grade as Grade
+    from enhance.correcting.grade import Graded as Graded
     from enhance.enhancer import Enhancer as Enhancer
     from enhance.enhancer import Memory as Memory
     from enhance.evaluate import evaluate as evaluate
-    from enhance.grade import Grade as Grade
-    from enhance.grade import Graded as Graded
-    from enhance.isp import Isp as Isp
-    from enhance.isp import random_isp as random_isp
-    from enhance.pairs import make_pairs as make_pairs
-    from enhance.run import TrainConfig as TrainConfig
-    from enhance.shards import PairSet as PairSet
-    from enhance.train import train as train
+    from enhance.pairs.isp import Isp as Isp
+    from enhance.pairs.isp import random_isp as random_isp
+    from enhance.pairs.make import make_pairs as make_pairs
+    from enhance.pairs.shards import PairSet as PairSet
+    from enhance.training.run import TrainConfig as TrainConfig
+    from enhance.training.train import train as train
 
 
 def __getattr__(name: str):
@@ -51,7 +51,7 @@ def __getattr__(name: str):
 
 class _Package(types.ModuleType):
     def __setattr__(self, name, value):
-        # importing enhance/train.py would bind the module to the name that belongs to the call
+        # importing enhance/evaluate.py would bind the module to the name that belongs to the call
         if not (name in _HOME and isinstance(value, types.ModuleType)):
             super().__setattr__(name, value)
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
+from enhance.correcting.grade import Grade, Graded
 from enhance.enhancer import Enhancer
-from enhance.grade import Grade, Graded
 from enhance.object_ids import ObjectIds
 from enhance.pictures import Pictures, PictureWriter
 from enhance.step import Steps, frame_of

@@ -47,9 +47,17 @@ class Pairs:
     """Same seed, same pairs; another leaves out other frames and fits longer or shorter, with more or fewer splats."""
 
     def run(self) -> None:
-        from enhance.clips import PairConfig
-        from enhance.pairs import check_cameras, check_kinds, claim_pairs, make_pairs, open_reconstruction, open_recording, prepare_sources
-        from enhance.photo_pairs import check_names, make_photo_pairs
+        from enhance.pairs.clips import PairConfig
+        from enhance.pairs.make import (
+            check_cameras,
+            check_kinds,
+            claim_pairs,
+            make_pairs,
+            open_reconstruction,
+            open_recording,
+            prepare_sources,
+        )
+        from enhance.pairs.of_photos import check_names, make_photo_pairs
         from render.progress import Progress
 
         _some("--kinds", self.kinds)
@@ -141,8 +149,8 @@ class Train:
     """Go on from the folder's checkpoint."""
 
     def run(self) -> None:
-        from enhance.shards import PairSet
-        from enhance.train import train
+        from enhance.pairs.shards import PairSet
+        from enhance.training.train import train
         from render.progress import Progress
 
         if not self.pairs:

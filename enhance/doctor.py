@@ -68,7 +68,7 @@ if not features.check("webp"):
 print(f"{version}, with WebP {features.version('webp')}")
 """
 WEIGHTS = """
-from enhance.weights_file import BUILTIN, load_net
+from enhance.network.weights_file import BUILTIN, load_net
 net, about = load_net(BUILTIN)
 print(f"{BUILTIN.stat().st_size / 1e6:.1f} MB, {sum(p.numel() for p in net.parameters()) / 1e6:.1f} million parameters")
 """

@@ -8,13 +8,13 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
-from enhance.corrections import Corrections, correct
-from enhance.net import MULTIPLE, Net, photos_of
-from enhance.past import Past, alike, thin
-from enhance.precision import channels_last, has_bfloat16
+from enhance.correcting.corrections import Corrections, correct
+from enhance.network.net import MULTIPLE, Net, photos_of
+from enhance.network.past import Past, alike, thin
+from enhance.network.precision import channels_last, has_bfloat16
+from enhance.network.weights_file import BUILTIN, REPAIR_GAIN, WORTH, is_net, load_net
 from enhance.step import Steps, checked
 from enhance.tiles import Tiles
-from enhance.weights_file import BUILTIN, REPAIR_GAIN, WORTH, is_net, load_net
 from render.frame_types import Frame
 from scenes.opening import check_device
 

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from enhance.clip import telling
+from enhance.correcting.grade import Grade, Graded
 from enhance.drift import KEPT, drift, drift_text, of_video
 from enhance.enhancer import Enhancer
-from enhance.grade import Grade, Graded
 from enhance.metrics import Features, feature_distance, interval, region_ssim, sharpness, warp_error
-from enhance.shards import KINDS, RENDERED, PairSet, Shard, Window
+from enhance.network.weights_file import BUILTIN, load_net
+from enhance.pairs.shards import KINDS, RENDERED, PairSet, Shard, Window
 from enhance.step import Steps, frame_of
-from enhance.weights_file import BUILTIN, load_net
 from render.compare import psnr, ssim
 from render.frame_types import Frame
 from scenes.opening import check_device

@@ -48,7 +48,7 @@ from scenes.opening import check_device, fresh
 from scenes.scene import Scene
 from scenes.sky import Sky, linear_from_srgb
 from scenes.space_order import space_order
-from scenes.usd_scene import is_scene
+from scenes.usd.scene import is_scene
 
 PIXELS = 960 * 540
 """Of the pictures that are fitted, where nobody says."""

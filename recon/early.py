@@ -10,7 +10,7 @@ from recon.fit.config import FitConfig
 from recon.log import Log
 from render.progress import Progress
 from scenes.files import save
-from scenes.usd_scene import is_scene
+from scenes.usd.scene import is_scene
 
 SHARES = (0.25, 0.5, 0.75)
 SHORT = FitConfig(steps=2400, budget=100_000)

@@ -19,7 +19,7 @@ from scenes.atomic import atomic_folder
 from scenes.files import Dropping
 from scenes.pictures import opened, rgb_of
 from scenes.scene import Scene
-from scenes.usd_scene import load_recorded
+from scenes.usd.scene import load_recorded
 
 FOLDER = "photos"
 

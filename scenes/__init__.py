@@ -47,7 +47,7 @@ _HOME = {
     "load": "files",
     "load_dropping": "files",
     "save": "files",
-    "add_edit": "usd_edit",
+    "add_edit": "usd.edit",
     "describe": "report",
     "validate": "report",
 }

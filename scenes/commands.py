@@ -15,7 +15,7 @@ from scenes.options import AnyPath, Axis, Flag, Name, Overwrite, Replacement, Re
 from scenes.warnings import warn
 
 if TYPE_CHECKING:
-    from scenes.usd_edit import Undone
+    from scenes.usd.edit import Undone
 
 Value = TypeVar("Value")
 
@@ -106,7 +106,7 @@ def _turned(source: Path, target: Path, up: str | None) -> list[str]:
     after = "y" if named(target) in (GLB, SPZ) else "z"
     metres = 1.0
     if found(source) is USD:
-        from scenes.usd_splats import stage_axes
+        from scenes.usd.splats import stage_axes
 
         metres = stage_axes(source)[1]
     taken = f"{source} does not say which of its axes points up, as {target} will; z is taken to, and --up names another, as --up=-y"
@@ -142,7 +142,7 @@ class Edit:
         if not asked and not self.undo:
             raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
         from scenes.alone import alone
-        from scenes.usd_edit import undone
+        from scenes.usd.edit import undone
 
         with ExitStack() as stack:
             stack.enter_context(alone(self.scene))
@@ -158,7 +158,7 @@ class Edit:
         from scenes import edit as edits
         from scenes.astray import astray, meeting
         from scenes.match import light_held, other_model
-        from scenes.usd_edit import add_change, free_name
+        from scenes.usd.edit import add_change, free_name
 
         scene, _ = open_scene(self.scene)
         wanted = _once(self.replace, "--replace")

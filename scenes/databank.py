@@ -80,7 +80,7 @@ class Databank:
 
     def load(self, id: str, clean: Callable[[Gaussians, str], Gaussians] = Gaussians.checked) -> Asset:
         """The asset of an id, with the id in its meta. FileNotFoundError naming the file where one is missing."""
-        from scenes.usd_splats import load_asset
+        from scenes.usd.splats import load_asset
 
         entry = self.entry(id)
         file = self.path / entry.asset
@@ -118,7 +118,7 @@ class Databank:
                 return
 
     def _added(self, asset: Asset, thumb_png: bytes | None, half: bool) -> str:
-        from scenes.usd_splats import save_asset, to_json
+        from scenes.usd.splats import save_asset, to_json
 
         entries = self.ready()
         kind = slug(asset.label)

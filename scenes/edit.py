@@ -1,4 +1,4 @@
-"""What an edit does to a scene: actors are removed, shifted, replaced, retimed. In memory; scenes/usd_edit.py keeps it as a layer."""
+"""What an edit does to a scene: actors are removed, shifted, replaced, retimed. In memory; scenes/usd/edit.py keeps it as a layer."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def save(
     """
     path = Path(path)
     if isinstance(thing, Scene):
-        from scenes.usd_scene import save_scene
+        from scenes.usd.scene import save_scene
 
         for name, gaussians in splats_of(thing):
             gaussians.validate(name)
@@ -65,11 +65,11 @@ def save(
     for name, gaussians in splats_of(thing):
         gaussians.validate(name)
     if isinstance(thing, Asset):
-        from scenes.usd_splats import save_asset
+        from scenes.usd.splats import save_asset
 
         save_asset(path, thing, half)
     elif form is USD:
-        from scenes.usd_splats import save_gaussians
+        from scenes.usd.splats import save_gaussians
 
         save_gaussians(path, thing, model, half)
     else:
@@ -89,7 +89,7 @@ def kind_of(path: str | os.PathLike) -> str:
         return "scene"
     form = found(path)
     if form is USD:
-        from scenes.usd import open_stage, own_data
+        from scenes.usd.layers import open_stage, own_data
 
         with open_stage(path) as stage:
             root = stage.GetDefaultPrim()
@@ -128,10 +128,10 @@ def read(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussians] =
     if kind == "splats" and (form := found(path)):
         return form.load(path, clean)
     if kind == "scene":
-        from scenes.usd_scene import load_scene
+        from scenes.usd.scene import load_scene
 
         return load_scene(path if path.is_dir() else path.parent, clean)
-    from scenes.usd_splats import load_asset
+    from scenes.usd.splats import load_asset
 
     return load_asset(path / "asset.usdc" if path.is_dir() else path, clean)
 

@@ -284,7 +284,7 @@ def _usd_files(path: Path) -> list[Path]:
 
 
 def _usd_problems(file: Path) -> list[str]:
-    from scenes.usd import usd_problems
+    from scenes.usd.layers import usd_problems
 
     try:
         return [f"{file}: {problem}" for problem in usd_problems(file)]

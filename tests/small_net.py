@@ -2,7 +2,7 @@
 
 import torch
 
-from enhance.net import Net, NetConfig
+from enhance.network.net import Net, NetConfig
 
 SMALL = NetConfig(width=24, blocks=2, heads=3, half=8, quarter=8, eighth=16, looks=8)
 

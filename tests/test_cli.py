@@ -20,7 +20,7 @@ import torch
 from render.video import VideoWriter, read_video
 from scenes import Databank, Gaussians, Placed, SplatModel, load, save
 from scenes.convert import stood_up
-from scenes.usd_splats import save_gaussians
+from scenes.usd.splats import save_gaussians
 
 REPOSITORY = Path(__file__).parents[1]
 

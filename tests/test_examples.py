@@ -8,8 +8,8 @@ import pytest
 import street as made
 from made_colmap import pictures_along, write_colmap
 
-from enhance.net import Net
-from enhance.weights_file import save_net
+from enhance.network.net import Net
+from enhance.network.weights_file import save_net
 from render.video import read_image, read_video
 from scenes import Databank, save
 

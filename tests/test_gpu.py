@@ -12,8 +12,8 @@ from made_drive import write_drive
 
 import sidestep
 from enhance.evaluate import main as evaluate
-from enhance.shards import PairSet
-from enhance.train import TrainConfig, train
+from enhance.pairs.shards import PairSet
+from enhance.training.train import TrainConfig, train
 from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
 from render.outputs import OUTPUTS

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional as F
 
-from enhance.past import alike
-from enhance.precision import channels_last, has_bfloat16
+from enhance.network.past import alike
+from enhance.network.precision import channels_last, has_bfloat16
 from enhance.public.model import Model
 from enhance.step import checked
 from render.frame_types import Frame

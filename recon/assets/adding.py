@@ -94,7 +94,7 @@ def own_axes(file: Path) -> tuple[str, str, float]:
     if form in (GLB, SPZ):
         return "y", "z" if form is GLB else "-z", 1.0
     if form is USD:
-        from scenes.usd_splats import stage_axes
+        from scenes.usd.splats import stage_axes
 
         said, metres = stage_axes(file)
         up, forward = {"y": ("y", "z"), "z": ("z", "x")}.get(said or "", ("-y", "z"))

@@ -33,7 +33,7 @@ from scenes.scene import Scene, dimmed
 from scenes.seen import SECTORS, unseen_sides
 from scenes.sky import linear_from_srgb
 from scenes.trajectory import Trajectory
-from scenes.usd_scene import load_recorded
+from scenes.usd.scene import load_recorded
 
 FEWEST_SPLATS = 1000
 FEWEST_VIEWS = 10

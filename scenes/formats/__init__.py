@@ -53,7 +53,7 @@ PLY = Format("PLY", (".ply",), "scenes.formats.ply", "ply", tagged=True)
 COMPRESSED_PLY = Format(
     "compressed PLY", (".compressed.ply",), "scenes.formats.compressed_ply", "compressed_ply", ordered=True, tagged=True
 )
-USD = Format("USD", (".usdc", ".usda", ".usd"), "scenes.usd_splats", "gaussians")
+USD = Format("USD", (".usdc", ".usda", ".usd"), "scenes.usd.splats", "gaussians")
 GLB = Format("GLB", (".glb",), "scenes.formats.glb", "glb")
 SPZ = Format("SPZ", (".spz",), "scenes.formats.spz", "spz", tagged=True)
 SPLAT = Format(".splat", (".splat",), "scenes.formats.splat", "splat")

@@ -31,7 +31,7 @@ def said_up(path: Path) -> str | None:
         return "y"
     if form is not USD:
         return None
-    from scenes.usd_splats import stage_axes
+    from scenes.usd.splats import stage_axes
 
     return stage_axes(path)[0]
 

@@ -22,7 +22,7 @@ def model_of(path: Path) -> SplatModel:
     """
     form = found(path)
     if form is USD:
-        from scenes.usd_splats import model_in
+        from scenes.usd.splats import model_in
 
         return model_in(path)
     if form is SPZ:

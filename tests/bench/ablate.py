@@ -22,15 +22,15 @@ from torch.nn import functional as F
 
 from enhance.enhancer import Enhancer
 from enhance.evaluate import TOLD, Row, measured, shipped_features
-from enhance.losses import PatchPerceptual, pixel_loss
-from enhance.net import Net, told_of
-from enhance.precision import autocast, channels_last
-from enhance.run import TrainConfig
-from enhance.samples import Sampler
-from enhance.shards import KINDS, RENDERED, PairSet, Shard, to_bytes, write_shard
+from enhance.network.net import Net, told_of
+from enhance.network.precision import autocast, channels_last
+from enhance.network.weights_file import BUILTIN, load_net, save_net
+from enhance.pairs.shards import KINDS, RENDERED, PairSet, Shard, to_bytes, write_shard
 from enhance.step import Steps
-from enhance.train import train
-from enhance.weights_file import BUILTIN, load_net, save_net
+from enhance.training.losses import PatchPerceptual, pixel_loss
+from enhance.training.run import TrainConfig
+from enhance.training.samples import Sampler
+from enhance.training.train import train
 from render.frame_types import Frame
 from scenes.atomic import atomic_file
 from scenes.spread import spread

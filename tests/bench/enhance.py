@@ -20,7 +20,7 @@ from torch.nn import functional as F
 
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
 from enhance.enhancer import Enhancer, Memory
-from enhance.precision import has_bfloat16
+from enhance.network.precision import has_bfloat16
 from render import render_clip
 from render.frame_types import Frame
 from scenes import Databank, Scene, load

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from enhance.autoencoder import zero
+from enhance.network.autoencoder import zero
 
 
 class ChannelNorm(nn.LayerNorm):

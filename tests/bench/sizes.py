@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from enhance.clips import scene_time
+from enhance.pairs.clips import scene_time
 from recon import open_log
 from recon.album import at_once
 from render import render_frame

@@ -4,8 +4,8 @@ import torch
 from small_net import stirred
 
 from enhance.enhancer import Enhancer
-from enhance.shards import KINDS, PairSet, to_bytes, write_shard
-from enhance.weights_file import REPAIR_GAIN
+from enhance.network.weights_file import REPAIR_GAIN
+from enhance.pairs.shards import KINDS, PairSet, to_bytes, write_shard
 from tests.bench.ablate import CONFIG, Alone, halved, suited, table, variants
 from tests.bench.nafnet import NafNet
 

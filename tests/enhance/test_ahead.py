@@ -5,8 +5,8 @@ from itertools import islice
 import pytest
 import torch
 
-from enhance.ahead import Batch, drawn
-from enhance.samples import Photos, Sampler
+from enhance.training.ahead import Batch, drawn
+from enhance.training.samples import Photos, Sampler
 from render.video import write_image
 
 CPU = torch.device("cpu")

@@ -13,8 +13,8 @@ from small_net import SMALL, stirred
 
 from enhance.clip import enhance_frames, enhance_video, enhancement, telling
 from enhance.enhancer import Enhancer
-from enhance.net import Net
-from enhance.weights_file import save_net
+from enhance.network.net import Net
+from enhance.network.weights_file import save_net
 from render.clip import render_clip
 from render.frame_types import Frame
 from render.references import References, Shot

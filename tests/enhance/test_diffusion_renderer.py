@@ -8,11 +8,11 @@ import pytest
 import torch
 from PIL import Image
 
-from enhance.clips import PairConfig
 from enhance.commands import Pairs
-from enhance.diffusion_renderer import FRAMES, Relit
-from enhance.pairs import make_pairs, prepare_sources
-from enhance.shards import PairSet
+from enhance.pairs.clips import PairConfig
+from enhance.pairs.diffusion_renderer import FRAMES, Relit
+from enhance.pairs.make import make_pairs, prepare_sources
+from enhance.pairs.shards import PairSet
 from scenes.opening import UsageError
 
 CONFIG = PairConfig(width=96, frames=3, every=4)

@@ -5,8 +5,8 @@ import torch
 from small_net import SMALL, stirred
 
 from enhance.enhancer import Enhancer
-from enhance.net import Net
-from enhance.weights_file import BUILTIN, FORMAT, REPAIR_GAIN, WORTH, load_net, save_net
+from enhance.network.net import Net
+from enhance.network.weights_file import BUILTIN, FORMAT, REPAIR_GAIN, WORTH, load_net, save_net
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import torch
 from small_net import SMALL, stirred
 
-from enhance.gain import repair_gain
-from enhance.net import Net, photos_of
+from enhance.network.net import Net, photos_of
+from enhance.training.gain import repair_gain
 
 
 def shard(given, target, kind="sparse", reference=None, trust=0.0):

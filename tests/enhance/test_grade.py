@@ -8,13 +8,13 @@ import torch
 from PIL import Image
 
 from enhance.clip import enhance_video
-from enhance.colour_map import Colours, Map
+from enhance.correcting.colour_map import Colours, Map
+from enhance.correcting.grade import STEADY, Grade, Graded
 from enhance.enhancer import Enhancer
 from enhance.evaluate import GRADED, evaluate
-from enhance.grade import STEADY, Grade, Graded
-from enhance.isp import Isp
-from enhance.photo_pairs import make_photo_pairs
-from enhance.shards import PairSet
+from enhance.pairs.isp import Isp
+from enhance.pairs.of_photos import make_photo_pairs
+from enhance.pairs.shards import PairSet
 from enhance.step import frame_of
 from render.compare import psnr
 from render.video import VideoWriter, read_image, write_image

@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch.nn import functional as F
 
-from enhance.corrections import correct
-from enhance.grain import Excess, Grain, of_object, usual_of, without
-from enhance.isp import Isp
+from enhance.correcting.corrections import correct
+from enhance.correcting.grain import Excess, Grain, of_object, usual_of, without
+from enhance.correcting.objects import ObjectNet
 from enhance.metrics import sharpness
-from enhance.objects import ObjectNet
+from enhance.pairs.isp import Isp
 from render.compare import psnr
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from enhance.isp import Isp, alter, random_isp, random_pipeline
-from enhance.masks import random_mask
+from enhance.pairs.isp import Isp, alter, random_isp, random_pipeline
+from enhance.pairs.masks import random_mask
 
 
 def image(seed=0, h=12, w=20):

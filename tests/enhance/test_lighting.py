@@ -5,7 +5,7 @@ import pytest
 import torch
 from street import sky, street
 
-from enhance.lighting import Illumination, random_sky, relit, smoothed, under
+from enhance.pairs.lighting import Illumination, random_sky, relit, smoothed, under
 from scenes.light import sun_of_sky
 
 UP = torch.tensor([0.0, 0.0, 1.0])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from enhance.autoencoder import Encoder
-from enhance.losses import PatchPerceptual, flicker, pixel_loss
+from enhance.network.autoencoder import Encoder
+from enhance.training.losses import PatchPerceptual, flicker, pixel_loss
 
 
 def test_pixel_loss_is_least_at_the_target_and_slight_damage_counts_beside_strong():

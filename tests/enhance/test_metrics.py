@@ -8,7 +8,7 @@ from small_net import SMALL, stirred
 from enhance.drift import drift, of_video
 from enhance.enhancer import Enhancer
 from enhance.metrics import feature_distance, interval, region_ssim, sharpness, warp_error
-from enhance.net import Net
+from enhance.network.net import Net
 from render.compare import ssim
 from render.video import VideoWriter
 

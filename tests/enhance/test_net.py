@@ -4,9 +4,9 @@ import pytest
 import torch
 from small_net import SMALL, stirred
 
-from enhance.autoencoder import Autoencoder
-from enhance.net import Net, blend_of, photos_of
-from enhance.past import Past
+from enhance.network.autoencoder import Autoencoder
+from enhance.network.net import Net, blend_of, photos_of
+from enhance.network.past import Past
 
 
 def inputs(b=1, k=2, h=32, w=48, seed=0, net=None):

@@ -5,11 +5,24 @@ import torch
 
 from enhance import Enhancer
 from enhance.clip import telling
-from enhance.corrections import STEADY, Correction, correct
+from enhance.correcting.corrections import STEADY, Correction, correct
+from enhance.correcting.objects import (
+    COEFFICIENTS,
+    FEWEST,
+    REACH,
+    SEAM,
+    Evidence,
+    ObjectNet,
+    boxes,
+    changed,
+    evidence,
+    reaching_over,
+    spots,
+    whole_of,
+)
+from enhance.correcting.shade import KNOTS
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
-from enhance.object_samples import PIXELS, ObjectSampler
-from enhance.objects import COEFFICIENTS, FEWEST, REACH, SEAM, Evidence, ObjectNet, boxes, changed, evidence, reaching_over, spots, whole_of
-from enhance.shade import KNOTS
+from enhance.training.object_samples import PIXELS, ObjectSampler
 from render import render_clip
 from scenes import Databank, load
 from scenes.insert import insert

@@ -14,14 +14,14 @@ from made_drive import write_drive
 from PIL import Image
 from street import car
 
-from enhance.clips import Clip, PairConfig, of_scene
-from enhance.damage import ORDER, Sources
-from enhance.degrade import Underfit, unfinish
-from enhance.lighting import random_sky
-from enhance.pairs import claim_pairs, held_out_camera, kinds_for, make_pairs, open_reconstruction, open_recording, prepare_sources
-from enhance.photo_pairs import make_photo_pairs
-from enhance.refits import REFITS, Refit, as_reconstructed, shots_of
-from enhance.shards import KINDS, PairSet
+from enhance.pairs.clips import Clip, PairConfig, of_scene
+from enhance.pairs.damage import ORDER, Sources
+from enhance.pairs.degrade import Underfit, unfinish
+from enhance.pairs.lighting import random_sky
+from enhance.pairs.make import claim_pairs, held_out_camera, kinds_for, make_pairs, open_reconstruction, open_recording, prepare_sources
+from enhance.pairs.of_photos import make_photo_pairs
+from enhance.pairs.refits import REFITS, Refit, as_reconstructed, shots_of
+from enhance.pairs.shards import KINDS, PairSet
 from recon import open_log
 from recon.assets.extract import FEWEST_SPLATS, Candidate
 from recon.log import LogCamera
@@ -33,7 +33,7 @@ from scenes import load, save
 from scenes.databank import Databank
 from scenes.edit import Edit
 from scenes.trajectory import Trajectory
-from scenes.usd_edit import add_change
+from scenes.usd.edit import add_change
 
 CONFIG = PairConfig(width=96, frames=3, every=4)
 

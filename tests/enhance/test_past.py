@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from enhance.flow import shrink_flow
-from enhance.past import Past, thin
+from enhance.network.past import Past, thin
 
 
 def constant_flow(x, y, h=10, w=14):

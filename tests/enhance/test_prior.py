@@ -3,8 +3,8 @@
 import torch
 from small_net import SMALL
 
-from enhance.net import Net
-from enhance.prior import FIXED, Time, flow_matching_loss, velocity
+from enhance.network.net import Net
+from enhance.training.prior import FIXED, Time, flow_matching_loss, velocity
 
 
 def test_at_the_fixed_time_nothing_is_left_of_time():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from made_drive import write_drive
 
-from enhance.refits import SHORT, Less, as_reconstructed, by_turns, exposed_as, refits, rendered_aside, thinned
+from enhance.pairs.refits import SHORT, Less, as_reconstructed, by_turns, exposed_as, refits, rendered_aside, thinned
 from recon import open_log
 from recon.align import MOVED
 from recon.fit.fit import Fit
@@ -101,7 +101,7 @@ def test_a_refit_is_exposed_as_its_scene_is(log, street, tmp_path):
 
 
 def test_each_half_of_the_rig_shows_the_other_halfs_views(log, street, tmp_path, monkeypatch):
-    monkeypatch.setattr("enhance.refits._fit", lambda scene, part, path, config, size, device: _instead(scene, path))
+    monkeypatch.setattr("enhance.pairs.refits._fit", lambda scene, part, path, config, size, device: _instead(scene, path))
     made = refits("crossref", street, log, tmp_path, QUICK, SIZE)
     assert {r.cameras for r in made} == {("front_camera",), ("left_camera",)}
     alone = replace(street, rig={"front_camera": street.rig["front_camera"]})

@@ -8,17 +8,17 @@ import pytest
 import torch
 from small_net import stirred
 
-from enhance.clips import PairConfig
 from enhance.commands import Pairs, Train
 from enhance.enhancer import Enhancer
 from enhance.evaluate import main
-from enhance.pairs import make_pairs
-from enhance.photo_pairs import make_photo_pairs
-from enhance.run import TrainConfig, opened
-from enhance.shards import PairSet, to_bytes, write_shard
+from enhance.network.weights_file import REPAIR_GAIN, load_net, save_net
+from enhance.pairs.clips import PairConfig
+from enhance.pairs.make import make_pairs
+from enhance.pairs.of_photos import make_photo_pairs
+from enhance.pairs.shards import PairSet, to_bytes, write_shard
 from enhance.step import checked
-from enhance.train import train
-from enhance.weights_file import REPAIR_GAIN, load_net, save_net
+from enhance.training.run import TrainConfig, opened
+from enhance.training.train import train
 from recon.build import reconstruct
 from render.frame_types import Frame
 from render.video import write_image
@@ -183,8 +183,8 @@ def test_photos_of_one_name_and_other_settings_are_refused(tmp_path):
 
 
 def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("enhance.pairs.open_recording", lambda *_: recording)
-    monkeypatch.setattr("enhance.pairs.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
+    monkeypatch.setattr("enhance.pairs.make.open_recording", lambda *_: recording)
+    monkeypatch.setattr("enhance.pairs.make.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
     save(street, tmp_path / "street")
     (tmp_path / "other").mkdir()
     one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from enhance.samples import Photos, Sampler
-from enhance.shards import PairSet, to_bytes, write_shard
+from enhance.pairs.shards import PairSet, to_bytes, write_shard
+from enhance.training.samples import Photos, Sampler
 from render.video import write_image
 
 
@@ -70,7 +70,7 @@ def test_right_pictures_come_from_pairs_and_photos(pairs, photos):
 
 
 def test_flipping_turns_the_flow_too():
-    from enhance.samples import Sample, _flipped
+    from enhance.training.samples import Sample, _flipped
 
     x = torch.arange(12.0).reshape(1, 1, 1, 12).repeat(2, 3, 4, 1)
     flow = torch.stack([torch.full((2, 4, 12), 2.0), torch.zeros(2, 4, 12)], 1)

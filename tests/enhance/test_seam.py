@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from enhance.isp import Isp, alter
-from enhance.object_samples import Objects
-from enhance.objects import COEFFICIENTS, _edges, boxes, changed
-from enhance.seam import ENDS, effects, fitted, usual_changes
+from enhance.correcting.objects import COEFFICIENTS, _edges, boxes, changed
+from enhance.correcting.seam import ENDS, effects, fitted, usual_changes
+from enhance.pairs.isp import Isp, alter
+from enhance.training.object_samples import Objects
 
 NOTHING = torch.zeros(COEFFICIENTS)
 BROAD = 0.5 * torch.eye(COEFFICIENTS)

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from enhance.shade import ACROSS, DOWN, KNOTS, ShadeNet, optical_depth, read_ground, shaded
-from enhance.shade_samples import ShadeSampler
-from enhance.shards import PairSet, to_bytes, write_shard
+from enhance.correcting.shade import ACROSS, DOWN, KNOTS, ShadeNet, optical_depth, read_ground, shaded
+from enhance.pairs.shards import PairSet, to_bytes, write_shard
+from enhance.training.shade_samples import ShadeSampler
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
 

@@ -6,7 +6,7 @@ from small_net import stirred
 from torch.nn import functional as F
 
 from enhance.enhancer import Enhancer
-from enhance.net import Net
+from enhance.network.net import Net
 from enhance.tiles import TILE, Tiles
 from render.frame_types import Frame
 from scenes.camera import Camera

@@ -13,11 +13,11 @@ from small_net import SMALL
 
 from enhance.enhancer import Enhancer
 from enhance.evaluate import ALL_TOLD, ALONE, METHODS, PUT_IN, _told, evaluate, table
-from enhance.net import Net, NetConfig
-from enhance.run import TrainConfig, opened
-from enhance.shards import PairSet, to_bytes, write_shard
-from enhance.train import train
-from enhance.weights_file import BUILTIN, load_net
+from enhance.network.net import Net, NetConfig
+from enhance.network.weights_file import BUILTIN, load_net
+from enhance.pairs.shards import PairSet, to_bytes, write_shard
+from enhance.training.run import TrainConfig, opened
+from enhance.training.train import train
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
@@ -58,7 +58,7 @@ def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch
     torch.set_num_threads(1)
     whole = train(pairs, tmp_path / "whole", steps=12, seed=3, config=QUICK, net=SMALL)
 
-    module, steps = sys.modules["enhance.train"], []
+    module, steps = sys.modules["enhance.training.train"], []
     step = module._enhancer_step
 
     def stop(*arguments):
@@ -161,7 +161,7 @@ def test_told_objects_are_corrected_alike_on_a_gpu():
 
 def test_a_loss_that_is_not_finite_ends_a_training_before_it_is_saved(pairs, trained, monkeypatch):
     kept = (trained / "checkpoint.pt").read_bytes()
-    monkeypatch.setattr(sys.modules["enhance.train"], "pixel_loss", lambda *_: torch.tensor(torch.nan, requires_grad=True))
+    monkeypatch.setattr(sys.modules["enhance.training.train"], "pixel_loss", lambda *_: torch.tensor(torch.nan, requires_grad=True))
     with pytest.raises(ValueError, match="enhancer's loss is nan"):
         train(pairs, trained, steps=4, config=QUICK, net=SMALL, resume=True)
     assert (trained / "checkpoint.pt").read_bytes() == kept
@@ -258,11 +258,11 @@ def test_enhancers_beside_ours_are_rows_of_their_own(pairs):
 
 def test_what_is_learnt_of_objects_is_kept_before_it_is_asked_what_changes_are_usual(pairs, tmp_path, monkeypatch):
     """That takes minutes, says how far it is, can be stopped, and comes out the same where it begins anew."""
-    monkeypatch.setattr(sys.modules["enhance.train"], "USUAL", 60)
+    monkeypatch.setattr(sys.modules["enhance.training.train"], "USUAL", 60)
     only = {"steps": 4, "config": QUICK, "start": "builtin", "only": ("objects",)}
     whole = train(pairs, tmp_path / "whole", **only)
 
-    lines, now = [], sys.modules["enhance.train"].time
+    lines, now = [], sys.modules["enhance.training.train"].time
     monkeypatch.setattr(now, "monotonic", iter(range(0, 10**9, 10)).__next__)
 
     def stop(share, line):
@@ -275,7 +275,7 @@ def test_what_is_learnt_of_objects_is_kept_before_it_is_asked_what_changes_are_u
         train(pairs, tmp_path / "halves", **only, progress=stop, save_every=10**6)
     assert "of 60 objects for what changes are usual" in lines[-1]
     monkeypatch.undo()
-    monkeypatch.setattr(sys.modules["enhance.train"], "USUAL", 60)
+    monkeypatch.setattr(sys.modules["enhance.training.train"], "USUAL", 60)
     halves = train(pairs, tmp_path / "halves", **only, resume=True)
     first, second = load_net(whole)[0].objects.usual, load_net(halves)[0].objects.usual
     assert torch.equal(first, second) and not torch.equal(first, load_net(BUILTIN)[0].objects.usual)

@@ -21,7 +21,7 @@ from scenes.edit import Edit
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw
 from scenes.report import validate
-from scenes.usd_edit import add_change
+from scenes.usd.edit import add_change
 
 CAMERA = "front_camera"
 

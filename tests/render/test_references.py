@@ -18,7 +18,7 @@ from scenes.files import load, save
 from scenes.lenses import Fisheye
 from scenes.poses import translation
 from scenes.scene import Scene
-from scenes.usd_edit import add_change
+from scenes.usd.edit import add_change
 
 CAMERA = "front_camera"
 

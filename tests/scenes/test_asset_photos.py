@@ -16,7 +16,7 @@ from scenes.edit import Edit
 from scenes.lenses import OpenCV
 from scenes.poses import translation
 from scenes.report import validate
-from scenes.usd_edit import add_change, add_edit
+from scenes.usd.edit import add_change, add_edit
 
 
 def photo(value=200, lens=Pinhole(30.0, 31.0, 15.5, 10.25), time_us=1_500_000_000_000_007) -> AssetPhoto:  # noqa: B008 - frozen

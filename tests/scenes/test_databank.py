@@ -7,7 +7,7 @@ from randomized import asset
 
 from scenes import Databank, load
 from scenes.names import slug
-from scenes.usd import usd_problems
+from scenes.usd.layers import usd_problems
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_an_add_that_breaks_off_leaves_the_databank_as_it_was(bank, monkeypatch)
         raise OSError(28, "No space left on device")
 
     before = {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()}
-    monkeypatch.setattr("scenes.usd_splats.author_splats", fail)
+    monkeypatch.setattr("scenes.usd.splats.author_splats", fail)
     with pytest.raises(OSError, match="No space"):
         bank.add(asset())
     assert {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()} == before
@@ -119,7 +119,7 @@ def test_an_add_that_fails_leaves_no_folder(tmp_path):
 
 
 def test_a_folder_that_could_not_be_written_is_taken_away(bank, monkeypatch):
-    monkeypatch.setattr("scenes.usd_splats.author_splats", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("scenes.usd.splats.author_splats", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         bank.add(asset(4, "Truck"))
     assert not (bank.path / "assets/truck").exists()

@@ -20,9 +20,9 @@ from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
 from scenes.seen import SECTORS
-from scenes.usd import new_stage, usd_problems
-from scenes.usd_edit import add_change, add_edit, undo, undone
-from scenes.usd_root import RECORDED, add_sublayer
+from scenes.usd.edit import add_change, add_edit, undo, undone
+from scenes.usd.layers import new_stage, usd_problems
+from scenes.usd.root import RECORDED, add_sublayer
 
 
 def busy() -> Scene:
@@ -241,7 +241,7 @@ def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
 
 def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_next_edit(saved):
     add_change(saved, "mine", load(saved), ALL, {})
-    kill = "import os, sys; from scenes.usd_edit import undone\nwith undone(sys.argv[1], ['mine']): os.kill(os.getpid(), 9)"
+    kill = "import os, sys; from scenes.usd.edit import undone\nwith undone(sys.argv[1], ['mine']): os.kill(os.getpid(), 9)"
     for next_edit in (lambda: put_in(saved), lambda: undo(saved, "new")):
         subprocess.run([sys.executable, "-c", kill, str(saved)], check=False)
         (aside,) = saved.glob(".undone.*")

@@ -4,7 +4,7 @@ import pytest
 from randomized import gaussians, scene
 
 from scenes import load, save
-from scenes.usd_crate import _lz4, check_crate
+from scenes.usd.crate import _lz4, check_crate
 
 
 @pytest.fixture

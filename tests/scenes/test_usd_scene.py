@@ -10,7 +10,7 @@ from pxr import Gf, Usd, UsdGeom
 from randomized import START_US, asset, scene, trajectory
 
 from scenes import Actor, Gaussians, Scene, Sky, Trajectory, add_edit, load, load_dropping, save
-from scenes.usd import usd_problems
+from scenes.usd.layers import usd_problems
 
 
 @pytest.fixture
@@ -155,7 +155,7 @@ def test_a_write_that_breaks_off_leaves_the_old_scene(saved, monkeypatch, broken
         raise OSError(28, "No space left on device")
 
     before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    monkeypatch.setattr(f"scenes.usd_scene.{broken}", fail)
+    monkeypatch.setattr(f"scenes.usd.scene.{broken}", fail)
     with pytest.raises(OSError, match="No space"):
         save(scene(tracks=("new",)), saved, overwrite=True)
     with pytest.raises(OSError, match="No space"):
@@ -307,7 +307,7 @@ def test_an_edit_that_breaks_off_leaves_the_scene_as_it_was(saved, monkeypatch):
         raise KeyboardInterrupt
 
     before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    monkeypatch.setattr("scenes.usd_edit.add_sublayer", fail)
+    monkeypatch.setattr("scenes.usd.edit.add_sublayer", fail)
     with pytest.raises(KeyboardInterrupt):
         add_edit(saved, "first", [inserted("bus")], {})
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before

@@ -14,8 +14,8 @@ from randomized import asset, gaussians
 from scenes import Gaussians, load, load_dropping, save
 from scenes.harmonics import evaluate
 from scenes.poses import matrix_from_quat
-from scenes.usd import usd_problems, valid_names
-from scenes.usd_splats import stage_axes
+from scenes.usd.layers import usd_problems, valid_names
+from scenes.usd.splats import stage_axes
 
 SUFFIXES = ["usdc", "usda", "usd"]
 

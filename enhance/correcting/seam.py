@@ -1,0 +1,97 @@
+"""What the seam alone says of an object's colours: the change with which surfaces go on across it, by robust least squares.
+
+Where a mask reaches beyond its object, or cuts through a wall or a road, the same surface lies on both sides of the seam, and what its
+colours jump by is the damage itself. That holds on streets that no network has seen. The network's guess is where the fit begins and what
+it is drawn to: the more, the less profiles agree, as round an object that ends where its mask does. Seeing little of a change and much
+noise is weighed by what changes are usual (a Gaussian, of training objects).
+"""
+
+from __future__ import annotations
+
+import torch
+
+from enhance.correcting.objects import COEFFICIENTS, LUMA, Box
+from enhance.training.object_samples import Objects
+
+PROFILES = 512
+"""Most profiles across a seam that are read."""
+OFF = (1, 2, 3)
+"""Pixels beyond those at the seam, which may be mixed, whose mean is a side's colour."""
+FEWEST_PROFILES = 24
+PULL = 200.0
+"""Profiles that the guess is worth, at the usual spread of what it is wrong by. Neighbours say much the same: 30 of them count as one."""
+EXACT = 0.02
+"""Least spread of what profiles differ by."""
+ROUNDS = 5
+ENDS = 7 / 255
+"""Difference that a seam's fit leaves from which an object ends there: where one surface goes on, nothing was put in and no shadow is
+missing. Of assets put in it is 9 levels and more, of regions of a picture mostly 1 to 6."""
+
+
+def fitted(
+    rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor, box: Box, guess: torch.Tensor, usual: torch.Tensor
+) -> tuple[torch.Tensor, float]:
+    """Coefficients `[15]` of the change (`objects.changed`) that object `i` needs, and what its profiles then still differ by: the median.
+
+    rgb, ids  `[3, h, w]` and `[h, w]`: the box's outer part
+    edges     `[E, 4]`: pixels at the object's seam there, and the way out (`Spots.edges`)
+    guess     `[15]`, which is returned where the seam has too few profiles, which then differ infinitely
+    usual     `[15, 15]`: a root of the covariance of what objects need (`usual_changes`); of zeros, the guess is kept
+    """
+    inside, outside, row = _profiles(rgb, ids, i, edges)
+    if len(inside) < FEWEST_PROFILES:
+        return guess, float("inf")
+    height = box.placed(row + box.outer_rows.start, torch.zeros_like(row))[:, 0]
+    does = effects(inside, height)
+    left = outside - inside - does @ guess
+    found, off = _robust(does @ usual, left)
+    return guess + usual @ found, float(off.median().sqrt())
+
+
+def _robust(does: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """How much of each usual change `[15]`, by what each of them does to colours `[N, 3, 15]` and what these miss `[N, 3]`; and the mean
+    squares `[N]` that are left. Reweighted least squares (Cauchy's), for a spread that the profiles themselves show."""
+    flat, missing = does.flatten(0, 1), missing.flatten()
+    pull = PULL * torch.eye(COEFFICIENTS, device=does.device)
+    off = missing.new_zeros(len(does))
+    spread = missing.view(-1, 3).square().mean(1).median().clamp_min(EXACT**2)
+    for _ in range(ROUNDS):
+        weighted = flat / (off + spread).repeat_interleave(3)[:, None]
+        found = torch.linalg.solve(weighted.T @ flat + pull, weighted.T @ missing)
+        off = (flat @ found - missing).view(-1, 3).square().mean(1)
+        spread = (1.5 * off.median()).clamp_min(EXACT**2)
+    return found, off
+
+
+def _profiles(rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Colours inside and outside the seam `[N, 3]`, of profiles that lie in the picture and meet no other object; their rows `[N]`."""
+    h, w = ids.shape
+    edges = edges[torch.arange(min(PROFILES, len(edges)), device=edges.device) * len(edges) // PROFILES] if len(edges) > PROFILES else edges
+    off = torch.tensor(OFF, device=edges.device)
+    steps = torch.cat([-off, 1 + off])
+    y, x = edges[:, :1] + steps * edges[:, 2:3], edges[:, 1:2] + steps * edges[:, 3:]
+    there = ((y >= 0) & (y < h) & (x >= 0) & (x < w)).all(1)
+    y, x, row = y[there], x[there], edges[there, 0]
+    id_there = ids[y, x]
+    clear = (id_there[:, : len(OFF)] == i).all(1) & (id_there[:, len(OFF) :] <= 0).all(1)
+    colours = rgb[:, y[clear], x[clear]].permute(1, 2, 0)
+    inside, outside = colours.split(len(OFF), 1)
+    return inside.mean(1), outside.mean(1), row[clear]
+
+
+def effects(rgb: torch.Tensor, height: torch.Tensor) -> torch.Tensor:
+    """What a unit of each coefficient adds to `rgb` `[N, 3]` at `height` `[N]`, as `objects.changed` does: `[N, 3, 15]`."""
+    luma = (rgb @ rgb.new_tensor(LUMA))[:, None]
+    each = torch.stack([torch.ones_like(rgb), rgb, rgb * rgb, luma - rgb, height[:, None] * rgb], -1)
+    return (each[:, :, :, None] * torch.eye(3, device=rgb.device)[:, None]).flatten(2)
+
+
+def usual_changes(objects: Objects) -> torch.Tensor:
+    """The root of the covariance, about zero, of the coefficients that B objects need: lower triangular `[15, 15]`."""
+    needed = []
+    for given, target, height in zip(objects.given, objects.target, objects.height, strict=True):
+        does = effects(given, height).flatten(0, 1)
+        weak = 1e-4 * len(given) * torch.eye(COEFFICIENTS)
+        needed.append(torch.linalg.solve(does.T @ does + weak, does.T @ (target - given).flatten()))
+    k = torch.stack(needed)
+    return torch.linalg.cholesky(k.T @ k / len(k) + 1e-5 * torch.eye(COEFFICIENTS))

@@ -1,0 +1,1 @@
+"""The network that repairs rendered frames, and its weights on disk."""
