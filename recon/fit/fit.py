@@ -151,7 +151,8 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            closing = shown.held(there.flat_ground.on(shown), ("means", "quats")).held(shade, ("logits",))
+            movers = shown.group_of() > 0  # of one that another hides some is held by nothing else, and would close gaps in streaks
+            closing = shown.held(there.flat_ground.on(shown) | movers, ("means", "quats")).held(movers, ("log_scales", "logits"))
             (solid,) = draw(self._placed(closing, aside), aside.camera, "alpha", scale=scale_of(view, aside.camera))
             haze = haze + self.openings.gaps(solid, aside.camera)
         if known:
