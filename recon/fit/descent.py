@@ -50,9 +50,9 @@ class Descent:
         """At whose colours any picture has pulled: bool `[N]`."""
         return (self.moments[:, 1, COLOURS:] > 0).any(1)
 
-    def still_colours(self, which: torch.Tensor) -> None:
-        """Take their momentum from the colours of splats `which`, bool `[N]`."""
-        self.moments[which, 0, COLOURS:] = 0
+    def still(self, which: torch.Tensor, first: int = 0) -> None:
+        """Take their momentum from splats `which`, bool `[N]`, or from their numbers from `first` on, as `COLOURS`."""
+        self.moments[which, 0, first:] = 0
 
     def follow(self, splats: Splats, which: torch.Tensor, shown: Splats, rates: Rates, growth: Growth) -> None:
         """Move splats `which` `[M]`, which have caught up, along the gradients of `shown`, copies of theirs, and tell `growth`."""

@@ -163,9 +163,7 @@ class Fit:
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
         torch.autograd.backward([cost for cost in (whole, self.motion.unrest()) if cost.requires_grad])
-        colours = shown.fields["sh"].grad
-        if there.guessed is not None and colours is not None:
-            colours.mul_(~there.guessed[which, None, None])
+        there.keep_guesses(shown, which)
         hold_shade(shown, shade)
         value = float(loss.detach())  # before anything else is asked of the device, which the host would wait for here
         descent.follow(there.splats, which, shown, rates, there.growth)

@@ -8,15 +8,15 @@ import torch
 
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
-from recon.fit.densify import Growth, grow, joined, kept
-from recon.fit.descent import Descent
+from recon.fit.densify import Growth, grow, joined, kept, shade_of
+from recon.fit.descent import COLOURS, Descent
 from recon.fit.flat import FlatGround
 from recon.fit.halves import ROOM, halves, outdone
 from recon.fit.model import Splats
 from recon.fit.motion import Motion
 from recon.fit.reach import reach_of
 from recon.fit.swept import Swept
-from recon.fit.unseen import LOW, Shown, as_neighbours, curtains, off_ground, pennants, swollen
+from recon.fit.unseen import LOW, SEEN, Shown, as_neighbours, curtains, off_ground, pennants, swollen
 from recon.seeds.points import fewer
 from scenes.gaussians import Gaussians
 from scenes.trajectory import Trajectory
@@ -25,7 +25,7 @@ from scenes.trajectory import Trajectory
 class Population:
     """The splats of a fit, and what each carries.
 
-    splats; descent, growth: of each of them; guessed: bool `[N]`, whose colours are their neighbours', to keep; None before any is.
+    splats; descent, growth: of each of them; guessed: bool `[N]`, what no picture shows, whose colours are to stay; None before any is.
     """
 
     def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear):
@@ -64,7 +64,21 @@ class Population:
         part = self._complete(seen.part[~hang], shown)
         self.guessed = as_neighbours(self.splats, part, self.descent.coloured(), self.ground)
         self.flat_ground.lay(self.splats, self.guessed & (off_ground(self.splats, self.ground) < LOW))
-        self.descent.still_colours(self.guessed)
+        unseen_movers = (part < SEEN) & (self.splats.group_of() > 0) & ~shade_of(self.splats)
+        self.guessed |= unseen_movers
+        self.descent.still(self.guessed, COLOURS)
+        self.descent.still(unseen_movers)
+
+    def keep_guesses(self, shown: Splats, which: torch.Tensor) -> None:
+        """Take from those of splats `which` `[M]` that are guessed the gradients that would colour them, and from movers' all that there
+        are: of the street what is guessed may still close gaps, of a car another hides, rims would stretch it and a gap behind it, too."""
+        if self.guessed is None:
+            return
+        guessed = self.guessed[which]
+        for name, field in shown.fields.items():
+            if field.grad is not None:
+                still = guessed if name == "sh" else guessed & (shown.group_of() > 0)
+                field.grad.mul_(~still.view(-1, *[1] * (field.ndim - 1)))
 
     def _complete(self, part: torch.Tensor, shown: Callable[[], Shown]) -> torch.Tensor:
         """Give vehicles the halves that no picture shows. part: what pictures show of each splat `[N]`; returned of all there are then."""

@@ -93,7 +93,7 @@ def test_it_is_known_whose_colours_were_pulled_at():
     follow(descent, ours, everything, gradients, 1)
     assert torch.equal(descent.coloured(), everything >= 25)
     before = ours.fields["sh"].clone()
-    descent.still_colours(everything >= 30)
+    descent.still(everything >= 30, COLOURS)
     descent.catch_up(ours, everything, 4, rates_at(9, RATES, FADE))
     moved = (ours.fields["sh"] != before).any(2).any(1)
     assert torch.equal(descent.coloured(), everything >= 25) and torch.equal(moved, (everything >= 25) & (everything < 30))

@@ -195,9 +195,13 @@ def test_a_fit_keeps_them_to_its_end(drive):
     assert fit.progress == pytest.approx(GUESSED_FROM, abs=1.5 / CONFIG.steps)
     some = fit.population.guessed
     assert 0 < some.float().mean() < 0.7  # half of so small a scene is street that no picture shows
-    before = {name: field.clone() for name, field in fit.splats.fields.items()}
+    before, of_movers = {name: field.clone() for name, field in fit.splats.fields.items()}, fit.splats.group_of() > 0
+    assert (some & of_movers).sum() > 10
     while fit.step_count < CONFIG.steps:
         fit.step()
     after = fit.splats.fields
     assert torch.equal(after["sh"][some], before["sh"][some]), "their colours rest"
-    assert not torch.equal(after["sh"][~some], before["sh"][~some]) and not torch.equal(after["means"][some], before["means"][some])
+    for name in ("means", "quats", "log_scales"):
+        assert torch.equal(after[name][some & of_movers], before[name][some & of_movers]), "and movers' altogether"
+    street, known = some & ~of_movers, ~some
+    assert not torch.equal(after["sh"][known], before["sh"][known]) and not torch.equal(after["means"][street], before["means"][street])
