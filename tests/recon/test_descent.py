@@ -4,7 +4,7 @@ import torch
 from randomized import gaussians
 
 from recon.fit.densify import LARGEST, LONGEST, THINNEST, Growth
-from recon.fit.descent import Descent, rates_at
+from recon.fit.descent import COLOURS, Descent, rates_at
 from recon.fit.model import Splats
 
 RATES = {"means": 1e-3, "quats": 2e-3, "log_scales": 1e-4, "logits": 4e-2, "colours": 5e-3, "harmonics": 5e-4}
