@@ -18,6 +18,7 @@ from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import translation
 from tests.recon.test_fit import CONFIG, SIZE
+from tests.recon.test_flanks import an_end
 
 BOX = np.array([4.0, 2.0, 1.5])
 
@@ -54,6 +55,15 @@ def test_a_side_that_pictures_show_is_mirrored_where_the_other_is_not_known():
     assert more[1].means[:, 1].tolist() == pytest.approx([-0.9] * len(more[1]))
     assert float(more[1].means[:, 0].max()) == pytest.approx(1.0 - THERE, abs=0.06), "up to what is known of it"
     assert torch.equal(more[1].sh[0, 0], left.sh[0, 0]) and (reach[1] == 20.0).all()
+
+
+def test_a_car_that_is_seen_from_behind_has_sides_and_a_walker_has_none():
+    rear = an_end(-1.9)
+    splats = of(panel(5.0), rear, rear)
+    more, reach = halves(splats, torch.full((len(splats),), 0.5), [track("veh_1"), track("ped_1", "pedestrian")])
+    sides = more[1].means
+    assert len(sides) == len(reach[1]) > 100 and (reach[1] >= 20.0).all() and len(more[2]) == 0
+    assert float(sides[:, 0].max()) > 1.5 and (sides[:, 1].abs() > 0.8).all()
 
 
 def test_who_walks_and_what_is_hardly_known_have_no_halves():
