@@ -1,6 +1,7 @@
 """The house stands: imports run one way, and what must be light is light."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 COMMANDS = ["recon", "assets", "insert", "edit", "render", "pairs", "train", "enhance", "convert", "info", "validate", "doctor", "demo"]
 ORDER = ["scenes", "render", "recon", "enhance"]
+PAGES = [page for room in ("", *ORDER, "tests", "examples") for page in (REPOSITORY / room).glob("**/*.md" if room else "*.md")]
 
 
 def imported_packages(path: Path) -> set[str]:
@@ -74,3 +76,20 @@ def test_help_and_usage_errors_load_nothing_heavy(arguments):
     code = "import sys, sidestep\ntry: sidestep.main(sys.argv[1:])\nexcept SystemExit as end: print('ENDED', end.code)"
     modules, _ = loaded(code, *arguments)
     assert not modules & {"torch", "numpy", "warp", "scenes.gaussians", "PIL", "av"}
+
+
+def headings(page: Path) -> set[str]:
+    """Of a page, as GitHub names them in links."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_in_the_pages_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" not in target:
+            path, _, heading = target.partition("#")
+            there = (page.parent / path).resolve() if path else page
+            assert there.exists(), target
+            assert not heading or heading in headings(there), target
