@@ -33,8 +33,9 @@ NOISE, TELLING = 0.1, 4
 GROUND, BARE = 1, 2
 """What is known of a cell (`shown_ground`)."""
 
-CLEAR, STRAY = (0.15, 1.5), 0.02
-"""Metres above the ground between which nothing may stand where it is bare, and points that may, of those that lie on it: lidar strays."""
+LEAST, MOST_OFF, STRAY = 0.15, 1.5, 0.02
+"""Metres off the ground between which nothing is above it where it is bare, and below it where it is known: at a step it is neither. And
+how many points are there all the same, in parts of those that lie on it."""
 
 STEEPEST = 0.2
 """Metres by which ground may rise or fall with every metre away from the path."""
@@ -73,8 +74,8 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
 
 
 def shown_ground(points: np.ndarray, ground: Ground) -> torch.Tensor:
-    """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it, `BARE` where
-    besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess."""
+    """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it and next to none
+    below, `BARE` where besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess."""
     at = (points[:, :2] - np.array(ground.origin)) / ground.cell
     column, row = np.round(at).astype(np.int64).T
     rows, columns = ground.heights.shape
@@ -85,9 +86,12 @@ def shown_ground(points: np.ndarray, ground: Ground) -> torch.Tensor:
         which = which & inside
         return np.bincount(row[which] * columns + column[which], minlength=rows * columns).reshape(rows, columns)
 
-    lying, standing = count(np.abs(off) < NOISE), count((off > CLEAR[0]) & (off < CLEAR[1]))
+    lying, standing, below = (
+        count(which) for which in (np.abs(off) < NOISE, (off > LEAST) & (off < MOST_OFF), (-off > LEAST) & (-off < MOST_OFF))
+    )
     stands = ndimage.binary_dilation(standing > STRAY * lying, np.ones((3, 3)))
-    return torch.from_numpy(np.where(lying >= TELLING, np.where(stands, GROUND, BARE), 0).astype(np.uint8))
+    known = (lying >= TELLING) & (below <= STRAY * lying)
+    return torch.from_numpy(np.where(known, np.where(stands, GROUND, BARE), 0).astype(np.uint8))
 
 
 def _noise_under(points: np.ndarray, place: np.ndarray, ground: Ground) -> torch.Tensor:

@@ -148,7 +148,7 @@ def prepare(
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
     told_gains = tuple(v.gain for v in frames.views)
-    ground_shown = shown_ground(split.static if sparse is None else cloud.xyz, ground)
+    ground_shown = shown_ground(split.static, ground)  # by lidar alone: points from pictures are as far off as what it is to mend
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(measured), swept, told_gains)
 
 

@@ -194,3 +194,8 @@ class Placed:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_pose(getattr(self, name)))
                 check_tensor(name, getattr(self, name), (4, 4), torch.float64)
+
+    def detach(self) -> Placed:
+        end = self.world_from_local_end
+        poses = (self.world_from_local.detach(), None if end is None else end.detach())
+        return replace(self, gaussians=self.gaussians.detach(), world_from_local=poses[0], world_from_local_end=poses[1])

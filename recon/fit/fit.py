@@ -44,7 +44,8 @@ BLAME_EVERY = 3
 """Every how many steps it is found out which splats show what is wrong, as long as some are added."""
 
 GUESSED_FROM = 0.8
-"""Part of the fit from which splats that pictures hardly show keep their neighbours' colours; the others are fitted on around them."""
+"""Part of the fit from which splats that pictures hardly show keep their neighbours' colours, and movers' rest; the others are fitted on
+around them."""
 
 CLIPPED = 0.99
 """Colours of pictures from which on they may be clipped."""
@@ -151,9 +152,8 @@ class Fit:
             wrong = (rgb.detach() - target).abs().mean(-1)
             haze = haze + (drawn["features"][..., 0] * wrong).sum()  # nothing, whose gradient says who shows errors
         if aside is not None:
-            movers = shown.group_of() > 0  # of one that another hides some is held by nothing else, and would close gaps in streaks
-            closing = shown.held(there.flat_ground.on(shown) | movers, ("means", "quats")).held(movers, ("log_scales", "logits"))
-            (solid,) = draw(self._placed(closing, aside), aside.camera, "alpha", scale=scale_of(view, aside.camera))
+            closing = self._placed(shown.held(there.flat_ground.on(shown), ("means", "quats")), aside)
+            (solid,) = draw(street_alone(closing), aside.camera, "alpha", scale=scale_of(view, aside.camera))
             haze = haze + self.openings.gaps(solid, aside.camera)
         if known:
             weights, depths = zip(*known, strict=True)
@@ -338,6 +338,12 @@ class Fit:
         self.turns.due = state["due"]
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
+
+
+def street_alone(placed: Sequence[Placed]) -> list[Placed]:
+    """The same, but only the background is differentiated: what another car hides of a mover is held by nothing else, and asked to close
+    gaps it would stretch into streaks."""
+    return [p if p.instance == 0 else p.detach() for p in placed]
 
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:

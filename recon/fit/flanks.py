@@ -7,11 +7,13 @@ height: paint, glass and bumper go round the corner, lamps and a plate do not. A
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.mirror import SOLID
+from recon.mirror import FEWEST, SOLID
 from recon.outline import outline
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
@@ -26,8 +28,8 @@ WIDE, THICK, LOGIT = 0.6, 0.02, 3.0
 """Their standard deviations along these two, in what is between them, and in metres across; the logit of their opacity."""
 
 THERE, OPEN = 0.12, 0.3
-"""Metres along and up within which something known of the outer half tells that a side is there, and the part of it that is not, from which
-on it is taken as never seen."""
+"""Metres along and up within which something known of the outer half tells that a side is there, and the part of it that is not there from
+which on the rest is made."""
 
 BONNET, BONNETED = ((0.6, 1.0), (0.28, 0.05)), {"car", "pickup", "vehicle"}
 """Parts of the height, and how far ahead of the middle vehicles reach there, in lengths, of those classes that end in a bonnet."""
@@ -37,19 +39,20 @@ COLUMN = 0.1
 
 
 def flanks(known: Gaussians, size: np.ndarray, label: str) -> Gaussians:
-    """Splats for those sides of a vehicle in a box `[length, width, height]` of which next to nothing is `known`, by its rear or front,
-    whichever more is known of."""
+    """Splats for what is not `known` of those sides of a vehicle in a box `[length, width, height]` of which more than `OPEN` is not, by
+    its rear or front, whichever more is known of; none where neither is."""
     solid = known.select(torch.sigmoid(known.logit_opacities) > SOLID)
     means, colours = solid.means.double().cpu().numpy(), rgb_from_sh(solid.sh[:, 0]).double().cpu().numpy()
     at_ends = {end: means[:, 0] * end > size[0] / 2 - END for end in (1.0, -1.0)}
     end = max(at_ends, key=lambda end: int(at_ends[end].sum()))
-    shape = outline(means * [end, 1, 1], size)
-    if shape is None:
+    shape = outline(means[means[:, 0] * end > 0] * [end, 1, 1], size)
+    if shape is None or at_ends[end].sum() < FEWEST:
         return Gaussians.empty(known.sh.shape[1])
     places, rgb = [], []
     for z in np.arange(shape[0][0], shape[0][-1], UP):
         ahead, half = (float(np.interp(z, shape[0], reach)) for reach in shape[1:])
-        x = np.arange(ahead - WIDE * ALONG, -_other_end(z / size[2], end, label) * size[0], -ALONG)
+        first, last = ahead - WIDE * ALONG, WIDE * ALONG - _other_end(z / size[2], end, label) * size[0]
+        x = np.linspace(first, last, max(0, math.ceil((first - last) / ALONG) + 1))
         places.append(np.stack([x * end, np.full(len(x), half), np.full(len(x), z)], 1))
         rgb.append(np.tile(_middle_colour(means, colours, z, at_ends[end]), (len(x), 1)))
     left, made = np.concatenate(places), []

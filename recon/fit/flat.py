@@ -31,8 +31,9 @@ ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
 
 UNDER, OVER = 1.0, 0.3
-"""The same below where lidar shows the ground, and above where it shows it bare (`recon.ground.shown_ground`): nothing else is there. What
-pictures of a straight drive leave there is a fifth of what they show of the road, and from 2 m aside as far off as it is deep."""
+"""`ON`, but below the ground where lidar shows it, and above where it shows it bare (`recon.ground.shown_ground`): nothing else is there,
+however thick. What pictures of a straight drive leave there is a sixth of what they show of the road, and from 2 m aside as far off as it
+is deep."""
 
 NEAR = 0.3
 """Metres from the ground within which what hides a gap there is the street, and stays where and as it lies."""

@@ -1,7 +1,7 @@
-"""The side of a vehicle that no picture shows: the mirror image of the other.
+"""The side of a vehicle that no picture shows: the mirror image of the other, or where neither is known its end drawn along it (`flanks`).
 
 A car ahead is half hidden by the one that the recording car follows; what stands there is left of how the fit began, or nothing does, and
-from aside that shows. A mirror image is taken where no picture shows it either.
+from aside that shows. Both are taken where no picture shows them either.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from recon.tracks import VEHICLES
 from scenes.gaussians import Gaussians
 
 INSTEAD = 0.3
-"""Metres from a mirror image within which it stands for what no picture shows."""
+"""Metres from a mirror image or side within which it stands for what no picture shows."""
 
 ROOM = 0.02
 """Of the splat budget that is kept for halves and sides."""

@@ -25,7 +25,8 @@ from scenes.trajectory import Trajectory
 class Population:
     """The splats of a fit, and what each carries.
 
-    splats; descent, growth: of each of them; guessed: bool `[N]`, what no picture shows, whose colours are to stay; None before any is.
+    splats; descent, growth: of each of them; guessed: bool `[N]`, what no picture shows: it keeps its colours, and
+    movers' all that it is; None before any is.
     """
 
     def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear):
@@ -54,8 +55,8 @@ class Population:
 
     @torch.no_grad()
     def guess(self, shown: Callable[[], Shown]) -> None:
-        """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray is gone. shown:
-        what pictures show of the splats there are by then."""
+        """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray, hangs or swelled
+        is gone; of movers it rests from then on. shown: what pictures show of the splats there are by then."""
         self.drop(self.swept.holds(self.splats) | self.clear.holds(self.splats))
         seen = shown()
         hang = curtains(self.splats, seen.inside, self.descent.coloured(), self.ground) | pennants(self.splats, seen, self.ground)
@@ -70,18 +71,21 @@ class Population:
         self.descent.still(unseen_movers)
 
     def keep_guesses(self, shown: Splats, which: torch.Tensor) -> None:
-        """Take from those of splats `which` `[M]` that are guessed the gradients that would colour them, and from movers' all that there
-        are: of the street what is guessed may still close gaps, of a car another hides, rims would stretch it and a gap behind it, too."""
+        """Take gradients from those of splats `which` `[M]` that are guessed: of the street those that would colour them, since it may
+        still grow to close gaps, of movers all, since the rims by which they are seen would stretch them."""
         if self.guessed is None:
             return
         guessed = self.guessed[which]
+        movers = guessed.clone()
+        movers[: shown.sizes[0]] = False
         for name, field in shown.fields.items():
             if field.grad is not None:
-                still = guessed if name == "sh" else guessed & (shown.group_of() > 0)
-                field.grad.mul_(~still.view(-1, *[1] * (field.ndim - 1)))
+                still = guessed if name == "sh" else movers
+                field.grad.masked_fill_(still.view(-1, *[1] * (field.ndim - 1)), 0.0)
 
     def _complete(self, part: torch.Tensor, shown: Callable[[], Shown]) -> torch.Tensor:
-        """Give vehicles the halves that no picture shows. part: what pictures show of each splat `[N]`; returned of all there are then."""
+        """Give vehicles the halves and sides that no picture shows. part: what pictures show of each splat `[N]`; returned of all there
+        are then."""
         more, reach = halves(self.splats, part, self.motion.tracks)
         if not any(map(len, more)):
             return part

@@ -29,9 +29,10 @@ def press(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
-    """Of splats `which`, those of the first `count` that moved `now`, are less than `near` says below and above the ground, and no thicker
-    than it says above, lose `part` of their extent along its normal, and `pull` of how far they are above what lies `sunk` below it, along
-    the ray to the eye. Those that no picture has pulled at, as moments from `colour` on tell, lose another part, however thick they are.
+    """Of splats `which`, those of the first `count` that moved `now`, are less than `near` says, metres below and above, from the ground,
+    and no thicker than it says above, lose `part` of their extent along its normal, and `pull` of how far they are above what lies `sunk`
+    below it, along the ray to the eye. Those that no picture has pulled at, as moments from `colour` on tell, lose another part, however
+    thick they are.
 
     With D = 1 - part n n^T a covariance becomes D C D, to first order in `part`: in the splat's own axes its diagonal is what its scales
     lose, and the rest is a turn of its axes.

@@ -75,3 +75,16 @@ def test_of_little_or_nothing_no_side_is_made():
     end = an_end(-2.2)
     for known in (Gaussians.empty(4), end.select(torch.arange(30))):
         assert len(flanks(known, BOX, "car")) == 0
+
+
+def test_of_a_long_one_whose_middle_alone_is_known_no_side_is_made():
+    size, middle = np.array([12.0, 2.5, 3.2]), a_side(0.9, (-3.0, 3.0))
+    for known in (middle, Gaussians.cat([middle, solid([[5.8, 0.9, 1.0]], 0.3)])):
+        assert len(flanks(known, size, "truck")) == 0
+
+
+@pytest.mark.parametrize("label", ["car", "van"])
+def test_sides_end_where_the_vehicle_does(label):
+    made = flanks(an_end(-2.2), BOX, label)
+    reach = made.means[:, 0].abs() + made.log_scales[:, 0].exp()
+    assert float(reach.max()) < BOX[0] / 2 + 0.05

@@ -2,6 +2,7 @@ import numpy as np
 import torch
 
 from recon.ground import BARE, GROUND, MOST, estimate_ground, shown_ground
+from scenes.ground import Ground
 from scenes.poses import translation
 from scenes.trajectory import Trajectory
 
@@ -45,6 +46,25 @@ def test_a_street_is_bare_where_lidar_shows_it_and_nothing_on_it():
     assert at(10, 4) == at(7.4, 4) == at(0, 10) == GROUND, "below a car, next to it, at a kerb"
     assert at(0, -8) == BARE, "below a wire"
     assert at(40, 15) == 0, "where lidar shows nothing, nothing is known"
+
+
+def test_beside_a_step_nothing_is_known_of_the_ground():
+    """Between its heights there is none, and what stands below would be drawn up."""
+    generator = np.random.default_rng(4)
+    xy = generator.uniform([-10, -10], [10, 10], (400_000, 2))
+    points = np.column_stack([xy, np.where(xy[:, 1] > 3, -0.6, 0.0) + generator.normal(0, 0.01, len(xy))])
+    y, x = np.meshgrid(np.arange(-8, 8.01, 0.5), np.arange(-8, 8.01, 0.5), indexing="ij")
+    ground = Ground(torch.from_numpy(np.where(y > 3, -0.6, 0.0)).float(), (-8.0, -8.0), 0.5)
+    shown = shown_ground(points, ground)
+    rows = [round((height + 8) / 0.5) for height in (0.0, 3.0, 3.5, 6.0)]
+    assert [set(shown[row, 1:-1].tolist()) <= {BARE} for row in rows] == [True, False, False, True]
+    assert 0 in shown[rows[2], 1:-1].tolist() + shown[rows[1], 1:-1].tolist()
+
+
+def test_of_no_points_nothing_is_known():
+    ground = Ground(torch.zeros(4, 4), (0.0, 0.0), 1.0)
+    for points in (np.zeros((0, 3)), np.full((5, 3), 100.0)):
+        assert not shown_ground(points, ground).any()
 
 
 def test_every_cell_is_filled_even_far_from_any_point():

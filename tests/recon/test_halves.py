@@ -119,6 +119,6 @@ def test_a_fit_completes_what_it_knows_one_side_of_and_changes_no_picture(drive,
     mine = fit.splats.group_of() == car
     left = (fit.splats.fields["means"][mine][:, None] == half[None]).all(2).any(1)
     assert 10 < left.sum() < len(half)
-    assert (part[mine][left] < SEEN).float().mean() > 0.8, "of which pictures show nothing, or no more once others are gone"
+    assert (part[mine][left] < SEEN).float().mean() > 0.8, "nothing, but for what others hid that are gone"
     assert max(float((a - b).abs().mean()) for a, b in zip(pictures, after, strict=True)) < 0.01
     fit.step()

@@ -201,7 +201,7 @@ def test_a_fit_keeps_them_to_its_end(drive):
         fit.step()
     after = fit.splats.fields
     assert torch.equal(after["sh"][some], before["sh"][some]), "their colours rest"
-    for name in ("means", "quats", "log_scales"):
+    for name in ("means", "quats", "log_scales", "logits"):
         assert torch.equal(after[name][some & of_movers], before[name][some & of_movers]), "and movers' altogether"
     street, known = some & ~of_movers, ~some
     assert not torch.equal(after["sh"][known], before["sh"][known]) and not torch.equal(after["means"][street], before["means"][street])
