@@ -7,7 +7,12 @@ demo: .venv/installed
 
 test: .venv/installed
 	$(BIN)/ruff check .
+	@$(MAKE) --no-print-directory -j2 types behaviour
+
+types: .venv/installed
 	$(BIN)/mypy
+
+behaviour: .venv/installed
 	$(BIN)/pytest -q -n auto --maxprocesses 4 --dist worksteal
 
 .venv/installed: pyproject.toml constraints.txt
@@ -16,4 +21,4 @@ test: .venv/installed
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	@touch $@
 
-.PHONY: demo test
+.PHONY: demo test types behaviour
