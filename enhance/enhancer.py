@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
+from enhance.alike import alike, thin
 from enhance.correcting.corrections import Corrections, correct
 from enhance.network.net import MULTIPLE, Net, photos_of
-from enhance.network.past import Past, alike, thin
+from enhance.network.past import Past
 from enhance.network.precision import channels_last, has_bfloat16
 from enhance.network.weights_file import BUILTIN, REPAIR_GAIN, WORTH, is_net, load_net
 from enhance.step import Steps, checked

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.alike import LONG, alike
 from enhance.correcting.colour_map import SAME, Colours, Map
 from enhance.correcting.grain import Excess, Grain, without
 from enhance.correcting.objects import LUMA
-from enhance.network.past import LONG, alike
+from enhance.photos import frames_of, shrunk
 from enhance.step import Steps, check_rgb, checked
-from enhance.training.samples import frames_of, shrunk
 from render.frame_types import Frame
 from scenes.pictures import PICTURES
 

@@ -18,8 +18,11 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional as F
 
+from enhance.batch import Batch
 from enhance.correcting.shade import DOWN, SEEN, ShadeNet, at_most
-from enhance.training.ahead import Batch
+
+PIXELS = 384
+"""Pixels of an object by which a correction is judged."""
 
 SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
 """How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
@@ -53,6 +56,16 @@ class Evidence(Batch):
     @classmethod
     def stacked(cls, parts: list[Evidence]) -> Evidence:
         return cls(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Objects(Batch):
+    """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
+
+    evidence: Evidence
+    given: torch.Tensor
+    target: torch.Tensor
+    height: torch.Tensor
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from enhance.correcting.objects import COEFFICIENTS, LUMA, Box
-from enhance.training.object_samples import Objects
+from enhance.correcting.objects import COEFFICIENTS, LUMA, Box, Objects
 
 PROFILES = 512
 """Most profiles across a seam that are read."""

@@ -14,7 +14,7 @@ from enhance.pairs.isp import alter, random_pipeline
 from enhance.pairs.make import claim
 from enhance.pairs.masks import random_mask
 from enhance.pairs.shards import to_bytes, write_shard
-from enhance.training.samples import Photos
+from enhance.photos import Photos
 
 STRIDE = 8
 

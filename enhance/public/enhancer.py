@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional as F
 
-from enhance.network.past import alike
+from enhance.alike import alike
 from enhance.network.precision import channels_last, has_bfloat16
 from enhance.public.model import Model
 from enhance.step import checked

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from enhance.network.past import alike, thin
+from enhance.alike import alike, thin
 from enhance.public.filters import FILTERS, harmonized
 from enhance.public.layout import fill, finite
 from enhance.step import checked

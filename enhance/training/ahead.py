@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
 from itertools import count
 from typing import Any, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-T = TypeVar("T", bound="Batch")
+from enhance.batch import Batch
+
+T = TypeVar("T", bound=Batch)
 DEEP = 2
 """Batches that each process may be ahead."""
-
-
-class Batch:
-    """A frozen dataclass of tensors and other batches, that goes to a device as one."""
-
-    def each(self: T, change: Callable[[Any], Any]) -> T:
-        """With every tensor changed."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]  # the subclasses are dataclasses
-        return replace(self, **{k: v.each(change) if isinstance(v, Batch) else change(v) for k, v in values.items()})  # type: ignore[type-var]
-
-    def pin_memory(self: T) -> T:
-        """Under the name that torch's loader asks for: from pinned memory a copy to the GPU does not wait for it."""
-        return self.each(torch.Tensor.pin_memory)
-
-    def to(self: T, device: torch.device) -> T:
-        return self.each(lambda x: x.to(device, non_blocking=True))
 
 
 def workers(device: torch.device) -> int:

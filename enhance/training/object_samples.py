@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.correcting.objects import Box, Evidence, boxes, evidence, grid_of, reaching_over, spots, whole_of
+from enhance.correcting.objects import PIXELS, Box, Evidence, Objects, boxes, evidence, grid_of, reaching_over, spots, whole_of
 from enhance.pairs.isp import alter, random_isp
 from enhance.pairs.masks import random_mask
 from enhance.pairs.shards import RENDERED, Shard
-from enhance.training.ahead import Batch
 
-PIXELS = 384
-"""Pixels of an object by which a correction is judged."""
 STORED = {"relight": 0.2, "reinsert": 0.1, "shadow": 0.12}
 """How often objects are drawn whose damage is stored: relit and re-inserted ones; and placed ones, right as they are."""
 RENDERED_ONES = 0.25  # how often a picture is a rendering and no photo, as where the enhancer is used
@@ -25,16 +21,6 @@ WHOLE = 0.12  # how often it is the whole picture, which only right pictures tel
 COARSE = 4  # how much smaller than the picture that region is drawn
 VARIANTS = 3  # how often an object is used, each time in other colours
 RIGHT = 0.35  # how often an object is right as it is
-
-
-@dataclass(frozen=True)
-class Objects(Batch):
-    """Evidence of B objects, and pixels `[B, PIXELS, 3]` as given and as they should be, at `height` `[B, PIXELS]` in the box."""
-
-    evidence: Evidence
-    given: torch.Tensor
-    target: torch.Tensor
-    height: torch.Tensor
 
 
 class ObjectSampler:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.batch import Batch
 from enhance.pairs.isp import random_isp
 from enhance.pairs.shards import KINDS, RENDERED, PairSet, Shard, Window
-from enhance.training.ahead import Batch
+from enhance.photos import Photos
 from enhance.training.object_samples import Objects, ObjectSampler
 from enhance.training.shade_samples import Grounds, ShadeSampler
-from render.video import read_image, read_video
-from scenes.pictures import PICTURES
-from scenes.spread import spread
 
 KIND_WEIGHTS = {"underfit": 0.4, "sparse": 0.3, "cycle": 0.2, "crossref": 0.1}
 """How often the network sees rendered kinds; most of what crossref lacks nobody can know."""
@@ -48,33 +44,6 @@ class Images(Batch):
     """Pictures `[B, 3, h, w]`."""
 
     rgb: torch.Tensor
-
-
-SMALLEST = 16
-"""Pixels of a photo's shorter side, at least."""
-
-
-class Photos:
-    """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
-
-    def __init__(self, paths: tuple[str | Path, ...], stride: int = 8, width: int = 960):
-        self.frames: list[np.ndarray] = []
-        for path in map(Path, paths):
-            before = len(self.frames)
-            for frame in frames_of(path, stride):
-                if min(frame.shape[:2]) < SMALLEST:
-                    raise ValueError(f"{path} holds a picture of {frame.shape[1]}x{frame.shape[0]} pixels, too small to tell; leave it out")
-                self.frames.append((shrunk(frame, width) * 255).round().to(torch.uint8).numpy())
-            if len(self.frames) == before:
-                raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PICTURES)} or a video")
-
-    def crop(self, rng: np.random.Generator, size: int) -> torch.Tensor:
-        """A crop `[3, size, size]` of one photo, as it is or shrunk."""
-        photo = self.frames[rng.integers(len(self.frames))]
-        n = int(size * min(float(rng.choice([1.0, 1.0, 1.5, 2.0])), min(photo.shape[:2]) / size))
-        y, x = (int(rng.integers(side - n + 1)) for side in photo.shape[:2])
-        rgb = torch.from_numpy(photo[y : y + n, x : x + n]).permute(2, 0, 1).float() / 255
-        return rgb if n == size else F.interpolate(rgb[None], (size, size), mode="area")[0]
 
 
 class Sampler:
@@ -183,22 +152,3 @@ def _flipped(rng: np.random.Generator, sample: Sample) -> Sample:
     turned = {f.name: getattr(sample, f.name).flip(-1) for f in fields(Sample)}
     turned["flow"] = turned["flow"] * torch.tensor([-1.0, 1.0])[:, None, None]
     return Sample(**turned)
-
-
-def frames_of(path: Path, stride: int, most: int | None = None) -> Iterator[torch.Tensor]:
-    """Of a picture that, of a folder its pictures, `most` of them spread over all, of a video every `stride`-th frame: `[H, W, 3]`."""
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
-        yield from map(read_image, files if most is None else spread(files, most))
-    elif path.suffix.lower() in PICTURES:
-        yield read_image(path)
-    else:
-        yield from islice(read_video(path), 0, None, stride)
-
-
-def shrunk(frame: torch.Tensor, width: int) -> torch.Tensor:
-    """A picture `[H, W, 3]` that is at most so wide; a photo is never enlarged."""
-    h, w = frame.shape[:2]
-    if w <= width:
-        return frame
-    return F.interpolate(frame.permute(2, 0, 1)[None], (round(h * width / w), width), mode="area")[0].permute(1, 2, 0)

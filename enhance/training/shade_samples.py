@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from enhance.batch import Batch
 from enhance.correcting.objects import boxes
 from enhance.correcting.shade import read_ground
 from enhance.pairs.isp import random_isp
 from enhance.pairs.shards import Shard
-from enhance.training.ahead import Batch
 
 PIXELS = 256
 """Pixels of the ground by which a shadow is judged."""

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.correcting.objects import changed
+from enhance.batch import Batch
+from enhance.correcting.objects import Objects, changed
 from enhance.correcting.seam import usual_changes
 from enhance.correcting.shade import optical_depth, shaded
 from enhance.network.net import Net, NetConfig, photos_of
@@ -28,13 +29,13 @@ from enhance.network.past import Past
 from enhance.network.precision import autocast
 from enhance.network.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
 from enhance.pairs.shards import RENDERED, PairSet
-from enhance.training.ahead import Batch, drawn, workers
+from enhance.photos import Photos
+from enhance.training.ahead import drawn, workers
 from enhance.training.gain import repair_gain
 from enhance.training.losses import PatchPerceptual, flicker, pixel_loss
-from enhance.training.object_samples import Objects
 from enhance.training.prior import flow_matching_loss
 from enhance.training.run import FROZEN, FURTHER, STAGES, Run, TrainConfig, opened
-from enhance.training.samples import Images, Photos, Sample, Sampler
+from enhance.training.samples import Images, Sample, Sampler
 from enhance.training.shade_samples import Grounds
 from scenes.atomic import made_folder
 from scenes.names import unknown

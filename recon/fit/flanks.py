@@ -55,13 +55,13 @@ def flanks(known: Gaussians, size: np.ndarray, label: str) -> Gaussians:
         x = np.linspace(first, last, max(0, math.ceil((first - last) / ALONG) + 1))
         places.append(np.stack([x * end, np.full(len(x), half), np.full(len(x), z)], 1))
         rgb.append(np.tile(_middle_colour(means, colours, z, at_ends[end]), (len(x), 1)))
-    left, made = np.concatenate(places), []
+    left, colour, made = np.concatenate(places), np.concatenate(rgb), []
     for side in (1.0, -1.0):
         outer = means[means[:, 1] * side > left[:, 1].max(initial=0) / 2]
         away = cKDTree(outer[:, [0, 2]]).query(left[:, [0, 2]])[0] if len(outer) else np.full(len(left), np.inf)
         lacking = away > THERE
         if len(left) and lacking.mean() > OPEN:
-            made.append(_panels(left[lacking] * [1, side, 1], np.concatenate(rgb)[lacking], known.sh.shape[1]))
+            made.append(_panels(left[lacking] * [1, side, 1], colour[lacking], known.sh.shape[1]))
     return Gaussians.cat(made) if made else Gaussians.empty(known.sh.shape[1])
 
 

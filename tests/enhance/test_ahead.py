@@ -5,8 +5,10 @@ from itertools import islice
 import pytest
 import torch
 
-from enhance.training.ahead import Batch, drawn
-from enhance.training.samples import Photos, Sampler
+from enhance.batch import Batch
+from enhance.photos import Photos
+from enhance.training.ahead import drawn
+from enhance.training.samples import Sampler
 from render.video import write_image
 
 CPU = torch.device("cpu")

@@ -9,6 +9,7 @@ from enhance.correcting.corrections import STEADY, Correction, correct
 from enhance.correcting.objects import (
     COEFFICIENTS,
     FEWEST,
+    PIXELS,
     REACH,
     SEAM,
     Evidence,
@@ -22,7 +23,7 @@ from enhance.correcting.objects import (
 )
 from enhance.correcting.shade import KNOTS
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
-from enhance.training.object_samples import PIXELS, ObjectSampler
+from enhance.training.object_samples import ObjectSampler
 from render import render_clip
 from scenes import Databank, load
 from scenes.insert import insert

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from enhance.alike import thin
 from enhance.flow import shrink_flow
-from enhance.network.past import Past, thin
+from enhance.network.past import Past
 
 
 def constant_flow(x, y, h=10, w=14):

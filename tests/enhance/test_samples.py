@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from enhance.pairs.shards import PairSet, to_bytes, write_shard
-from enhance.training.samples import Photos, Sampler
+from enhance.photos import Photos
+from enhance.training.samples import Sampler
 from render.video import write_image
 
 

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from enhance.correcting.objects import COEFFICIENTS, _edges, boxes, changed
+from enhance.correcting.objects import COEFFICIENTS, Objects, _edges, boxes, changed
 from enhance.correcting.seam import ENDS, effects, fitted, usual_changes
 from enhance.pairs.isp import Isp, alter
-from enhance.training.object_samples import Objects
 
 NOTHING = torch.zeros(COEFFICIENTS)
 BROAD = 0.5 * torch.eye(COEFFICIENTS)
