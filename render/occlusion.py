@@ -48,6 +48,13 @@ class Box:
         axes = torch.stack([self.low, self.high], 1).double()
         return torch.cartesian_prod(*axes)
 
+    def edges(self, count: int) -> torch.Tensor:
+        """float64 `[12 count, 3]`: places along each edge, its corners among them."""
+        corners = self.corners()  # the bits of a corner's index say on which side of the box it is
+        begins, ends = zip(*((i, i | side) for side in (1, 2, 4) for i in range(8) if not i & side), strict=True)
+        along = torch.linspace(0, 1, count, dtype=torch.float64)[:, None, None]
+        return torch.lerp(corners[list(begins)], corners[list(ends)], along).reshape(-1, 3)
+
 
 @dataclass(frozen=True)
 class Field:

@@ -96,9 +96,9 @@ class Scene:
         here = [(i, a) for i, a in enumerate(self.actors) if a.trajectory.covers(time_us)]
         poses = all_at([a.trajectory for _, a in here], time_us)
         gain = self.followed(time_us)
+        splats = [dimmed(a.asset.gaussians, gain) if a.recorded else a.asset.gaussians for _, a in here]
         actors = [
-            Placed(dimmed(a.asset.gaussians, gain) if a.recorded else a.asset.gaussians, pose, _end(a, time_us, readout_us), instance=i + 1)
-            for (i, a), pose in zip(here, poses, strict=True)
+            Placed(g, pose, end_pose(a, time_us, readout_us), instance=i + 1) for g, (i, a), pose in zip(splats, here, poses, strict=True)
         ]
         middle = time_us + readout_us // 2
         bent = [p if a.deformation is None else bend(p, a.deformation.at(middle)) for (_, a), p in zip(here, actors, strict=True)]
@@ -116,6 +116,7 @@ def bend(placed: Placed, lattice: Lattice) -> Placed:
     return replace(placed, gaussians=replace(splats, means=splats.means + lattice.at(splats.means)), lattice=lattice)
 
 
-def _end(actor: Actor, time_us: int, readout_us: int) -> torch.Tensor | None:
+def end_pose(actor: Actor, time_us: int, readout_us: int) -> torch.Tensor | None:
+    """`world_from_asset` `[4, 4]` as an image is read out at last that takes `readout_us`; None where the actor stands still meanwhile."""
     moves = readout_us != 0 and len(actor.trajectory) > 1
     return actor.trajectory.near(time_us + readout_us) if moves else None

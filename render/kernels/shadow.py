@@ -9,11 +9,12 @@ wp.set_module_options(OPTIONS)
 
 @wp.struct
 class Falling:
-    """A shadow in the frame of the asset that casts it: the camera's pose there, its instance id, half its length and width, the metres
-    of height up to which a surface is the ground and up to which the asset itself receives some, and the box whose light is known."""
+    """A shadow in the frame of the asset that casts it: its instance id, whether the camera's shutter moves along columns, half the asset's
+    length and width, the metres of height up to which a surface is the ground and up to which the asset itself receives some, and the box
+    whose light is known."""
 
-    pose: wp.mat44
     instance: int
+    by_columns: int
     half: wp.vec2
     ground: float
     skirt: float
@@ -40,12 +41,14 @@ def share(blocked: wp.array3d[float], at: wp.vec3):
 
 @wp.kernel
 def fall(
-    shadow: Falling, blocked: wp.array3d[float], rays: wp.array2d[wp.vec3], depth: wp.array2d[float], instance: wp.array2d[int],
+    shadow: Falling, poses: wp.array[wp.mat44], blocked: wp.array3d[float],
+    rays: wp.array2d[wp.vec3], origins: wp.array2d[wp.vec3], depth: wp.array2d[float], instance: wp.array2d[int],
     own: wp.array2d[float], left: int, top: int, light: wp.array2d[float],
     first: int,
 ):  # fmt: skip
-    """own: the part of what a pixel shows that is the asset itself. light: of a window whose first pixel is at left, top; 1 where no
-    shadow falls."""
+    """poses: the camera's in the asset's frame, one or one for each row or column. origins: where rays begin, one or one for each pixel.
+    own: the part of what a pixel shows that is the asset itself. light: of a window whose first pixel is at left, top; 1 where no shadow
+    falls."""
     v, u = pixel_of(first + wp.tid(), light.shape[1])
     row = top + v
     column = left + u
@@ -53,8 +56,13 @@ def fall(
     z = depth[row, column]
     if z == wp.inf:
         return
-    eye = wp.vec3(shadow.pose[0, 3], shadow.pose[1, 3], shadow.pose[2, 3])
-    ray = wp.transform_vector(shadow.pose, rays[row, column])
+    line = int(0)
+    if poses.shape[0] > 1:
+        line = wp.where(shadow.by_columns != 0, column, row)
+    eye = wp.transform_point(poses[line], origins[wp.min(row, origins.shape[0] - 1), wp.min(column, origins.shape[1] - 1)])
+    ray = wp.transform_vector(poses[line], rays[row, column])
+    if eye[2] <= 0.0:
+        return  # the ground is seen from below
     point = eye + z * ray
     height = point[2]
     # within the footprint the depth mixes the asset with the ground that shows through it

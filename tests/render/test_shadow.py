@@ -9,12 +9,13 @@ from street import street as made_street
 from render import render_frame
 from render.frame_types import Frame
 from render.occlusion import shadow_box, trace_field
-from render.shadow import cast, shadow_casters
-from scenes import Placed, Sky
+from render.shadow import Shade, cast, shadow_casters
+from scenes import Camera, Equirectangular, OpenCV, Orthographic, Placed, Sky
 from scenes.hdr import load_hdr
 from scenes.insert import insert
 from scenes.light import disc, light_of
 from scenes.placement import Placement
+from scenes.poses import inverse
 
 CAR = car()
 OVERCAST = light_of(replace(made_street(), sky=None)).directions.float()
@@ -202,3 +203,71 @@ def test_a_clip_traces_a_standing_assets_shadow_once(street, monkeypatch):
     for t in scene.frame_times("front_camera")[:4]:
         render_frame(scene, scene.camera("front_camera", int(t)))
     assert len(calls) == 1
+
+
+@pytest.mark.parametrize(("k1", "x", "y"), [(-0.06, 8, 3.5), (-0.1, 8, 6)])
+def test_a_shadow_falls_within_its_window_though_the_lens_folds_over(street, k1, x, y):
+    scene = insert(replace(open_street(street), sky=None), CAR, Placement("car", x, y)).scene
+    lens = OpenCV(65.0, 65.0, 80.0, 50.0, k1, 0.0)
+    camera = Camera(lens, 160, 100, scene.camera("front_camera", START_US).world_from_cam, time_us=START_US)
+    (caster,) = shadow_casters(scene, camera)
+    box = caster.field().box
+    places = torch.cartesian_prod(*(torch.linspace(float(a), float(b), 15) for a, b in zip(box.low, box.high, strict=True))).double()
+    seen = places @ inverse(caster.asset_from_cam[0])[:3, :3].T + inverse(caster.asset_from_cam[0])[:3, 3]
+    pixels = lens.project(seen[lens.valid(seen)])
+    pixels = pixels[((pixels > 0) & (pixels < torch.tensor([160, 100]))).all(1)]
+    x0, y0, x1, y1 = caster.window
+    assert len(pixels) and (pixels >= torch.tensor([x0, y0])).all() and (pixels <= torch.tensor([x1, y1])).all()
+
+
+def on_ground(camera) -> Frame:
+    """A frame that shows nothing but the ground: its depth is that of something below it, and a ray to the ground is followed there."""
+    height, width = camera.height, camera.width
+    far = torch.full((height, width), 1000.0)
+    return Frame(camera, rgb=torch.ones(height, width, 3), depth=far, instance=torch.zeros(height, width, dtype=torch.int32))
+
+
+def test_a_panorama_shows_the_shadow_behind_it(street):
+    scene = insert(replace(open_street(street), sky=None), CAR, Placement("car", -6, 2)).scene
+    ahead, turned = scene.camera("front_camera", START_US).world_from_cam, torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    light = []
+    for pose in (ahead, ahead @ turned):
+        camera = Camera(Equirectangular.whole(64, 32), 64, 32, pose, time_us=START_US)
+        light.append(cast(on_ground(camera), shadow_casters(scene, camera))[..., 0])
+    assert light[0].min() < 0.7
+    torch.testing.assert_close(light[0], light[1].roll(32, 1), atol=1e-4, rtol=0)
+
+
+def test_parallel_rays_show_a_shadow_where_it_lies(street):
+    scene = insert(replace(open_street(street), sky=None), CAR, Placement("car", 12, 0)).scene
+    down = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    down[:3, 3] = torch.tensor([9.0, 2.0, 12.0])  # 3 m behind the car, 2 m to its left
+    camera = Camera(Orthographic(8.0, 8.0, 64.0, 64.0), 128, 128, down, time_us=START_US)
+    dark = 1 - cast(on_ground(camera), shadow_casters(scene, camera))[..., 0]
+    y, x = ((dark * camera.pixel_centres()[..., k]).sum() / dark.sum() for k in (1, 0))
+    assert (float(x), float(y)) == pytest.approx((64 + 3 * 8, 64 + 2 * 8), abs=0.5)
+
+
+@pytest.mark.parametrize("shutter", ["rows", "columns"])
+def test_a_shadow_stays_below_its_asset_while_the_shutter_moves(street, shutter):
+    ahead = insert(replace(open_street(street), sky=None), CAR, Placement("car", 9, -1, yaw=math.pi / 2, speed=15.0)).scene
+    readout = 60_000
+    rolling = replace(ahead.rig["front_camera"], shutter=shutter, readout_us=readout)
+    camera = replace(ahead, rig={"front_camera": rolling}).camera("front_camera", START_US)
+    light = cast(on_ground(camera), shadow_casters(ahead, camera))[..., 0]
+    lines, still = (54, light) if shutter == "rows" else (96, light.T)
+    for line in range(24, 96, 9) if shutter == "columns" else range(30, 54, 6):
+        now = ahead.rig["front_camera"].along(ahead.ego, START_US + round(readout * (line + 0.5) / lines))
+        there = cast(on_ground(now), shadow_casters(ahead, now))[..., 0]
+        torch.testing.assert_close(still[line], (there if shutter == "rows" else there.T)[line], atol=0.02, rtol=0)
+    assert light.min() < 0.7
+
+
+def test_what_houses_keep_off_does_not_depend_on_the_frames_before(street):
+    scene = insert(street, CAR, Placement("car", 2, 3, speed=20.0)).scene
+    car_there, times = scene.actors[-1], scene.frame_times("front_camera").tolist()
+    onward, backward = Shade(scene), Shade(scene)
+    ahead = [onward.at(car_there, t)[1] for t in times]
+    behind = [backward.at(car_there, t)[1] for t in reversed(times)]
+    assert len({tuple(v.tolist()) for v in ahead}) > 1
+    assert all(torch.equal(a, b) for a, b in zip(ahead, reversed(behind), strict=True))
