@@ -29,14 +29,20 @@ def photos_folder(file: Path) -> Path:
 @contextmanager
 def photos_beside(file: Path, photos: Sequence[AssetPhoto]) -> Iterator[None]:
     """Within the block the asset is written to `file`; then its photos lie beside it, all or none, in place of those that lay there. Where
-    the block fails these stay. Lenses must be pinholes: ValueError before the block else."""
+    the block fails these stay. A folder that is not one of photos is never replaced: FileExistsError where photos would go there. Lenses
+    must be pinholes: ValueError. Both are raised before the block."""
     from PIL import Image
 
     folder = photos_folder(file)
     if not photos:
         yield
-        shutil.rmtree(folder, ignore_errors=True)
+        if _holds_photos(folder):
+            shutil.rmtree(folder, ignore_errors=True)
         return
+    if folder.exists() and not _holds_photos(folder):
+        raise FileExistsError(
+            f"{folder} holds something else than photos of an asset, so it is left alone; move it, or give {file.name} another name"
+        )
     with atomic_folder(folder, replace=True) as half:
         told = []
         for i, photo in enumerate(photos):
@@ -53,6 +59,12 @@ def photos_beside(file: Path, photos: Sequence[AssetPhoto]) -> Iterator[None]:
             )  # fmt: skip
         (half / INDEX).write_text(json.dumps(told, indent=1), encoding="utf-8")
         yield
+
+
+def _holds_photos(folder: Path) -> bool:
+    """Whether a folder holds the photos of an asset and nothing else."""
+    names = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    return INDEX in names and all(name == INDEX or name.endswith(".webp") for name in names)
 
 
 def load_photos(file: Path) -> tuple[AssetPhoto, ...]:

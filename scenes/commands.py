@@ -91,7 +91,7 @@ class Convert:
         thing, warnings = open_splats(self.source, self.drop_invalid, self.up)
         if self.up is not None and not isinstance(thing, Asset):
             thing = stood_up(thing, self.source, self.up)
-        said = self.up or said_up(self.source)
+        said = "z" if isinstance(thing, Asset) else self.up or said_up(self.source)
         turned = _turned(self.source, self.target, said)
         warn([*warnings, *(axis_warning(self.source) if said is None and turned else [])])
         for line in turned:

@@ -10,6 +10,7 @@ import torch
 from scenes.asset import Actor, Asset
 from scenes.gaussians import Gaussians
 from scenes.match import at_place
+from scenes.metres import require_metres
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -73,7 +74,10 @@ def named(entry: Mapping) -> list[str]:
 
 
 def check_edit(edit: Edit, scene: Scene) -> None:
-    """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing."""
+    """ValueError where the edit names a track that the scene has not, contradicts itself, or would change nothing, and where it
+    shifts by metres what has none."""
+    for track in edit.shift:
+        require_metres(scene, f"the shift of {track}")
     have, standing = {a.track: a for a in scene.actors}, parked(scene)
     for track in edit.tracks():
         if track not in have and track not in standing:

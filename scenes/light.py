@@ -77,7 +77,8 @@ def light_of(scene: Scene, time_us: int | None = None) -> Light:
 def sun_of_sky(sky: Sky) -> torch.Tensor | None:
     """Direction `[3]` of the sun in a sky image of true radiances; None where nothing in it is that much brighter than the rest.
 
-    It is the middle of what within 12 degrees of the brightest pixel exceeds the sky around.
+    It is the middle of what within 12 degrees of the brightest pixel exceeds the sky around, or that pixel where a coarse image, or a wide
+    sun, leaves no such sky.
     """
     directions, solid = _directions(*sky.linear.shape[:2])
     up = directions[..., 2] > 0
@@ -90,6 +91,8 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
     near = up & (directions @ peak > math.cos(BESIDE))
     around = float(luminance[near].median())
     extra = torch.where(near, (luminance - 4 * around).clamp_min(0), torch.zeros_like(luminance)) * solid
+    if not extra.any():
+        return peak
     centre = (extra[..., None] * directions).sum((0, 1))
     return centre / centre.norm()
 

@@ -52,9 +52,11 @@ def parse_at(text: str) -> tuple[float, float]:
 
 def parse_placement(text: str) -> Placement:
     """ "ID@X,Y[,yaw=5deg][,speed=8m/s][,path=lane]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
-    asset, at, rest = text.rpartition("@")
+    asset, at, rest = text.partition("@")
     if not at or not asset:
         raise ValueError(f'"{text}" does not say what goes where; write ID@X,Y as car/0003@12m,3.5m (metres forward, left)')
+    if rest.startswith("trajectory="):
+        return Placement(asset, trajectory=Path(rest.removeprefix("trajectory=")))  # a path may hold any character
     parts = rest.split(",")
     place = [p for p in parts if "=" not in p]
     given: dict[str, str] = {}
@@ -65,9 +67,7 @@ def parse_placement(text: str) -> Placement:
             raise ValueError(f'"{text}" says {key} twice; say it once')
         given[key] = value
     if "trajectory" in given:
-        if place or len(given) > 1:
-            raise ValueError(f'"{text}" gives a place and a trajectory; a trajectory says it all: {asset}@trajectory={given["trajectory"]}')
-        return Placement(asset, trajectory=Path(given["trajectory"]))
+        raise ValueError(f'"{text}" gives a place and a trajectory; a trajectory says it all: {asset}@trajectory={given["trajectory"]}')
     x, y = parse_at(",".join(place))
     turn, fast = angle(given.get("yaw", "0deg")), speed(given.get("speed", "0m/s"))
     return Placement(asset, x, y, turn, fast, parse_path(given.get("path", "straight")))

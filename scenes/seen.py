@@ -14,6 +14,9 @@ from scenes.poses import inverse
 SECTORS = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")
 """Eighths of the turn about an object, counted to the left from its nose."""
 
+NEAR = 0.1
+"""Metres of depth within which a camera sees nothing."""
+
 FEW = 5
 """Pictures from the next sector that show enough of a side that none was taken of."""
 
@@ -27,7 +30,7 @@ def seeing(actor: Actor, cameras: Sequence[Camera]) -> list[Camera]:
         if actor.trajectory.covers(camera.time_us):
             cam_from_asset = inverse(camera.world_from_cam) @ actor.trajectory.at(camera.time_us)
             points = box @ cam_from_asset[:3, :3].T + cam_from_asset[:3, 3]
-            pixels = camera.lens.project(points[points[:, 2] > 0.1])
+            pixels = camera.lens.project(points[camera.lens.valid(points) & (camera.lens.depth(points) > NEAR)])
             size = torch.tensor([camera.width, camera.height])
             if ((pixels >= 0) & (pixels <= size)).all(1).any():
                 found.append(camera)

@@ -429,6 +429,8 @@ def test_splats_alone_are_rendered_from_around(door, tmp_path):
 def test_a_converted_asset_stays_one_as_usd(door, tmp_path):
     door(["convert", "bank/assets/car/0001/asset.usdc", str(tmp_path / "a.usda")])
     assert json.loads(door(["info", str(tmp_path / "a.usda"), "--json"])[0])["label"] == "car"
+    for name in ("b.usdc", "b.spz"):  # of its folder, too, it is known that z is up
+        assert "--up" not in "".join(door(["convert", "bank/assets/car/0001", str(tmp_path / name)]))
 
 
 def test_nan_is_refused_or_dropped_in_conversion(door, spoiled):

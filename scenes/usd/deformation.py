@@ -26,7 +26,7 @@ def author_deformation(prim: Usd.Prim, deformation: Deformation, origin: int) ->
 
 
 def author_weights(prim: Usd.Prim, deformation: Deformation, origin: int) -> None:
-    """Give a prim a deformation's weights alone: an edit that retimes it keeps the modes."""
+    """Give a prim a deformation's weights alone: an edit that gives it another path keeps the modes."""
     weights = prim.CreateAttribute(WEIGHTS, Sdf.ValueTypeNames.FloatArray, True)
     for time, row in zip((deformation.times_us - origin).tolist(), deformation.weights.detach().cpu().numpy(), strict=True):
         weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(row)), time)
@@ -40,7 +40,7 @@ def block_deformation(prim: Usd.Prim) -> None:
 def read_deformation(prim: Usd.Prim, origin: int) -> Deformation | None:
     """The deformation of a prim, None where it has none. ValueError for one whose numbers do not fit together or are not finite."""
     weights = prim.GetAttribute(WEIGHTS)
-    if not weights or not (samples := weights.GetTimeSamples()):
+    if not weights or not (samples := weights.GetTimeSamples()) or _replaced(prim):
         return None
     corners, modes, counts = array(prim.GetAttribute(CORNERS), 3), array(prim.GetAttribute(MODES), 3), prim.GetAttribute(COUNTS).Get()
     if corners is None or modes is None or counts is None:
@@ -54,3 +54,12 @@ def read_deformation(prim: Usd.Prim, origin: int) -> Deformation | None:
         raise ValueError(f"{prim.GetPath()} has a deformation whose numbers do not fit: {error}") from error
     found.validate(str(prim.GetPath()))
     return found
+
+
+def _replaced(prim: Usd.Prim) -> bool:
+    """Whether an edit put another asset in the place of the one that a prim's modes belong to: whichever layer says how an asset bends
+    names the asset, too."""
+    modes = prim.GetAttribute(MODES)
+    bends = [spec.layer for spec in modes.GetPropertyStack(Usd.TimeCode.Default())] if modes else []
+    assets = [spec.layer for spec in prim.GetPrimStack() if spec.hasReferences]
+    return bool(bends) and bends[0] != assets[0]

@@ -19,6 +19,7 @@ from pxr import Sdf, Usd, UsdVol, Vt
 from scenes.alone import alone
 from scenes.asset import Actor
 from scenes.atomic import atomic_file, atomic_folder, need_folder
+from scenes.deformation import Deformation
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
@@ -111,8 +112,8 @@ def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: b
             set_own_data(prim, edited=name)
             if actor.track in edit.shift or actor.track in edit.retime:
                 author_path(prim, actor.trajectory, origin)
-            if actor.deformation is not None and actor.track in edit.retime:
-                author_weights(prim, actor.deformation, origin)
+                if (deformation := _in_step(actor, recorded)) is not None:
+                    author_weights(prim, deformation, origin)
             if actor.track in edit.replace:
                 block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
@@ -120,6 +121,13 @@ def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: b
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 
     _write(path, name, {**meta, "remove": list(edit.remove)} if edit.remove else meta, files, author)
+
+
+def _in_step(actor: Actor, recorded: Scene) -> Deformation | None:
+    """How an actor deforms along its path as an edit leaves it, None where it does not: of one that was recorded, and that another edit may
+    have replaced, as it would were it put back."""
+    was = next((a for a in recorded.actors if a.track == actor.track), actor)
+    return was.deformation and was.deformation.later(int(actor.trajectory.times_us[0] - was.trajectory.times_us[0]))
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,17 @@ def test_an_asset_without_photos_takes_the_place_of_one_with_them(pictured, tmp_
     assert not photos_folder(tmp_path / "car.usdc").exists() and load(tmp_path / "car.usdc").photos == ()
 
 
+def test_a_folder_of_something_else_is_left_alone(pictured, tmp_path):
+    """Though it has the name that photos would have, and holds pictures."""
+    folder = photos_folder(tmp_path / "car.usdc")
+    folder.mkdir()
+    (folder / "beach.webp").write_bytes(b"a holiday")
+    save(car(), tmp_path / "car.usdc")
+    with pytest.raises(FileExistsError, match=r"car.photos holds something else than photos of an asset.*another name"):
+        save(pictured, tmp_path / "car.usdc", overwrite=True)
+    assert (folder / "beach.webp").read_bytes() == b"a holiday" and load(tmp_path / "car.usdc").photos == ()
+
+
 def test_photos_stay_where_the_asset_cannot_be_written(pictured, tmp_path):
     save(pictured, tmp_path / "car.usdc")
     for photos in ((), (photo(10),)):

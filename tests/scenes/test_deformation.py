@@ -10,7 +10,7 @@ from street import START_US, STEP_US, box, car, street
 from scenes import Actor, Deformation, Lattice, Scene, load, save
 from scenes.edit import Edit, edited
 from scenes.report import describe, summary
-from scenes.usd.edit import add_change
+from scenes.usd.edit import add_change, undo
 from scenes.usd.layers import usd_problems
 
 CORNERS = torch.tensor([[-3.0, -1.0, 0.0], [3.0, 1.0, 2.0]])
@@ -150,6 +150,19 @@ def test_a_replaced_actor_that_is_put_back_bends_again(tmp_path):
     add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(replace={"veh_1": car("van")}), {})
     (tmp_path / "s1" / "edits" / "mine.usda").unlink()
     assert same(load(tmp_path / "s1").actors[0].deformation, sways())
+
+
+@pytest.mark.parametrize("first", [Edit(replace={"veh_1": car("van")}), Edit(retime={"veh_1": 200_000})], ids=["replace", "retime"])
+@pytest.mark.parametrize("second", [Edit(retime={"veh_1": 300_000}), Edit(shift={"veh_1": (1.0, 0.5)})], ids=["retime", "shift"])
+def test_what_an_edit_moved_bends_in_step_when_the_edit_before_is_undone(tmp_path, first, second):
+    save(bending(), tmp_path / "s1")
+    add_change(tmp_path / "s1", "first", load(tmp_path / "s1"), first, {})
+    add_change(tmp_path / "s1", "second", load(tmp_path / "s1"), second, {})
+    assert (load(tmp_path / "s1").actors[0].deformation is None) == bool(first.replace)
+    undo(tmp_path / "s1", "first")
+    actor = load(tmp_path / "s1").actors[0]
+    later = int(actor.trajectory.times_us[0] - bending().actors[0].trajectory.times_us[0])
+    assert later == sum(e.retime.get("veh_1", 0) for e in (first, second)) and same(actor.deformation, sways().later(later))
 
 
 def test_a_file_whose_numbers_do_not_fit_is_refused(tmp_path):

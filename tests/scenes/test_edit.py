@@ -437,6 +437,13 @@ def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
 
 
+def test_nothing_is_shifted_by_metres_in_a_scene_that_has_none():
+    scene = replace(busy(), meta={**busy().meta, "metric": False})
+    with pytest.raises(ValueError, match="the shift of veh_2 is in metres, but street has none"):
+        edited(scene, Edit(shift={"veh_2": (1.0, 0.0)}))
+    edited(scene, Edit(remove=("veh_2",)))
+
+
 def test_editing_what_an_edit_removed_names_that_edit(saved):
     add_change(saved, "mine", load(saved), Edit(remove=("veh_2",)), {"kind": "edit", "remove": ["veh_2"]})
     with pytest.raises(ValueError, match="veh_2 is not in street any more: the edit mine removed it; --undo mine brings it back"):

@@ -57,6 +57,17 @@ def test_a_sun_in_the_image_is_found_and_gets_its_share(street):
         assert float(near.double().mean()) == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.parametrize(("height", "radius"), [(8, 0), (64, 6)])
+def test_a_sun_that_fills_all_that_is_near_it_stands_at_its_brightest(height, radius):
+    """Of one pixel in a coarse sky, and of many in a fine one."""
+    linear, row = torch.full((height, 2 * height, 3), 0.3), height // 4
+    linear[row - radius : row + radius + 1, height - radius : height + radius + 1] = 30.0
+    linear[row, height] = 31.0
+    yaw, high = -math.pi / (2 * height), math.pi * (0.5 - (row + 0.5) / height)
+    expected = [math.cos(high) * math.cos(yaw), math.cos(high) * math.sin(yaw), math.sin(high)]
+    assert sun_of_sky(Sky(linear)).tolist() == pytest.approx(expected, abs=1e-6)
+
+
 def test_no_sun_is_made_up_where_the_sky_shows_none(street):
     assert sun_of_sky(GREY) is None and sun_of_sky(street.sky) is None
     assert light_of(street).sun is None and light_of(replace(street, sky=None)).sun is None

@@ -15,6 +15,7 @@ def test_a_placement_says_asset_place_heading_and_speed():
     full = parse_placement("car/0003@12m,-3.5m,yaw=180deg,speed=36km/h")
     assert full == Placement("car/0003", 12, -3.5, math.pi, 10)
     assert parse_placement("car/0003@trajectory=a/t.csv") == Placement("car/0003", trajectory=Path("a/t.csv"))
+    assert parse_placement("car/0003@trajectory=run,2@b=1.csv") == Placement("car/0003", trajectory=Path("run,2@b=1.csv"))
 
 
 @pytest.mark.parametrize(

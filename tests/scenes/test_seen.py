@@ -6,6 +6,7 @@ import pytest
 import torch
 from street import car
 
+from scenes import Equirectangular, Fisheye, OpenCV
 from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.seen import SECTORS, absence_warning, sector, seeing, unseen_sides, unseen_warning
@@ -24,6 +25,21 @@ def known(asset, mirrored=False, **sectors):
 def test_it_is_known_whether_an_actor_is_ever_in_view(street, x, y, seen):
     actor = insert(street, car(), Placement("car", x, y)).actor
     assert bool(seeing(actor, recorded(street))) == seen
+
+
+@pytest.mark.parametrize(
+    ("lens", "place", "seen"),
+    [
+        (Equirectangular.whole(96, 54), (-10, 3), True),
+        (Fisheye(30.0, 30.0, 48.0, 27.0), (-10, 3), False),  # its image ends 92 degrees from the axis, to the sides
+        (Fisheye(25.0, 25.0, 48.0, 27.0), (-1, 8), True),
+        (OpenCV(50.0, 50.0, 48.0, 27.0, -0.1), (2, 12), False),  # beyond 61 degrees it folds over
+        (OpenCV(50.0, 50.0, 48.0, 27.0, -0.1), (12, 6), True),
+    ],
+)
+def test_each_lens_sees_as_far_as_it_goes(street, lens, place, seen):
+    actor = insert(street, car(), Placement("car", *place)).actor
+    assert bool(seeing(actor, [replace(recorded(street)[0], lens=lens)])) == seen
 
 
 @pytest.mark.parametrize(
