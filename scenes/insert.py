@@ -214,6 +214,8 @@ def _track(scene: Scene, asset: str) -> str:
     edits = scene.meta.get("edits", [])
     taken = {actor.track for actor in scene.actors} | {track for edit in edits for track in named(edit)}
     taken |= {edit["name"] for edit in edits if not edit.get("missing")}  # of `sidestep insert` the name of what it brought
+    if "path" in scene.meta:  # a kill may leave the layer of an edit that the scene does not list yet
+        taken |= {layer.stem for layer in Path(scene.meta["path"], "edits").glob("*.usda")}
     number = 1
     while (name := base if number == 1 else f"{base}_{number}") in taken:
         number += 1

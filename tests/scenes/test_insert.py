@@ -92,6 +92,13 @@ def test_an_inserted_track_is_none_that_an_edit_speaks_of(street):
     assert insert(edited, car(), Placement("car/0001", 12, 3)).actor.track == "inserted_car_0001_4"
 
 
+def test_an_inserted_track_is_not_that_of_a_layer_that_a_kill_left(street, tmp_path):
+    (tmp_path / "edits").mkdir()
+    (tmp_path / "edits" / "inserted_car_0001.usda").touch()
+    killed = replace(street, meta={**street.meta, "path": str(tmp_path)})
+    assert insert(killed, car(), Placement("car/0001", 12, 3)).actor.track == "inserted_car_0001_2"
+
+
 def test_a_trajectory_file_is_followed(street, tmp_path):
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.3,13,0\n0.6,13,3\n")
     result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"), start_us=START_US)
