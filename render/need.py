@@ -30,10 +30,10 @@ ASIDE = (math.radians(5), math.radians(20))
 """Angle at a surface between the ray from here and that from the nearest photo: from supported to never seen like this."""
 
 NEAREST = 4
-"""Photos whose rays are compared."""
+"""Photos whose rays are compared; of a lens that sees beyond 90 degrees so many forward, back, and to each side."""
 
 FACING = math.cos(math.radians(60))
-"""Photos that look further away than this from where the camera looks did not see what it sees."""
+"""Photos that look further away than this from where a pixel of a wide lens looks, or the camera, did not see what that sees."""
 
 
 def support_fields(placed: Sequence[Placed], camera: Camera) -> list[torch.Tensor]:
@@ -83,21 +83,23 @@ def photos(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
 def far_from_photos(scene: Scene, camera: Camera, depth: torch.Tensor) -> torch.Tensor:
     """`[H, W]`, 0 to 1: how far the view of each pixel's surface is from that of the nearest photo that looks the same way; 0 for sky."""
     places, directions = photos(scene)
-    pose = camera.world_from_cam.detach()
-    places = places[directions @ pose[:3, 2] > FACING]
-    if not len(places):
+    pose, wide = camera.world_from_cam.detach(), camera.lens.limit() > math.pi / 2
+    offsets, looks = (places - pose[:3, 3]) @ pose[:3, :3], directions @ pose[:3, :3]  # in the camera
+    order, axes = offsets.norm(dim=1).argsort(), torch.eye(3, dtype=torch.float64)
+    ways = [*axes, *-axes] if wide else [axes[2]]
+    chosen = torch.cat([order[looks[order] @ way > FACING][:NEAREST] for way in ways]).unique()
+    if not len(chosen):
         return torch.isfinite(depth).float()
-    offsets = (places - pose[:3, 3]) @ pose[:3, :3]  # in the camera
-    offsets = offsets[offsets.norm(dim=1).argsort()[:NEAREST]].to(depth)
     rays = on_device(camera_rays(camera), depth.device)
     distance = rays.norm(dim=-1).clamp_min(1e-9)
     unit = rays / distance[..., None]
     distance = distance * depth
     aside = torch.full_like(depth, math.pi)
-    for b in offsets:
+    for b, look in zip(offsets[chosen].to(depth), looks[chosen].to(depth), strict=True):
         along = unit @ b
         across = (b.square().sum() - along.square()).clamp_min(0).sqrt()
-        aside = torch.minimum(aside, torch.atan2(across, distance - along))
+        angle = torch.atan2(across, distance - along)
+        aside = torch.minimum(aside, torch.where(unit @ look > FACING, angle, math.pi) if wide else angle)
     return torch.where(torch.isfinite(depth), _ramp(aside, ASIDE), torch.zeros_like(depth))
 
 

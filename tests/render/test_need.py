@@ -7,7 +7,7 @@ import torch
 
 from render import rasterize, render_clip, render_frame
 from render.need import far_from_photos, support_fields
-from scenes import Camera, Gaussians, Pinhole, Placed
+from scenes import Camera, Equirectangular, Gaussians, Pinhole, Placed
 from scenes.poses import translation
 from tests.bench.presets import random_splats
 
@@ -33,6 +33,14 @@ def test_a_surface_is_far_from_the_photos_where_they_saw_it_from_the_side(street
     assert near[:, 30:66].min() > 0.9 and far.max() == 0
     assert far_from_photos(street, camera, torch.full((54, 96), torch.inf)).max() == 0
     assert far_from_photos(street, camera_of(street), torch.full((54, 96), 4.0)).max() == 0
+
+
+def test_a_panorama_is_supported_where_photos_look_only(street):
+    camera = replace(camera_of(street), lens=Equirectangular.whole(96, 54))
+    need = far_from_photos(street, camera, torch.full((54, 96), 10.0))
+    behind = torch.cat([need[24:30, :6], need[24:30, -6:]], 1)
+    assert need[24:30, 42:54].max() == 0 and behind.min() == 1  # the cameras look ahead and to the left
+    assert need[24:30, 20:28].max() < 0.1 and need[24:30, 76:].min() == 1
 
 
 def test_what_was_inserted_needs_everything(street):
