@@ -172,7 +172,7 @@ def _colours(sh: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
 
 
 def colours(placed: Placed, camera: Camera) -> torch.Tensor:
-    """What colour `[N, 3]` each splat shows to `camera`."""
+    """What colour `[N, 3]` each splat shows to `camera`, whose rays begin in its eye."""
     eye = (inverse(placed.world_from_local) @ camera.world_from_cam)[:3, 3].detach()
     return _colours(placed.gaussians.sh.detach().double(), placed.gaussians.means.detach().double() - eye)
 

@@ -123,7 +123,7 @@ def shown(lens: Lens, camera: Camera, model: SplatModel, points: torch.Tensor, a
 
 
 def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict[str, torch.Tensor], moving: bool):
-    """Of the splats `g` that show: their rows, points and axes in the camera, directions from the eye in the local frame, and mean
+    """Of the splats `g` that show: their rows, points and axes in the camera, directions of sight in the local frame, and mean
     `[n, 2]` and covariance `[n, 2, 2]` in pixels; those beyond an image's seam twice."""
     still = torch.zeros_like(g["means"])
     s = readout(lens, camera, pose, g["means"], still, moving)
@@ -133,7 +133,8 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
     axes = at[..., :3, :3] @ local
     rows = shown(lens, camera, model, points, axes).nonzero()[:, 0]
     points, axes, local, means = points[rows], axes[rows], local[rows], g["means"][rows]
-    sight = (at[rows, :3, :3].transpose(1, 2) @ points[..., None])[..., 0]
+    along = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points) if isinstance(lens, Orthographic) else points
+    sight = (at[rows, :3, :3].transpose(1, 2) @ along[..., None])[..., 0]
     mean = lens.project(points)
     aim = aimed(lens, camera, points)
     if model.projection == "ewa":

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import warp as wp
 
 from render.kernels.fields import exp_scale, rotation, rotation_backward, sigmoid
-from render.kernels.lenses import PLANAR, ROUND, LensFunctions
+from render.kernels.lenses import PARALLEL, PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import PARAMS, Optics, params
 from render.kernels.motion import motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
@@ -25,6 +25,8 @@ POSE = 12
 
 TURN = wp.constant(wp.float64(6.283185307179586))
 STEP = wp.constant(wp.float64(1.0e-5))
+AXIS = wp.constant(wp.vec3d(0.0, 0.0, 1.0))
+"""The way that all rays go of a lens without an eye."""
 
 
 class LensKernels(NamedTuple):
@@ -65,7 +67,7 @@ def scaled_axes(quat: wp.vec4, log_scale: wp.vec3):
 def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     """The kernels of a lens under a global or a moving shutter."""
     pixel, jacobian, params_gradient, depth = lens
-    planar, around = depth == PLANAR, depth == ROUND
+    planar, around, parallel = depth == PLANAR, depth == ROUND, depth == PARALLEL
     readout, placed, pixel_backward, nearest, sighted, spread, turns, ellipse = sight_functions(lens, rolling)
     bound = lens_bound(lens, rolling)
 
@@ -100,7 +102,10 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
                         if motion.copy != 0 and e.seen == ANYWHERE:
                             shows = wp.vec2(0.0)  # its original is seen everywhere
-                    sight = wp.vec3(wp.transpose(c.rotation) * c.t)
+                    along = wp.vec3d(c.t)
+                    if wp.static(parallel):
+                        along = AXIS
+                    sight = wp.vec3(wp.transpose(c.rotation) * along)
                     write_splat(e, shows, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
@@ -235,10 +240,14 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     g_t += (g.depth / c.depth) * c.t
                 else:
                     g_t += wp.vec3d(none, none, g.depth)
-                sight = wp.vec3(wp.transpose(c.rotation) * c.t)
+                along = wp.vec3d(c.t)
+                if wp.static(parallel):
+                    along = AXIS
+                sight = wp.vec3(wp.transpose(c.rotation) * along)
                 g_sight = wp.vec3d(colour_backward(sh, i, sight, g.rgb, g_sh))
-                g_t += c.rotation * g_sight
-                g_rotation += wp.outer(c.t, g_sight)
+                if wp.static(not parallel):
+                    g_t += c.rotation * g_sight
+                g_rotation += wp.outer(along, g_sight)
                 g_s = wp.float64(0.0)
                 if wp.static(rolling):
                     rate = rotation_rate(motion, c.s)

@@ -108,7 +108,7 @@ def write_splat(
 ):  # fmt: skip
     """Record j, its reach, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
 
-    shows: as of `fade`. sight: from the eye to the splat in its local frame, of any length.
+    shows: as of `fade`. sight: the way it is seen, from the eye to the splat, in its local frame, of any length.
     """
     wide = dilated(e, view)
     xx = wide[0]

@@ -123,6 +123,15 @@ def test_every_lens_has_the_oracles_gradients(make, name, model):
         assert_gradient(what, mine, reference)
 
 
+def test_parallel_rays_show_a_picture_that_moves_with_the_camera():
+    """Whatever the splats' harmonics, and whichever way they are turned: each ray looks the same way."""
+    lens, pixels = LENSES["orthographic"], 8
+    poses = START, START @ translation(pixels / lens.fx, 0, 0)
+    a, b = (rasterize(around(4), replace(camera_of(lens), world_from_cam=pose), ("rgb", "normal"), config=EXACT) for pose in poses)
+    assert (a.rgb[:, pixels:] - b.rgb[:, :-pixels]).abs().max() < 1e-4
+    assert (a.normal[:, pixels:] - b.normal[:, :-pixels]).abs().max() < 1e-3
+
+
 def dots(points, scale: float = 0.02) -> Placed:
     """Small opaque white splats at camera points `[n, 3]` of a camera that stands at the origin."""
     points = torch.as_tensor(points, dtype=torch.float32)
