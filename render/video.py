@@ -13,14 +13,13 @@ import numpy as np
 import torch
 
 from render.matroska import lacking
+from render.yuv import BT709, HDR, TO_SDR, from_rgb, to_rgb
 from scenes.atomic import atomic_file
 from scenes.checks import check_floats, check_tensor
 
 CONTAINERS = (".mp4", ".mkv", ".mov")
 TICK = Fraction(1, 90_000)
 """Seconds by which the times of frames that are not evenly apart are counted, as in MPEG's own clock."""
-
-BT709 = 1  # the code point of ITU-R BT.709 in H.264, for primaries, transfer and matrix alike
 
 
 def to_bytes(rgb: torch.Tensor) -> np.ndarray:
@@ -61,8 +60,8 @@ class Video:
 
     fps: frames a second in the mean; width, height: pixels of the turned frames; pixel_aspect: how much wider than high a pixel is to be
     shown; count, seconds: frames and length as the file claims, None where it does not say; sound: whether it has any; dropped: what of the
-    first frame is not read, in words, or ''. Raises ValueError where the file is no video, has no frames, breaks off in the middle, or goes
-    on in another size.
+    first frame is not read, in words, or ''. Raises ValueError where the file is no video, is of high dynamic range, has no frames, breaks
+    off in the middle, or goes on in another size.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -87,6 +86,9 @@ class Video:
         frames = self._decoded()
         first = next(frames)  # what turns them is said with the frames
         frames.close()
+        if (transfer := first.color_trc) in HDR:
+            fix = f"ffmpeg -i {quote(str(path))} -vf {TO_SDR} {quote(f'{self.path.stem}_sdr.mp4')} makes one that is read"
+            raise ValueError(f"{path} is of high dynamic range ({HDR[transfer]}), which is not read; {fix}")
         self.dropped = _dropped(first)
         lies = _turns(first)[0] % 2 == 1
         self.width, self.height = (first.height, first.width) if lies else (first.width, first.height)
@@ -103,7 +105,7 @@ class Video:
             at = i / self.fps if frame.pts is None else float(frame.pts * frame.time_base)
             began = at if began is None else began
             quarters, mirrored = _turns(frame)
-            stored = frame.to_ndarray(format="rgb24")
+            stored = to_rgb(frame)
             pixels = np.rot90(stored[:, ::-1] if mirrored else stored, quarters)
             if pixels.shape[:2] != (self.height, self.width):
                 sizes = f"{self.width}x{self.height} to {pixels.shape[1]}x{pixels.shape[0]}"
@@ -212,12 +214,9 @@ class VideoWriter:
 
     def write(self, rgb: torch.Tensor, time_us: int | None = None) -> None:
         """Add one frame `[height, width, 3]`. time_us: when it is shown, later than the one before, of all frames or of none."""
-        import av
-        from av.video.reformatter import Colorspace
-
         check_tensor("a video frame", rgb, (self.height, self.width, 3))
         pixels = np.pad(to_bytes(rgb), ((0, self.height % 2), (0, self.width % 2), (0, 0)), mode="edge")
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
+        frame = from_rgb(pixels)
         if self.count == 0 and time_us is not None:
             self._stream.codec_context.time_base = TICK
         if time_us is None:

@@ -1,6 +1,7 @@
 import os
 import struct
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -8,6 +9,7 @@ from PIL import Image
 
 from render.compare import psnr
 from render.video import VideoWriter, read_image, read_video, write_image
+from render.yuv import from_rgb
 from scenes.pictures import rgb_of
 
 
@@ -93,6 +95,53 @@ def test_colours_survive_the_codec(tmp_path, colour):
         video.write(torch.tensor(colour).expand(32, 32, 3))
     (frame,) = read_video(tmp_path / "a.mp4")
     assert frame[16, 16].tolist() == pytest.approx(colour, abs=2 / 255)
+
+
+def test_a_picture_comes_back_as_bright_as_it_was(tmp_path):
+    """swscale's fast paths cut off, so that a picture would be a level darker after each pass."""
+    image = smooth_image(360, 640)
+    with VideoWriter(tmp_path / "a.mp4", 10, 640, 360, crf=1) as video:
+        video.write(image)
+    (frame,) = read_video(tmp_path / "a.mp4")
+    assert (255 * (frame - image).mean((0, 1))).abs().max() < 0.3
+
+
+BARS = np.repeat(np.array([[200, 30, 30], [30, 160, 40], [30, 40, 190], [200, 150, 120]], np.uint8), 320, 0)[None]
+
+
+def write_tagged(path, height, tags):
+    """Bars of colour in BT.709's YUV, 1280 wide, with these code points of H.273 for transfer, primaries and matrix."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "1"})
+        stream.width, stream.height, stream.pix_fmt = 1280, height, "yuv420p"
+        context = stream.codec_context
+        context.color_trc, context.color_primaries, context.colorspace = tags
+        container.mux([*stream.encode(from_rgb(BARS.repeat(height, 0))), *stream.encode(None)])
+
+
+@pytest.mark.parametrize("tags", [(1, 1, 1), (2, 2, 2)], ids=["told", "untold"])
+def test_high_definition_is_bt709_told_or_not(tmp_path, tags):
+    write_tagged(tmp_path / "a.mp4", 720, tags)
+    (frame,) = read_video(tmp_path / "a.mp4")
+    assert (255 * frame[360, 160::320] - torch.from_numpy(BARS[0, 160::320])).abs().max() <= 2
+
+
+def test_rgb_is_read_as_it_is_stored(tmp_path):
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 1280, 720, "bgr0"
+        container.mux([*stream.encode(av.VideoFrame.from_ndarray(BARS.repeat(720, 0), format="rgb24")), *stream.encode(None)])
+    (frame,) = read_video(tmp_path / "a.mkv")
+    assert torch.equal((255 * frame[0]).round(), torch.from_numpy(BARS[0]).float())
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
+def test_high_dynamic_range_is_refused_with_what_makes_it_readable(tmp_path, transfer, name):
+    write_tagged(tmp_path / "a.mp4", 48, (transfer, 9, 9))
+    with pytest.raises(
+        ValueError, match=rf"a.mp4 is of high dynamic range \({name}\).*; ffmpeg -i .*a.mp4 -vf zscale=.*tonemap.* a_sdr.mp4"
+    ):
+        read_video(tmp_path / "a.mp4")
 
 
 def test_odd_sizes_gain_a_row_and_a_column(tmp_path):
