@@ -10,6 +10,7 @@ import torch
 from enhance.pictures import in_order
 from scenes.pictures import opened
 
+KINDS = (".npy", ".png")
 MOST = 64
 """Objects of one picture; where more are told, a mask's soft edges most likely count as objects of their own."""
 
@@ -23,11 +24,18 @@ class ObjectIds:
     """
 
     def __init__(self, folder: str | Path, pictures: int | None = None):
-        self.folder, self.files = Path(folder), in_order(Path(folder), (".npy", ".png"))
+        self.folder, self.files = Path(folder), in_order(Path(folder), KINDS)
         if not self.files:
-            raise ValueError(f"{folder} holds no .npy or .png that say where objects were put in, one a picture")
-        if pictures is not None and pictures != len(self.files):
-            raise ValueError(f"{folder} has ids for {len(self.files)} pictures, and the clip has {pictures}; give one file a picture")
+            below = min((f.parent for f in self.folder.rglob("*") if f.suffix.lower() in KINDS), key=_instances_first, default=None)
+            told = f"{folder} holds no {' or '.join(KINDS)} that say where objects were put in, one a picture"
+            raise ValueError(told + (f"; {below} does" if below else ""))
+        if pictures is not None:
+            self.check_count(pictures)
+
+    def check_count(self, pictures: int) -> None:
+        """ValueError unless there are ids for as many pictures as the clip has."""
+        if pictures != len(self.files):
+            raise ValueError(f"{self.folder} has ids for {len(self.files)} pictures, and the clip has {pictures}; give one file a picture")
 
     def of(self, number: int, width: int, height: int) -> torch.Tensor:
         """int32 `[height, width]` of a picture, 0 where nothing was put in."""
@@ -42,6 +50,11 @@ class ObjectIds:
             fix = "give every object one value, without soft edges"
             raise ValueError(f"{file} tells of {count} objects, and {MOST} are the most of one picture; {fix}")
         return torch.from_numpy(ids.astype(np.int32))
+
+
+def _instances_first(folder: Path) -> tuple[bool, Path]:
+    """A key that sorts folders as they may hold ids: `sidestep render` keeps an output in a folder of its name."""
+    return folder.name != "instance", folder
 
 
 def _array(file: Path) -> np.ndarray:

@@ -77,7 +77,7 @@ class Video:
                 raise ValueError(f"{path} holds no video stream")
             stream = container.streams.video[0]
             self.fps = float(stream.average_rate or stream.guessed_rate or 25)
-            self.count = stream.frames or None
+            self.count = _shown(stream)
             self.seconds = float(stream.duration * stream.time_base) if stream.duration else None
             self.sound = bool(container.streams.audio)
             aspect = stream.sample_aspect_ratio or Fraction(1)
@@ -140,6 +140,12 @@ class Video:
             return av.open(str(self.path))
         except FFmpegError as error:
             raise ValueError(f"{self.path} cannot be decoded as video: {error.strerror}; fetch or export it again") from error
+
+
+def _shown(stream) -> int | None:
+    """How many frames a stream of PyAV's claims, None where it does not say; without those that an edit list hides, as before a cut."""
+    index = stream.index_entries if stream.frames else ()  # MP4's is whole, Matroska's has key frames alone
+    return sum(not entry.is_discard for entry in index) or stream.frames or None
 
 
 def _turns(frame) -> tuple[int, bool]:
