@@ -99,8 +99,7 @@ def enhance_video(
     if Path(source).is_file() and Path(source).suffix.lower() in PICTURES:
         raise ValueError(f"{source} is one picture; put it into a folder, and give that")
     clip = Pictures(source) if Path(source).is_dir() else read_video(source)
-    if Path(out).exists() and Path(out).samefile(source):
-        raise ValueError(f"{out} is the clip itself; write the enhanced one elsewhere")
+    _check_apart(Path(out), {"the clip itself": source, "the folder of instances": instances, "where the photos are": like})
     ids = None if instances is None else ObjectIds(instances, clip.count)
     enhancer = enhancer or Enhancer.load()
     if ids is not None and "instance" not in enhancer.reads:
@@ -124,6 +123,8 @@ def enhance_video(
             done += 1
             if progress is not None:
                 progress(done, clip.count)
+        if ids is not None:
+            ids.check_count(done)  # what a video claims may be wrong, and many claim nothing
     if clip.dropped:
         warn([f"{out} is without what {'pictures of ' * isinstance(clip, Pictures)}{source} had: {clip.dropped}"])
     if isinstance(clip, Video):
@@ -135,6 +136,15 @@ def enhance_video(
         why = f"its colours are those of {like}" if like is not None else _why(rendered, instances, told)
         warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
     return done, changed
+
+
+def _check_apart(out: Path, read: dict[str, str | Path | None]) -> None:
+    """ValueError where `out`, which is replaced, is one of what is read, by what that is, or the folder of a picture that is read."""
+    for what, path in read.items():
+        if path is None or not out.exists() or not Path(path).exists():  # what is not there is refused where it is read
+            continue
+        if out.samefile(path) or (Path(path).suffix.lower() in PICTURES and out.samefile(Path(path).parent)):
+            raise ValueError(f"{out} is {what}; write the enhanced one elsewhere")
 
 
 def _writer(out: str | Path, clip: Pictures | Video) -> PictureWriter | VideoWriter:

@@ -27,7 +27,7 @@ class Pictures:
         self.files = in_order(self.path, PICTURES)
         if not self.files:
             raise ValueError(f"{folder} holds no pictures ({', '.join(PICTURES)}), and is no video")
-        for one, other in pairwise(sorted(self.files)):
+        for one, other in pairwise(sorted(self.files, key=lambda file: (file.stem, file))):
             if one.stem == other.stem:
                 raise ValueError(f"{folder} holds {one.name} and {other.name}, which would both become {one.stem}.png; take one out")
         self.count = len(self.files)

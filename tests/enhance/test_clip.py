@@ -3,6 +3,7 @@
 import io
 from dataclasses import replace
 from fractions import Fraction
+from shutil import copytree
 
 import av
 import numpy as np
@@ -146,6 +147,10 @@ def test_a_folder_of_pictures_becomes_one(tmp_path, pictures, capsys):
     Image.new("RGB", (50, 34)).save(pictures / "f9.tif")
     with pytest.raises(ValueError, match=r"f9.png and f9.tif, which would both become f9.png"):
         enhance_video(pictures, tmp_path / "other", Marking())
+    (pictures / "f9.tif").rename(pictures / "f9.jpg")
+    write_image(pictures / "f9.k.png", torch.zeros(34, 50, 3))  # sorted, it stands between the two
+    with pytest.raises(ValueError, match=r"f9.jpg and f9.png, which would both become f9.png"):
+        enhance_video(pictures, tmp_path / "other", Marking())
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="holds no pictures"):
         enhance_video(tmp_path / "empty", tmp_path / "other", Marking())
@@ -240,6 +245,57 @@ def test_ids_that_do_not_fit_are_refused(tmp_path, pictures, capsys):
     refused("has ids for 2 pictures, and the clip has 3")
 
 
+def test_a_folder_above_the_ids_is_refused_with_where_they_are(tmp_path, pictures):
+    for kept in ("depth", "instance"):
+        (tmp_path / "out" / kept).mkdir(parents=True)
+        np.save(tmp_path / "out" / kept / "000000.npy", np.zeros((34, 50), np.int32))
+    with pytest.raises(ValueError, match=r"out holds no .npy or .png that say where .*, one a picture; .*/out/instance does$"):
+        enhance_video(pictures, tmp_path / "clean", Marking(), instances=tmp_path / "out")
+
+
+def ids_of(folder, count):
+    folder.mkdir()
+    for i in range(count):
+        np.save(folder / f"{i}.npy", np.zeros((34, 50), np.int32))
+    return folder
+
+
+@pytest.mark.parametrize("told", [3, 5])
+def test_ids_for_fewer_or_more_frames_than_a_video_has_are_refused_though_it_tells_no_number(tmp_path, told):
+    write(tmp_path / "in.mkv")
+    with pytest.raises(ValueError, match=f"ids has ids for {told} pictures, and the clip has"):
+        enhance_video(tmp_path / "in.mkv", tmp_path / "out.mp4", Marking(), instances=ids_of(tmp_path / "ids", told))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ids", "in.mkv"]
+
+
+def test_ids_are_told_for_the_frames_that_a_cut_video_shows(tmp_path):
+    """A cut without encoding anew keeps the frames that the first one shown needs, and hides them by an edit list."""
+    with VideoWriter(tmp_path / "in.mp4", 10, 50, 34) as video:
+        for i in range(6):
+            video.write(torch.full((34, 50, 3), 0.1 * i))
+    with av.open(str(tmp_path / "in.mp4")) as whole, av.open(str(tmp_path / "cut.mp4"), "w") as cut:
+        source = whole.streams.video[0]
+        stream = cut.add_stream_from_template(source)
+        for packet in whole.demux(source):
+            if packet.dts is not None:
+                packet.pts, packet.dts, packet.stream = packet.pts - 2 * packet.duration, packet.dts - 2 * packet.duration, stream
+                cut.mux(packet)
+    with av.open(str(tmp_path / "cut.mp4")) as cut:
+        assert cut.streams.video[0].frames == 6
+    assert read_video(tmp_path / "cut.mp4").count == len(list(read_video(tmp_path / "cut.mp4"))) == 4
+    assert enhance_video(tmp_path / "cut.mp4", tmp_path / "out.mp4", Marking(), instances=ids_of(tmp_path / "four", 4)) == (4, 0)
+    with pytest.raises(ValueError, match="six has ids for 6 pictures, and the clip has 4; give one file a picture"):
+        enhance_video(tmp_path / "cut.mp4", tmp_path / "other.mp4", Marking(), instances=ids_of(tmp_path / "six", 6))
+
+
+def test_ids_are_counted_against_frames_that_came_and_not_those_that_a_video_claims(tmp_path, monkeypatch):
+    write(tmp_path / "in.mp4")
+    monkeypatch.setattr("render.video._shown", lambda stream: 5)
+    with pytest.raises(ValueError, match="ids has ids for 5 pictures, and the clip has 4"):
+        enhance_video(tmp_path / "in.mp4", tmp_path / "out.mp4", Marking(), instances=ids_of(tmp_path / "ids", 5))
+    assert not (tmp_path / "out.mp4").exists()
+
+
 def test_a_model_that_cannot_be_told_says_so(tmp_path, pictures):
     deaf = Marking()
     deaf.reads, deaf.about = (), {"model": "NVIDIA Fixer"}
@@ -251,6 +307,15 @@ def test_a_clip_is_not_written_over_itself(tmp_path, enhancer):
     write(tmp_path / "in.mp4")
     with pytest.raises(ValueError, match="itself"):
         enhance_video(tmp_path / "in.mp4", tmp_path / "in.mp4", enhancer)
+
+
+@pytest.mark.parametrize(("told", "read"), [("instances", "ids"), ("like", "ids"), ("like", "ids/f9.png")])
+def test_a_clip_is_not_written_over_what_it_goes_by(tmp_path, pictures, told, read):
+    copytree(pictures, tmp_path / "ids")
+    where = "the folder of instances" if told == "instances" else "where the photos are"
+    with pytest.raises(ValueError, match=f"ids is {where}; write the enhanced one elsewhere"):
+        enhance_video(pictures, tmp_path / "ids", Marking(), **{told: tmp_path / read})
+    assert len(list((tmp_path / "ids").iterdir())) == 3
 
 
 def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
