@@ -17,7 +17,7 @@ from enhance.pairs.clips import Clip, PairConfig, clip_label, of_scene
 from enhance.pairs.damage import Damage, Sources, make
 from enhance.pairs.diffusion_renderer import Relit
 from enhance.pairs.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed_as, refits, shots_of
-from enhance.pairs.shards import KINDS, NOTE, PairSet, to_bytes, write_shard
+from enhance.pairs.shards import KINDS, NOTE, PairSet, is_whole, to_bytes, write_shard
 from recon import open_log, stopped_early
 from recon.align import as_aligned
 from recon.assets.extract import FEWEST_SPLATS, Candidate, candidates
@@ -99,8 +99,8 @@ def make_pairs(
 
 
 def _is_made(out: Path, kind: str, camera: LogCamera, start: int) -> bool:
-    """Whether a clip is there, whose description is written last."""
-    return (out / kind / f"{clip_label(camera.name, start)}.json").exists()
+    """Whether a clip is there."""
+    return is_whole(out / kind / f"{clip_label(camera.name, start)}.safetensors")
 
 
 def _ask(relit: Relit, starts: list[tuple[LogCamera, int]], config: PairConfig) -> None:

@@ -9,20 +9,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from enhance.pairs.clips import PairConfig
+from enhance.pairs.clips import PairConfig, clip_label
 from enhance.pairs.isp import alter, random_pipeline
 from enhance.pairs.make import claim
 from enhance.pairs.masks import random_mask
-from enhance.pairs.shards import to_bytes, write_shard
+from enhance.pairs.shards import is_whole, to_bytes, write_shard
 from enhance.photos import Photos
 
 STRIDE = 8
+MADE = ("isp", "isp_frame", "clean")
+"""Kinds of pairs of each photo."""
 
 
 def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0, width: int = 640) -> Path:
     """Of every photo in the folders and every STRIDE-th frame of the videos `paths`, `width` pixels wide, a clip of one frame of isp,
     isp_frame and clean in the folder `out`, which is returned. Where a region is in other colours, it is told as instance 1; in clean the
-    same region is told and is as it was.
+    same region is told and is as it was. A run that was broken off goes on where it stopped.
 
     They are for measuring: training draws from photos by itself (`train(photos=...)`), so the split is "held out". ValueError where a path
     holds no photos, where two have one name, and where the folder holds pairs of others of that name or made with other settings; and for a
@@ -32,9 +34,13 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
     check_names(paths)
     for path in map(Path, paths):
         photos = Photos((path,), STRIDE, config.width).frames
-        digest = hashlib.sha256(photos[0].tobytes()).hexdigest()[:16]
-        claim(out, {"seed": seed, "width": config.width}, {f"source {path.stem}": f"{len(photos)} {digest}"})
+        digest = hashlib.sha256()
+        for photo in photos:  # all: a pair that is there is not made again of another photo
+            digest.update(photo.tobytes())
+        claim(out, {"seed": seed, "width": config.width}, {f"source {path.stem}": f"{len(photos)} {digest.hexdigest()[:16]}"})
         for i, photo in enumerate(photos):
+            if all(is_whole(_file(out, kind, path.stem, i)) for kind in MADE):
+                continue
             rng = np.random.default_rng([seed, i])
             target = torch.from_numpy(photo).permute(2, 0, 1).float() / 255
             region = torch.from_numpy(random_mask(rng, *photo.shape[:2]))[None]
@@ -64,4 +70,8 @@ def _write(out: Path, kind: str, given: torch.Tensor, target: torch.Tensor, told
         "visible": torch.zeros(1, height, width, dtype=torch.uint8),
         "depth": torch.full((1, height, width), torch.inf, dtype=torch.float16),
     }
-    write_shard(out / kind / f"{meta['camera']}_{meta['start']:04d}.safetensors", tensors, {"kind": kind, **meta})
+    write_shard(_file(out, kind, meta["camera"], meta["start"]), tensors, {"kind": kind, **meta})
+
+
+def _file(out: Path, kind: str, camera: str, start: int) -> Path:
+    return out / kind / f"{clip_label(camera, start)}.safetensors"

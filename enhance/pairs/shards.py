@@ -157,6 +157,11 @@ def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> Non
         Path(half).write_text(json.dumps({"frames": t, "height": h, "width": w, **meta}, indent=1))
 
 
+def is_whole(path: Path) -> bool:
+    """Whether `write_shard` has finished the clip that it stores there."""
+    return path.with_suffix(".json").exists()
+
+
 class PairSet:
     """All finished shards of a pairs folder, or of several; of a folder with one such folder a scene, all of these."""
 

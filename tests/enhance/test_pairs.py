@@ -416,3 +416,22 @@ def test_photos_become_pairs_that_are_held_out_and_told_their_region(tmp_path):
         changed = (a.input != a.target).any(1, keepdim=True)
         assert changed.any() and not changed[a.region == 0].any()
         assert torch.equal(a.instance, b.instance) and ((a.instance == 1) == (a.region > 0.5)).float().mean() > 0.99
+
+
+def test_pairs_of_photos_go_on_where_they_stopped(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for i in range(3):
+        write_image(tmp_path / "photos" / f"{i}.png", torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(i)))
+
+    def made() -> dict[Path, tuple[int, bytes]]:
+        out = make_photo_pairs([tmp_path / "photos"], tmp_path / "made", width=64)
+        return {file: (file.stat().st_mtime_ns, file.read_bytes()) for file in out.glob("*/*.safetensors")}
+
+    before = made()
+    (tmp_path / "made" / "isp_frame" / "photos_0001.json").unlink()
+    after = made()
+    assert {file for file in before if before[file][0] != after[file][0]} == {f for f in before if f.stem == "photos_0001"}
+    assert len(before) == 9 and all(before[file][1] == after[file][1] for file in before)
+    write_image(tmp_path / "photos" / "2.png", torch.zeros(60, 80, 3))
+    with pytest.raises(ValueError, match="holds pairs of another source photos, or of this one before it was changed"):
+        made()
