@@ -21,7 +21,7 @@ from render.record import Stages
 from render.references import READS as NEEDED
 from render.references import References
 from render.video import Video, VideoWriter, odd_warning, read_video
-from scenes.pictures import PICTURES
+from scenes.pictures import PICTURES, count_of, opened
 from scenes.scene import Scene
 from scenes.warnings import warn
 
@@ -97,6 +97,11 @@ def enhance_video(
     changed. Raises FileNotFoundError, and ValueError where the source cannot be decoded; nothing is left under `out` then.
     """
     if Path(source).is_file() and Path(source).suffix.lower() in PICTURES:
+        with opened(source, str(source), "fetch or export it again") as picture:
+            count = count_of(picture)
+        if count > 1:
+            fix = f"store each as a file of its own, as by magick {quote(str(source))} -coalesce FOLDER/%06d.png, and give their folder"
+            raise ValueError(f"{source} holds {count} pictures, of which only the first would be read; {fix}")
         raise ValueError(f"{source} is one picture; put it into a folder, and give that")
     clip = Pictures(source) if Path(source).is_dir() else read_video(source)
     _check_apart(Path(out), {"the clip itself": source, "the folder of instances": instances, "where the photos are": like})

@@ -45,14 +45,22 @@ def rgb_of(picture: Image.Image) -> Image.Image:
 
 
 def dropped_of(picture: Image.Image) -> str:
-    """What `rgb_of` leaves out of an opened picture, '' for nothing: its alpha channel, or what its values have beyond 8 bits."""
+    """What `rgb_of` leaves out of an opened picture, '' for nothing: its alpha channel, what its values have beyond 8 bits, or further
+    pictures of its file."""
     finer = picture.mode[0] in "IF" or any(";16" in str(tile[3]) for tile in getattr(picture, "tile", ()))
-    return unread(picture.has_transparency_data, finer)
+    return unread(picture.has_transparency_data, finer, count_of(picture))
 
 
-def unread(alpha: bool, finer: bool) -> str:
-    """What 8-bit RGB has no place for, in words."""
-    return " and ".join(["its alpha channel"] * alpha + ["all beyond 8 bits of its values"] * finer)
+def unread(alpha: bool, finer: bool, count: int = 1) -> str:
+    """What one picture of 8-bit RGB has no place for, in words."""
+    further = [f"all but the first of its {count} pictures"] * (count > 1)
+    return " and ".join(["its alpha channel"] * alpha + ["all beyond 8 bits of its values"] * finer + further)
+
+
+def count_of(picture: Image.Image) -> int:
+    """How many pictures an opened file holds, one after another, as animations and scans do. A camera's MPO counts as one: what follows
+    there is the same picture again, in small or as another lens saw it."""
+    return 1 if picture.format == "MPO" else getattr(picture, "n_frames", 1)
 
 
 def is_turned(picture: Image.Image) -> bool:

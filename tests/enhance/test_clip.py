@@ -171,6 +171,20 @@ def test_what_a_pictures_enhanced_one_lacks_is_said(tmp_path, pictures, capsys, 
     assert said in errors and ("is without what" in errors) == bool(said)
 
 
+@pytest.mark.parametrize("suffix", [".webp", ".tif", ".png"])
+def test_a_file_of_several_pictures_is_not_taken_for_one(tmp_path, pictures, capsys, suffix):
+    first, *others = (Image.new("RGB", (50, 34), (level, level, level)) for level in (40, 120, 220))
+    (pictures / "f9.png").unlink()
+    first.save(pictures / f"f9{suffix}", save_all=True, append_images=others)
+    enhance_video(pictures, tmp_path / "out", Marking())
+    assert f"of f9{suffix} all but the first of its 3 pictures\n" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=rf"^{pictures}/f9{suffix} holds 3 pictures, of which only .*; store each .* -coalesce"):
+        enhance_video(pictures / f"f9{suffix}", tmp_path / "out.mp4", Marking())
+    first.save(pictures / f"f9{suffix}", "MPO", save_all=True, append_images=others)  # as phones store a photo and its preview
+    enhance_video(pictures, tmp_path / "out", Marking())
+    assert "is without what" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("stored", "alpha", "said"),
     [
