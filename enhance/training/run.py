@@ -128,21 +128,21 @@ class Run:
         self._loss[stage] = torch.lerp(self._loss.get(stage, loss), loss, 0.02)
         self.step[stage] += 1
 
-    def loss(self, stage: str) -> float:
-        """The stage's loss, smoothed over some 50 steps. ValueError where one since the start was not finite."""
-        loss = float(self._loss.get(stage, 0.0))
-        if not np.isfinite(loss):
+    def loss(self, stage: str) -> float | None:
+        """The stage's loss, smoothed over some 50 steps; None where none is known, as before its first step. ValueError where one since the
+        start was not finite."""
+        loss = float(self._loss[stage]) if stage in self._loss else None
+        if loss is not None and not np.isfinite(loss):
             where = f"by step {self.step[stage]}"
             raise ValueError(f"the {stage}'s loss is {loss} {where}; check the pairs for damaged files, or lower the rate")
         return loss
 
     def save(self, path: Path) -> None:
         """Write the checkpoint from which `load` goes on. ValueError where a loss is not finite: the former checkpoint stays."""
-        for stage in STAGES:  # weights that are spoilt must not take the place of good ones
-            self.loss(stage)
+        losses = {stage: self.loss(stage) for stage in self._loss}  # weights that are spoilt must not take the place of good ones
         state = {name: part.state_dict() for name, part in self.parts().items()}
         facts = {"config": asdict(self.config), "seed": self.seed, "step": self.step, "seconds": self.seconds, "told": self.told}
-        save_state(path, {**facts, **state})
+        save_state(path, {**facts, "loss": losses, **state})
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint. ValueError where that is not whole, or of a training of something else."""
@@ -159,6 +159,7 @@ class Run:
             for name, part in self.parts().items():
                 part.load_state_dict(state[name])
             self.step, self.seconds = state["step"], state["seconds"]
+            self._loss = {k: torch.tensor(v, device=self.device) for k, v in state.get("loss", {}).items()}
         except (LookupError, RuntimeError, ValueError) as error:
             raise _broken(path, error) from error
 

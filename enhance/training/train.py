@@ -373,4 +373,7 @@ class _Reporter:
             return
         self.told = time.monotonic()
         done = sum(self.run.share(name) * self.run.done(name) for name in STAGES)
-        self.progress(done, f"{stage}: {said or f'step {self.run.step[stage]}, loss {self.run.loss(stage):.4f}'}")
+        if said is None:
+            loss = self.run.loss(stage)
+            said = f"step {self.run.step[stage]}" + ("" if loss is None else f", loss {loss:.4f}")
+        self.progress(done, f"{stage}: {said}")

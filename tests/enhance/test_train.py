@@ -16,11 +16,12 @@ from enhance.evaluate import ALL_TOLD, ALONE, METHODS, PUT_IN, _told, evaluate, 
 from enhance.network.net import Net, NetConfig
 from enhance.network.weights_file import BUILTIN, load_net
 from enhance.pairs.shards import PairSet, to_bytes, write_shard
-from enhance.training.run import TrainConfig, opened
-from enhance.training.train import train
+from enhance.training.run import STAGES, Run, TrainConfig, opened
+from enhance.training.train import _Reporter, train
 from render.frame_types import Frame
 from scenes.camera import Camera
 from scenes.lenses import Pinhole
+from scenes.state import save_state
 
 ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
 DEVICES = ["cpu", pytest.param("cuda", marks=ON_A_GPU)]
@@ -165,6 +166,25 @@ def test_a_loss_that_is_not_finite_ends_a_training_before_it_is_saved(pairs, tra
     with pytest.raises(ValueError, match="enhancer's loss is nan"):
         train(pairs, trained, steps=4, config=QUICK, net=SMALL, resume=True)
     assert (trained / "checkpoint.pt").read_bytes() == kept
+
+
+def test_a_loss_is_known_after_a_resume_and_not_said_where_it_is_not(pairs, trained):
+    def reported(run: Run) -> str:
+        lines: list[str] = []
+        _Reporter(run, lambda share, line: lines.append(line))("enhancer")
+        return lines[0]
+
+    checkpoint = trained / "checkpoint.pt"
+    state = opened(checkpoint)
+    run = Run(QUICK, Net(SMALL), None, 3, 0, STAGES, told=state["told"])
+    assert reported(run) == "enhancer: step 0" and set(state["loss"]) == {stage for stage, steps in state["step"].items() if steps}
+    run.load(checkpoint)
+    assert run.loss("enhancer") == state["loss"]["enhancer"] > 0
+    assert reported(run) == f"enhancer: step {state['step']['enhancer']}, loss {state['loss']['enhancer']:.4f}"
+    former = trained.parent / "former.pt"
+    save_state(former, {name: part for name, part in state.items() if name != "loss"})
+    run.load(former)
+    assert run.loss("enhancer") is None
 
 
 def test_a_gpu_gets_larger_batches_and_a_cpu_what_it_had():
