@@ -117,7 +117,9 @@ def reconstruct(
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)
     checkpoint = checkpoint_path(output)
-    saved = load_checkpoint(checkpoint, options) if resume else None
+    # a drive's folder is nobody's business whom its scene is given to
+    held = options | {"folder": str(log.path.resolve()), "world_from_model": log.meta.get("world_from_model")}
+    saved = load_checkpoint(checkpoint, held) if resume else None
 
     within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     for sweep in () if saved else within:
@@ -138,7 +140,7 @@ def reconstruct(
     def keep() -> None:
         so_far = {"seconds": seconds(), "live": live.curve, "path": {MOVED: log.meta.get(MOVED)}}
         so_far["movers"] = plain_tracks(log.tracks) if "movers" in log.meta else None
-        save_checkpoint(checkpoint, options, start, fit.tensors() | so_far)
+        save_checkpoint(checkpoint, held, start, fit.tensors() | so_far)
 
     with Progress("fit", total=config.steps) as steps:
         steps.resume(fit.step_count)
@@ -290,7 +292,8 @@ def begin(
     if exposed is not None:
         frames = replace(frames, views=[replace(v, gain=exposed[names[v.camera]].gain_at(v.time_us)) for v in frames.views])
     if start is not None:
-        frames = replace(frames, views=[replace(v, gain=gain) for v, gain in zip(frames.views, start.gains, strict=True)])
+        told = zip(frames.views, start.gains, start.skies, strict=True)
+        frames = replace(frames, views=[replace(v, gain=gain, sky=sky) for v, gain, sky in told])
         return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
     sparse = log.points
     if sparse is None and not log.sweeps_within(span):

@@ -21,7 +21,7 @@ from scenes.lenses import LENSES
 from scenes.state import load_state, save_state
 from scenes.trajectory import Trajectory
 
-VERSION = 16
+VERSION = 17
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -54,6 +54,10 @@ def load_checkpoint(path: Path, options: dict) -> tuple[Start, dict]:
 
 def _other(name: str, saved: Any, value: Any) -> str:
     """How an option of a checkpoint differs, in the words of the command line where it has any."""
+    if name == "world_from_model" and saved and value:
+        if saved["scale"] == value["scale"]:
+            return "another model of its pictures"
+        return f"{saved['scale']:g} metres per unit of its model, not {value['scale']:g}"
     if name != "span_us" or saved is None:
         return f"{name} {saved!r}, not {value!r}"
     lasted, lasts = ((end - start) / 1e6 for start, end in (saved, value))
@@ -78,6 +82,7 @@ def _plain_start(start: Start) -> dict:
         "measured": [[m.views, m.weight] for m in start.measured],
         "swept": start.swept.keys,
         "gains": list(start.gains),
+        "skies": list(start.skies),
     }  # fmt: skip
 
 
@@ -122,5 +127,5 @@ def _start(plain: dict, fit: dict) -> Start:
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
     measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
-    told = (fit["sky"], fit["exposures"], ego, ground, plain["ground_shown"], rig, measured, swept, tuple(plain["gains"]))
+    told = (fit["sky"], fit["exposures"], ego, ground, plain["ground_shown"], rig, measured, swept, tuple(plain["gains"]), tuple(plain["skies"]))
     return Start(splats, tracks_of(plain["tracks"]), *told)

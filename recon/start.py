@@ -56,7 +56,7 @@ WIDEST_SEED = 0.012
 @dataclass
 class Start:
     """The start of a fit: splats of background and actors, the tracks they belong to, sky, exposures, the body's path, ground and what is
-    known of it, rig, the depths that were measured in views, where nothing stands, and the views' gains."""
+    known of it, rig, the depths that were measured in views, where nothing stands, the views' gains, and what of them is sky."""
 
     splats: Splats
     tracks: list[Track]
@@ -69,6 +69,7 @@ class Start:
     measured: tuple[Measured, ...]
     swept: Swept
     gains: tuple[torch.Tensor | None, ...]
+    skies: tuple[torch.Tensor, ...]
 
 
 def prepare(
@@ -147,9 +148,9 @@ def prepare(
     filled, *groups = (fewer(group, max(1, share * len(group))) for group in (filled, *groups))
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
-    told_gains = tuple(v.gain for v in frames.views)
+    of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
     ground_shown = shown_ground(split.static, ground)  # by lidar alone: points from pictures are as far off as what it is to mend
-    return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(measured), swept, told_gains)
+    return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(measured), swept, *of_views)
 
 
 def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:

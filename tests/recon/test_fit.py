@@ -196,6 +196,7 @@ def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive,
 
 def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, monkeypatch):
     log, out = open_log(drive), tmp_path / "scene"
+    log = replace(log, meta={**log.meta, "world_from_model": {"scale": 4.0}})
     with pytest.raises(FileNotFoundError, match="without --resume"):
         reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
 
@@ -212,6 +213,11 @@ def test_resuming_nothing_other_options_or_rubbish_is_refused(drive, tmp_path, m
         reconstruct(log, out, size=SIZE, config=CONFIG, held_out=4, resume=True)
     with pytest.raises(ValueError, match=r"made with a --duration of 0.8s, not 0.5s; repeat its options"):
         reconstruct(log, out, size=SIZE, config=CONFIG, duration_us=500_000, resume=True)
+    other = replace(log, meta={**log.meta, "world_from_model": {"scale": 8.0}})
+    with pytest.raises(ValueError, match="made with 4 metres per unit of its model, not 8; repeat its options"):
+        reconstruct(other, out, size=SIZE, config=CONFIG, resume=True)
+    with pytest.raises(ValueError, match=f"made with folder '{drive}', not '{tmp_path}'"):
+        reconstruct(replace(log, path=tmp_path), out, size=SIZE, config=CONFIG, resume=True)
     checkpoint_path(out).write_bytes(checkpoint_path(out).read_bytes()[:2000])
     with pytest.raises(ValueError, match="scene.fit"):
         reconstruct(log, out, size=SIZE, config=CONFIG, resume=True)
@@ -306,6 +312,18 @@ def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, t
     kept = load_checkpoint(tmp_path / "scene.fit", {})[0]
     assert len(kept.swept.keys) and torch.equal(kept.swept.keys, start.swept.keys)
     assert all(torch.equal(m.nan_to_num(), kept.measured[0].views[w].nan_to_num()) for w, m in depths.items())
+
+
+def test_a_fit_goes_on_under_the_sky_that_it_began_with(drive, tmp_path):
+    """What points of pictures told of it is not sought again."""
+    log = open_log(drive)
+    names, span = choose(log, ["front_camera"])
+    start, fit = begin(log, names, span, (48, 27), CONFIG, 4)
+    told = tuple(torch.rand(sky.shape) < 0.5 for sky in start.skies)
+    save_checkpoint(tmp_path / "scene.fit", {}, replace(start, skies=told), fit.tensors())
+    kept = load_checkpoint(tmp_path / "scene.fit", {})[0]
+    again = begin(log, names, span, (48, 27), CONFIG, 4, kept)[1]
+    assert all(torch.equal(view.sky, sky) for view, sky in zip(again.frames.views, told, strict=True))
 
 
 def test_what_the_sky_stands_in_for_comes_back(drive):
