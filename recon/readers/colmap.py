@@ -150,11 +150,12 @@ def camera_names(model: Model) -> dict[int, str]:
 
 
 def _lead(model: Model) -> int:
-    """The camera that stands for the body: the one with most pictures, one whose name says front among equals."""
+    """The camera that stands for the body: of those with at least half as many pictures as any has, one whose name says front, else the one
+    with most. A rig's front camera lacks one that was not registered now and then, and to the left of another is not the car's left."""
     keys = sorted({i.camera for i in model.images})
     count = {key: sum(i.camera == key for i in model.images) for key in keys}
     ahead = {key: any("front" in i.name.lower() for i in model.images if i.camera == key) for key in keys}
-    return max(keys, key=lambda k: (count[k], ahead[k], -k))
+    return max((k for k in keys if 2 * count[k] >= max(count.values())), key=lambda k: (ahead[k], count[k], -k))
 
 
 def _picture_folder(path: Path, where: Path, name: str) -> Path:

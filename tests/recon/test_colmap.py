@@ -145,6 +145,13 @@ def test_two_cameras_share_the_moments_of_equal_names(street, tmp_path):
     torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("registered", "lead"), [(5, "front"), (2, "left")])
+def test_the_front_camera_is_the_body_unless_it_lacks_most_pictures(street, tmp_path, registered, lead):
+    pair = {"left": pictures_along(street, "left_camera", count=6), "front": pictures_along(street, count=6)[:registered]}
+    log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
+    assert next(iter(log.cameras)) == lead and log.meta["body"].startswith(f"camera {lead},")
+
+
 def renamed(folder, names):
     """A workspace whose pictures, in the order in which they were taken, have other names."""
     images = folder / "sparse/0/images.txt"

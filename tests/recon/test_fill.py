@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from recon.seeds.fill import FAR, unexplained
@@ -8,8 +9,10 @@ from recon.seeds.sweep import companions, swept_depth
 from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sky, seen_sky, sky_mask
 from recon.view import View
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
+from scenes.ground import Ground
 
 GREY = np.full(3, 0.5)
+DEEP = Ground(torch.full((2, 2), -40.0), (0.0, 0.0), 1.0)
 
 
 def house_under_sky():
@@ -66,15 +69,35 @@ def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
     sky = np.zeros((60, 80), bool)
     sky[:25] = True
     view = View(0, 0, 0, image, False, torch.zeros(60, 80, dtype=torch.bool))
-    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3), -40.0, [])
+    cloud, width = unexplained(view, camera(), alpha, depth, sky, np.ones(3), DEEP, [])
     assert len(cloud.xyz) > 10 and np.abs(cloud.xyz[:, 0] - 12).max() < 1e-6 and (cloud.xyz[:, 2] > -2).all()
     assert (width > 0).all()
     eaves = (cloud.xyz[:, 2] > cloud.xyz[:, 2].max() - 1e-6) & (np.abs(cloud.xyz[:, 1]) < 2)  # a row of their pixels is sky
     assert eaves.any()
     np.testing.assert_allclose(cloud.rgb[eaves], np.broadcast_to(np.array([150, 120, 90]) / 255, (eaves.sum(), 3)), atol=1e-6)
-    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), -40.0, [])[0]
+    nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), DEEP, [])[0]
     up = nothing.xyz[:, 2] > 0
     assert np.abs(nothing.xyz[up, 0] - FAR).max() < 1e-6 and np.abs(nothing.xyz[:, 2].min() + 40) < 1e-6
+
+
+@pytest.mark.parametrize("rise", [-0.12, 0.0, 0.08])
+def test_what_fills_gaps_lies_on_the_street_however_that_falls_and_never_under_it(rise):
+    """A camera 1.5 m above a street; nothing is explained but its lowest rows, said to be far away."""
+    street = Ground((rise * torch.arange(0, 101.0)).expand(2, 101).contiguous(), (0.0, -50.0), 1.0)
+    pose = camera().world_from_cam.clone()
+    pose[2, 3] = 1.5
+    high = replace(camera(), world_from_cam=pose)
+    image = torch.full((60, 80, 3), 90, dtype=torch.uint8)
+    view = View(0, 0, 0, image, False, torch.zeros(60, 80, dtype=torch.bool))
+    alpha = np.zeros((60, 80))
+    alpha[54:] = 1
+    depth = np.where(alpha > 0, 90.0, np.inf)
+    cloud, _ = unexplained(view, high, alpha, depth, np.zeros((60, 80), bool), np.ones(3), street, [])
+    falls = (cloud.xyz[:, 2] - 1.5) / cloud.xyz[:, 0]
+    over = cloud.xyz[:, 2] - rise * cloud.xyz[:, 0]
+    meets = falls < min(rise - 1.5 / 90, -1e-3)
+    assert meets.sum() > 20 and np.abs(over[meets]).max() < 1e-6
+    assert np.abs(cloud.xyz[~meets, 0] - 90).max() < 1e-6
 
 
 def test_what_stands_far_behind_a_house_is_found_there_by_other_pictures():

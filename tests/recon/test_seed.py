@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from randomized import gaussians
 
@@ -85,6 +86,14 @@ def test_thinning_meets_its_budget_and_keeps_more_near_the_path():
     assert 3500 < len(chosen.xyz) <= 5500 and len(sides) == len(chosen.xyz)
     near = np.linalg.norm(chosen.xyz, axis=1) < 10
     assert near.mean() > 3 * (distance < 10).mean()
+
+
+@pytest.mark.parametrize("start", [(0.0, -5500.0, 0.0), (-9000.0, 9000.0, 300.0)])
+def test_thinning_keeps_as_many_however_far_from_the_start(start):
+    xyz = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 6], (20_000, 3)) // 0.04 * 0.04 + 0.02
+    near, _ = thin(Cloud(xyz, xyz), np.full(len(xyz), 5.0), len(xyz))
+    far, _ = thin(Cloud(xyz + start, xyz), np.full(len(xyz), 5.0), len(xyz))
+    np.testing.assert_allclose(far.xyz - start, near.xyz, atol=1e-6)
 
 
 def test_fewer_splats_are_as_much_wider_and_enough_are_left_as_they_are():
