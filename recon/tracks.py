@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from recon.actors import APART_US
 from recon.log import Track
 from scenes.poses import inverse, pose_from
 from scenes.trajectory import Trajectory
@@ -21,8 +22,15 @@ VEHICLES = {
 }  # fmt: skip
 
 MOVED = 1.0
-"""Metres that a box's middle goes before it counts as moving, where the log does not say: annotators' boxes wander by half of that."""
+"""Metres in plan that a box's middle goes before it counts as moving, where the log does not say: annotators' boxes wander by half of that,
+and heights by more, as GPS does."""
 
+RARE = 2.5
+"""Times as long as the shortest between two of its boxes may be that between two others for something to be known between them, however
+rarely a log annotates."""
+
+MOMENT_US = 50_000
+"""Before and after its only box, in which something that moves is taken to be there: in a sweep, and not in the next."""
 
 FACES_US, LIMBED_US = 750_000, 150_000
 """Between two boxes at most, for something to face in the second about as in the first: nuScenes annotates every half second, in which
@@ -60,7 +68,8 @@ def from_middles(poses: torch.Tensor, heights: np.ndarray) -> torch.Tensor:
 
 
 def tracks_of(found: list[Boxes], ego: Trajectory, where: str) -> tuple[Track, ...]:
-    """Tracks of annotated boxes, named. What goes less than `MOVED` stands. ValueError naming a box with an impossible size or place."""
+    """Tracks of annotated boxes, named. What goes less than `MOVED` stands, be a box astray or not. ValueError naming a box with an
+    impossible size or place."""
     made = []
     for boxes in found:
         order = np.argsort(boxes.times_us, kind="stable")
@@ -70,17 +79,31 @@ def tracks_of(found: list[Boxes], ego: Trajectory, where: str) -> tuple[Track, .
             raise ValueError(f"{where}: box {boxes.source} must have positive sizes and finite places, got {size.tolist()} m")
         if not (np.diff(times) > 0).all():
             raise ValueError(f"{where}: box {boxes.source} stands twice at one time")
-        middle = poses[:, :3, 3]
+        middle = _steady(poses[:, :2, 3])
         moving = bool((middle - middle.median(0).values).norm(dim=1).max() > MOVED)
         made.append(Track("", boxes.label, moving, size, times, poses, np.full(len(times), -1), (boxes.source,)))
     return named(made, ego)
 
 
+def _steady(places: torch.Tensor) -> torch.Tensor:
+    """Places `[T, 2]` without those that are alone in being off: running medians of three, at an end with where the two beside it would
+    take it (Tukey 1977)."""
+    if len(places) < 3:
+        return places
+    out = places.clone()
+    out[1:-1] = torch.stack([places[:-2], places[1:-1], places[2:]]).median(0).values
+    for end, next_, after in ((0, 1, 2), (-1, -2, -3)):
+        out[end] = torch.stack([places[end], out[next_], 3 * out[next_] - 2 * out[after]]).median(0).values
+    return out
+
+
 def named(tracks: list[Track], ego: Trajectory) -> tuple[Track, ...]:
-    """The tracks as `veh_1`, `ped_1`, `cyc_1`, `obj_1`, ..., each kind numbered by how near it came to the body; none spins (`facing`)."""
+    """The tracks as `veh_1`, `ped_1`, `cyc_1`, `obj_1`, ..., each kind numbered by how near it came to the body; none spins (`facing`), and
+    none goes on where nobody knows of it (`known`)."""
     numbers: dict[str, int] = {}
     out = []
-    for _, track in sorted(((nearness(t, ego), facing(t)) for t in tracks), key=lambda pair: (pair[0], pair[1].sources)):
+    parts = [part for track in tracks for part in known(facing(track))]
+    for _, track in sorted(((nearness(t, ego), t) for t in parts), key=lambda pair: (pair[0], pair[1].sources)):
         kind = "veh" if track.label in VEHICLES else KINDS.get(track.label, "obj")
         numbers[kind] = numbers.get(kind, 0) + 1
         out.append(replace(track, name=f"{kind}_{numbers[kind]}"))
@@ -99,6 +122,24 @@ def facing(track: Track) -> Track:
         wrong = torch.from_numpy(run[back if back.mean() <= 0.5 else ~back])
         poses[wrong] = poses[wrong] @ torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
     return replace(track, world_from_box=poses)
+
+
+def known(track: Track) -> list[Track]:
+    """A track in those parts between which it is not known where what moves was: `APART_US` apart, or `RARE` steps where these are longer.
+    Of one box alone what moves is there for a moment: a trajectory of one pose would stand there all the time."""
+    if not track.moving:
+        return [track]
+    gaps = np.diff(track.times_us)
+    longest = max(APART_US, RARE * gaps.min(initial=APART_US))
+    return [_part(track, run) for run in np.split(np.arange(len(track.times_us)), np.flatnonzero(gaps > longest) + 1)]
+
+
+def _part(track: Track, boxes: np.ndarray) -> Track:
+    """A track of these of its boxes, and for a moment where it is but one."""
+    times = track.times_us[boxes]
+    if len(boxes) == 1:
+        boxes, times = boxes.repeat(3), times + MOMENT_US * np.arange(-1, 2)
+    return replace(track, times_us=times, world_from_box=track.world_from_box[torch.from_numpy(boxes)], sensor=track.sensor[boxes])
 
 
 def nearness(track: Track, ego: Trajectory) -> float:

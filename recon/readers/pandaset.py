@@ -9,6 +9,7 @@ degrees. An object seen by two lidars has two cuboid tracks that name each other
 from __future__ import annotations
 
 import json
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -160,10 +161,12 @@ def _geodetic(path: Path) -> dict:
 def _observations(path: Path, count: int) -> dict[str, list[dict]]:
     """Every cuboid by its track's uuid, in time order: frame index and the row."""
     found: dict[str, list[dict]] = {}
-    for index in range(count):
-        file = _pickle(path / "annotations" / "cuboids", index)
-        if file is None:
-            continue
+    folder = path / "annotations" / "cuboids"
+    files = [(index, file) for index in range(count) if (file := _pickle(folder, index)) is not None]
+    if files and len(files) < count:
+        missing = next(i for i in range(count) if i not in dict(files))
+        print(f"{folder} has the boxes of {len(files)} of {count} sweeps, and not {missing:02d}{PICKLES[0]}: fetch all", file=sys.stderr)
+    for index, file in files:
         table = read_frame(file)
         needed = ["uuid", "label", "yaw", "stationary", *(f"{a}.{k}" for a in ("position", "dimensions") for k in "xyz")]
         missing = [k for k in needed if k not in table]

@@ -148,6 +148,16 @@ def test_a_drive_without_boxes_or_gps_is_a_drive(own_drive):
     assert open_log(own_drive).tracks == ()
 
 
+def test_a_drive_that_lacks_boxes_of_some_sweeps_says_so_and_what_moves_is_there_no_longer(own_drive, capsys):
+    for i in (0, 1, 3, 4, 5, 6, 7):
+        (own_drive / f"annotations/cuboids/{i:02d}.pkl.gz").unlink()
+    log = open_log(own_drive)
+    assert "annotations/cuboids has the boxes of 1 of 8 sweeps, and not 00.pkl.gz: fetch all" in capsys.readouterr().err
+    mover = next(t for t in log.tracks if t.moving)
+    stamps = [s.time_us for s in log.sweeps]
+    assert [mover.trajectory().covers(t) for t in stamps] == [s.index == 2 for s in log.sweeps]
+
+
 def test_a_folder_that_is_no_drive_is_refused_with_the_drive_inside(own_drive, tmp_path):
     with pytest.raises(ValueError, match=str(own_drive)):
         open_log(tmp_path)
