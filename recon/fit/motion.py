@@ -15,6 +15,7 @@ from recon.frames import Frames
 from recon.log import Track
 from recon.view import View
 from scenes.camera import Camera, RigCamera
+from scenes.lenses import OpenCV, Pinhole
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -154,8 +155,10 @@ class Motion:
         return splats.changed(means=means + shifts)
 
     def near(self, view: View, camera: Camera) -> list[int]:
-        """Groups of the actors that may be in a camera's view at the view's moment."""
+        """Groups of the actors that may be in a camera's view at the view's moment: all there are where its lens may look aside, or back."""
         around = self._around[self.row[view.camera, view.index]]
+        if not isinstance(camera.lens, Pinhole | OpenCV):
+            return around.groups[1:]
         pose, places, radii = camera.world_from_cam.detach().numpy(), around.bases.numpy()[1:, :3, 3], around.radii[1:]
         x, _, z = ((places - pose[:3, 3]) @ pose[:3, :3]).T
         aside = np.abs(x) - 1.5 * radii < np.maximum(z, 0) * (camera.width / (1.6 * camera.lens.focal()[0])) + radii

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +19,14 @@ GATE = 1.0, 2.0
 """Metres that an object may be off where its speed takes it, and metres a second more for the time since it was seen."""
 
 LOST = 0.3, 2.0
-"""Seconds after which an object that is not seen is given up: one that was seen a few times, and one that was seen `SEEN` times."""
+"""Seconds after which an object that is not seen is given up: one that was seen a few times, and one that was seen often enough."""
 
-SEEN = 8
-"""Sweeps that must show an object for it to be believed."""
+SOON = 1.5
+"""Steps from one sweep to the next after which the former is not given up yet, however long they take."""
+
+SEEN, SEEN_S = (5, 8), 2.0
+"""Sweeps that must show an object for it to be believed: those of so many seconds, at least and at most. Of drive 002's sweeps every fifth,
+two a second, shows nine movers so, of which none is made up; with four, two of twelve are in part."""
 
 MOVED = 0.25
 """Part of the sweeps that show an object in which it must have moved."""
@@ -33,8 +38,8 @@ before the lidar stands where nobody has seen through, and is known by its shape
 LESS = 0.8
 """Part of an object's points that must have moved again for these to be all of it."""
 
-PACE = 8
-"""Sweeps over which an object's speed is taken."""
+PACE, PACE_S = (3, 8), 1.2
+"""Sweeps over which an object's speed is taken: those of so many seconds, at least and at most."""
 
 JOLT = 0.3
 """Metres that such an object may be off where its speed takes it: what is farther is something else that stands there."""
@@ -61,11 +66,28 @@ class Cluster:
         return len(self.xyz) * (self.away() / away) ** 2
 
 
+@dataclass(frozen=True)
+class Patience:
+    """How long objects are followed that are not seen, by whether they are believed, in seconds; how many sweeps must have `seen` one; and
+    the `pace`, over how many its speed is taken."""
+
+    lost: tuple[float, float]
+    seen: int
+    pace: int
+
+    @staticmethod
+    def of(times_us: Sequence[int]) -> Patience:
+        """For sweeps at rising times."""
+        step = float(np.median(np.diff(times_us))) / 1e6 if len(times_us) > 1 else LOST[0]
+        seen, pace = (int(np.clip(round(seconds / step), *count)) for count, seconds in ((SEEN, SEEN_S), (PACE, PACE_S)))
+        return Patience((max(LOST[0], SOON * step), max(LOST[1], SOON * step)), seen, pace)
+
+
 class Followed:
     """An object's `clusters` so far, in time order, its middle in each, `places`, and the last cluster that moved, `known`."""
 
-    def __init__(self, first: Cluster):
-        self.clusters, self.places, self.known = [first], [first.middle()], first
+    def __init__(self, first: Cluster, patience: Patience):
+        self.clusters, self.places, self.known, self.patience = [first], [first.middle()], first, patience
 
     def add(self, cluster: Cluster) -> None:
         """The next cluster that moved."""
@@ -75,17 +97,17 @@ class Followed:
 
     @property
     def believed(self) -> bool:
-        return sum(c.moved for c in self.clusters) >= max(SEEN, MOVED * len(self.clusters))
+        return sum(c.moved for c in self.clusters) >= max(self.patience.seen, MOVED * len(self.clusters))
 
     def live(self, time_us: int) -> bool:
-        return time_us - self.clusters[-1].time_us <= 1e6 * LOST[self.believed]
+        return time_us - self.clusters[-1].time_us <= 1e6 * self.patience.lost[self.believed]
 
     def expected(self, time_us: int) -> tuple[np.ndarray, float]:
         """Where its middle should be at a time, `[2]`, and how far off that may be."""
         gap = (time_us - self.clusters[-1].time_us) / 1e6
         if len(self.clusters) == 1:
             return self.places[-1], GATE[0] + FASTEST * gap
-        back = min(len(self.clusters), PACE)
+        back = min(len(self.clusters), self.patience.pace)
         speed = (self.places[-1] - self.places[-back]) / (self.clusters[-1].time_us - self.clusters[-back].time_us) * 1e6
         return self.places[-1] + gap * speed, GATE[0] + GATE[1] * gap
 
@@ -109,7 +131,9 @@ class Followed:
         return True
 
 
-def follow(followed: list[Followed], found: list[Cluster], time_us: int, eye: np.ndarray, points: np.ndarray) -> None:
+def follow(
+    followed: list[Followed], found: list[Cluster], time_us: int, eye: np.ndarray, points: np.ndarray, patience: Patience
+) -> None:
     """Add a sweep's clusters to the objects that they continue, or as new ones (assignment by least total distance, Kuhn 1955).
 
     Of an object of which less is found than there was, all its `points` `[N, 3]` are taken."""
@@ -127,4 +151,4 @@ def follow(followed: list[Followed], found: list[Cluster], time_us: int, eye: np
             continue
         if i in next_of:
             one.add(found[next_of[i]])
-    followed += [Followed(c) for j, c in enumerate(found) if j not in next_of.values()]
+    followed += [Followed(c, patience) for j, c in enumerate(found) if j not in next_of.values()]

@@ -15,7 +15,7 @@ from recon.actors import MARGIN, SWEPT_MARGIN, inside
 from recon.ground import estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.movers.boxing import boxed
-from recon.movers.following import FEWEST, Cluster, Followed, follow
+from recon.movers.following import FEWEST, Cluster, Followed, Patience, follow
 from recon.movers.freespace import RangeImage, range_images, tally
 from recon.tracks import named
 from scenes.ground import Ground
@@ -55,11 +55,12 @@ def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = 
     ground = estimate_ground(some, log.ego.within((min(read), max(read))))
     images = range_images(log, read.items())
     followed: list[Followed] = []
+    patience = Patience.of(list(read))
     asked: dict[int, np.ndarray] = {}
     for time, points in read.items():
         asked[time] = candidates(log, time, points, ground)
         eye = log.ego.near(time)[:3, 3].numpy()
-        follow(followed, clusters(time, asked[time], images, eye), time, eye, asked[time])
+        follow(followed, clusters(time, asked[time], images, eye), time, eye, asked[time], patience)
         report()
     stamps = np.unique([s.time_us for s in log.sweeps])
     made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed and not _own(f, log.ego)]

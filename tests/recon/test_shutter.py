@@ -17,7 +17,8 @@ from recon.view import View
 from render import render_frame
 from render.compare import psnr
 from scenes import Camera, Pinhole
-from scenes.poses import interpolate, inverse, translation, yaw
+from scenes.lenses import Fisheye
+from scenes.poses import CAM_FROM_FLU, interpolate, inverse, translation, yaw
 
 
 @pytest.mark.parametrize("shutter", ["rows", "columns"])
@@ -94,6 +95,15 @@ def test_corrections_move_the_camera_in_the_bodys_own_frame():
     path.ego.deltas[2, 4] = 1.0  # left
     off = inverse(before) @ path.camera(views[2]).world_from_cam
     torch.testing.assert_close(off[:3, 3], torch.tensor([-EGO[1], 0, 0], dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_a_lens_that_looks_aside_sees_the_actors_there():
+    scene, views, path = motion()
+    place = scene.actors[0].trajectory.at(views[3].time_us)[:3, 3]
+    pose = translation(*(place - torch.tensor([40.0, 0, 0])).tolist()) @ yaw(1.4) @ inverse(CAM_FROM_FLU)
+    beside = Camera(Pinhole(40.0, 40.0, 48.0, 27.0), 96, 54, pose)
+    assert path.near(views[3], beside) == []
+    assert path.near(views[3], replace(beside, lens=Fisheye(30.0, 30.0, 48.0, 27.0))) == [1]
 
 
 def splats_of(scene):
