@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -44,8 +45,14 @@ BEYOND_PART = 0.06
 ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
 
+CARPET_PART = 0.15
+"""Of the splat budget that the ground may take that nobody saw: of a way of some hundred metres, 30 cm apart, it takes that much."""
+
 FILLED_PART = 0.9
 """Of the splat budget that all of these may take at most, with the ground that nobody saw and what fills holes."""
+
+LACKING = 1.5
+"""Usual steps that one from a picture of the first camera to its next takes where it lacks some between."""
 
 SKY_HEIGHT = 256
 
@@ -121,7 +128,7 @@ def prepare(
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values()))
-    background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count)])
+    background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
 
     groups, reaches, tracks = [], [], []
     most = even_limit([len(points) for points, _ in split.actors.values()], int(budget * ACTORS_PART))
@@ -162,17 +169,38 @@ def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarra
 def body_path(log: Log, frames: Frames, rig: dict[str, RigCamera]) -> Trajectory:
     """The body at the first camera's moments, from its recorded poses, one step longer at either end.
 
-    Camera poses are recorded closer to the pictures than the lidar's are.
+    Camera poses are recorded closer to the pictures than the lidar's are. Where the camera lacks some, the body goes as the log has it, and
+    no shortcut: other cameras took theirs there.
     """
     name = frames.names[0]
     camera, back = log.camera(name), inverse(rig[name].body_from_cam)
     views = [v for v in frames.views if v.camera == 0]
     times = [v.time_us for v in views]
     poses = [camera.world_from_cam[v.index] @ back for v in views]
+    times, poses = _without_gaps(log.ego, times, poses)
     if len(times) > 1:
         times = [2 * times[0] - times[1], *times, 2 * times[-1] - times[-2]]
         poses = [interpolate(poses[0], poses[1], -1.0), *poses, interpolate(poses[-2], poses[-1], 2.0)]
     return Trajectory(torch.tensor(times), torch.stack(poses))
+
+
+def _without_gaps(ego: Trajectory, times: list[int], poses: list[torch.Tensor]) -> tuple[list[int], list[torch.Tensor]]:
+    """Times and a body's poses with those of its path `ego`, where it has any, in steps of which a usual one is less than `LACKING`; moved
+    as they are before and after the step."""
+    if len(times) < 3:
+        return times, poses
+    usual = float(np.median(np.diff(times)))
+    off = inverse(ego.near_each(torch.tensor(times))) @ torch.stack(poses)
+    whole_times, whole_poses = times[:1], poses[:1]
+    for i, (first, last) in enumerate(pairwise(times)):
+        between = np.linspace(first, last, round((last - first) / usual) + 1)[1:-1].round().astype(np.int64)
+        if last - first > LACKING * usual and ((ego.times_us > first) & (ego.times_us < last)).any():
+            moved = [interpolate(off[i], off[i + 1], (t - first) / (last - first)) for t in between.tolist()]
+            whole_times += between.tolist()
+            whole_poses += list(ego.near_each(torch.from_numpy(between)) @ torch.stack(moved))
+        whole_times.append(last)
+        whole_poses.append(poses[i + 1])
+    return whole_times, whole_poses
 
 
 def even_limit(counts: Sequence[int], total: int) -> int:

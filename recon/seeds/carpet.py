@@ -12,8 +12,11 @@ from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
 from scenes.trajectory import Trajectory
 
-SPACING = 0.3
-"""Metres between the splats of the carpet."""
+SPACING, WIDER = 0.3, 1.05
+"""Metres between the splats of the carpet, and how much farther apart they are laid at least where these would be too many."""
+
+TILE = 32
+"""Spacings along a side of the squares, around the path, in which places are looked for."""
 
 WIDE = 0.75
 """Standard deviation of one along the ground, in spacings: half way between four they hide all but a fiftieth of what is below."""
@@ -34,19 +37,20 @@ LOGIT = 2.0
 """Of the opacity."""
 
 
-def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int) -> Gaussians:
-    """Flat splats on the ground within `REACH` of the path wherever `cloud` has no ground point near, coloured as what lies on it there."""
+def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: int) -> Gaussians:
+    """Flat splats on the ground within `REACH` of the path wherever `cloud` has no ground point near, coloured as what lies on it there;
+    `most` at most, farther apart on a long way."""
     off = np.abs(cloud.xyz[:, 2] - ground.height(torch.from_numpy(cloud.xyz[:, :2])).numpy())
     own = off < NEAR_GROUND
     lying = off < (LYING if (off < LYING).any() else NEAR_GROUND)
     path = ego.world_from_body[:, :2, 3].numpy()
-    low, high = path.min(0) - REACH, path.max(0) + REACH
-    grid = np.stack(np.meshgrid(*(np.arange(a, b, SPACING) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
-    grid = grid[cKDTree(path).query(grid)[0] < REACH]
-    if not own.any() or not len(grid):
+    if not own.any() or most < 1:
         return Gaussians.empty(sh_count)
-    away, _ = cKDTree(cloud.xyz[own, :2]).query(grid, workers=2)
-    xy = grid[away > 0.75 * SPACING]
+    known, spacing = cKDTree(cloud.xyz[own, :2]), SPACING
+    while len(xy := _bare(path, known, spacing)) > most:
+        spacing *= max(WIDER, (len(xy) / most) ** 0.5)
+    if not len(xy):
+        return Gaussians.empty(sh_count)
     _, nearest = cKDTree(cloud.xyz[lying, :2]).query(xy, range(1, min(ALIKE, int(lying.sum())) + 1), workers=2)
     rgb = np.median(cloud.rgb[lying][nearest], axis=1)
     n = len(xy)
@@ -56,7 +60,25 @@ def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int) -> Gaus
     return Gaussians(
         torch.from_numpy(means).float(),
         torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        torch.tensor([WIDE * SPACING, WIDE * SPACING, 0.1 * SPACING]).log().repeat(n, 1),
+        torch.tensor([WIDE * spacing, WIDE * spacing, 0.1 * spacing]).log().repeat(n, 1),
         torch.full((n,), LOGIT),
         sh,
     )
+
+
+def _bare(path: np.ndarray, known: cKDTree, spacing: float) -> np.ndarray:
+    """Places `[N, 2]` of a grid within `REACH` of a path `[P, 2]` that lie apart from all that are known, row by row. They are looked for in
+    squares around the path: a long one's bounding box holds many more."""
+    low = path.min(0) - REACH
+    across = int(np.ceil(REACH / (TILE * spacing)))
+    reach = np.arange(-across, across + 1)
+    tiles = np.unique(np.floor((path - low) / (TILE * spacing)).astype(np.int64), axis=0)
+    tiles = np.unique((tiles[:, None] + np.stack(np.meshgrid(reach, reach), -1).reshape(-1, 2)).reshape(-1, 2), axis=0)
+    inner = np.stack(np.meshgrid(np.arange(TILE), np.arange(TILE)), -1).reshape(-1, 2)
+    cells = (tiles[:, None] * TILE + inner).reshape(-1, 2)
+    cells = cells[(cells >= 0).all(1)]
+    grid = low + spacing * cells
+    near = cKDTree(path).query(grid, distance_upper_bound=REACH)[0] < REACH
+    cells, grid = cells[near], grid[near]
+    bare = np.flatnonzero(known.query(grid, workers=2)[0] > 0.75 * spacing)
+    return grid[bare[np.lexsort(cells[bare].T)]]

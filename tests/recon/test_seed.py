@@ -1,18 +1,24 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from randomized import gaussians
+from scipy.spatial import cKDTree
 
 from recon import open_log
-from recon.frames import load_frames
+from recon.frames import Frames, load_frames
+from recon.log import Log, LogCamera
 from recon.seeds.carpet import carpet
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, nearest_box, splats_from, thin
-from recon.start import even_limit
+from recon.start import body_path, even_limit
+from recon.view import View
+from scenes.camera import RigCamera
 from scenes.ground import Ground
 from scenes.harmonics import rgb_from_sh
-from scenes.poses import matrix_from_quat
+from scenes.lenses import Pinhole
+from scenes.poses import matrix_from_quat, translation, yaw
 from scenes.spread import spread
 from scenes.trajectory import Trajectory
 
@@ -119,6 +125,21 @@ def test_views_are_spread_from_first_to_last():
     assert spread(list(range(10)), 4) == [0, 3, 6, 9] and spread([1], 5) == [1]
 
 
+def test_where_the_first_camera_lacks_pictures_the_body_goes_as_the_log_has_it():
+    """Around a bend; the camera's poses have the body a little aside of where the log has it."""
+    times = 100_000 * torch.arange(12)
+    bend = torch.stack([yaw(0.05 * i) @ translation(0.0, -15.0, 0.0) for i in range(12)])
+    mount, aside = translation(1.0, 0.0, 1.5), translation(0.0, 0.2, 0.0)
+    kept = [0, 1, 2, 3, 8, 9, 10, 11]
+    camera = LogCamera("front", Pinhole(60.0, 60.0, 48.0, 27.0), 96, 54, (), times[kept], bend[kept] @ aside @ mount)
+    log = Log("bend", Path(), {"front": camera}, (), (), Trajectory(times, bend), {})
+    views = [View(0, i, int(t), torch.zeros(1, 1, 3), i == 2, torch.zeros(1, 1)) for i, t in enumerate(camera.times_us)]
+    path = body_path(log, Frames(["front"], [(96, 54)], views), {"front": RigCamera(camera.lens, 96, 54, mount)})
+    torch.testing.assert_close(path.at_each(times), bend @ aside, atol=1e-9, rtol=0)
+    bare = replace(log, ego=Trajectory(times[kept], bend[kept]))
+    assert len(body_path(bare, Frames(["front"], [(96, 54)], views), {"front": RigCamera(camera.lens, 96, 54, mount)})) == 10
+
+
 def test_what_all_movers_may_have_goes_to_each_as_evenly_as_they_can_use_it():
     generator = np.random.default_rng(0)
     for total in (50, 400, 5000):
@@ -137,7 +158,22 @@ def test_the_carpet_takes_the_streets_colour_not_that_of_a_cars_sill():
     road = road[np.abs(road[:, :2]).max(1) > 1.5]
     sill = np.array([[0.0, y, 0.15] for y in np.arange(-1, 1, 0.4)])
     rgb = np.concatenate([np.full((len(road), 3), 0.4), np.tile([[0.1, 0.1, 0.9]], (len(sill), 1))])
-    laid = carpet(Cloud(np.concatenate([road, sill]), rgb), flat, ego, 4)
+    laid = carpet(Cloud(np.concatenate([road, sill]), rgb), flat, ego, 4, 10_000)
     gap = laid.means[:, :2].abs().amax(1) < 1.3
     assert gap.sum() > 20
     torch.testing.assert_close(rgb_from_sh(laid.sh[gap, 0]), torch.full((int(gap.sum()), 3), 0.4), atol=1e-4, rtol=0)
+
+
+def test_on_a_long_way_the_carpet_keeps_to_its_part_and_still_hides_what_is_below():
+    """2 km to the north-east: the box around it has a hundred times as many places as lie along it."""
+    along = np.arange(0, 1400.0, 3.0)
+    poses = torch.stack([translation(float(x), float(x), 1.8) for x in along])
+    ego, flat = Trajectory(100_000 * torch.arange(len(along)), poses), Ground(torch.zeros(2, 2), (0.0, 0.0), 1.0)
+    road = np.column_stack([along, along - 3, 0 * along])
+    laid = carpet(Cloud(road, np.full((len(road), 3), 0.4)), flat, ego, 1, 10_000)
+    assert 8_000 < len(laid) <= 10_000
+    spread = laid.log_scales[0, 0].exp()
+    away = cKDTree(laid.means[:, :2].numpy()).query(np.column_stack([along + 5, along + 1]))[0]
+    assert (away < 1.0 / 0.75 * float(spread)).all()
+    few = carpet(Cloud(road[:9], np.full((9, 3), 0.4)), flat, Trajectory(ego.times_us[:9], poses[:9]), 1, 20_000)
+    assert few.log_scales[0, 0].exp() == pytest.approx(0.75 * 0.3)
