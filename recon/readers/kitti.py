@@ -109,8 +109,8 @@ def read_kitti_odometry(path: Path) -> Log:
     blind = "Tr" not in calib and not (path / "velodyne").is_dir()  # the calibration that comes with grey pictures knows no lidar
     mount = CAM_FROM_FLU if blind else _padded(_named(calib, "Tr", 12, path / "calib.txt"))
     cam_from_body = rigid(mount, f"{path / 'calib.txt'}, Tr")
-    # the poses' world is the first rectified camera; ours is the first body pose, whose z is up
-    poses = inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body
+    # the poses' world is the first rectified camera; ours is the first body pose, turned to where up is in the mean: it may be on a slope
+    poses = _levelled(inverse(camera_world[0] @ cam_from_body) @ camera_world @ cam_from_body)
     ego = lengthened(times, poses)
     cameras = {}
     for folder in sorted(path.glob("image_[0-3]")):
@@ -128,6 +128,18 @@ def read_kitti_odometry(path: Path) -> Log:
         "body": f"{'first camera' if blind else 'lidar'}, x forward, y left, z up",
     }  # fmt: skip
     return _log(meta, path, cameras, sweeps, (), ego, torch.zeros(3, dtype=torch.float64))
+
+
+def _levelled(poses: torch.Tensor) -> torch.Tensor:
+    """A body's poses `[F, 4, 4]`, the first of them at 0 and not turned, in a world whose z is up for most of them; the first still heads
+    along x."""
+    up = poses[:, :3, 2].mean(0)
+    up = up / up.norm()
+    left = torch.linalg.cross(up, poses[0, :3, 0])
+    left = left / left.norm()
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.stack([torch.linalg.cross(left, up), left, up])
+    return turn @ poses
 
 
 def _log(meta: dict, path: Path, cameras: dict, sweeps: tuple, tracks: tuple, ego: Trajectory, lidar: torch.Tensor) -> Log:

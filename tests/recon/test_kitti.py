@@ -153,6 +153,23 @@ def test_pictures_whose_calibration_knows_no_lidar_are_read_from_the_camera(odom
         assert other[0, 2, 1] < -0.99  # the camera's y points down
 
 
+def test_a_sequence_that_begins_on_a_slope_stands_upright(own_sequence, odometry):
+    def nodding(row):  # the first camera looks up by a tenth
+        pose = torch.tensor(row).reshape(3, 4).double()
+        up = torch.tensor([[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]])
+        pose[:, :3] = pose[:, :3] @ up if nodded == [] else pose[:, :3]
+        nodded.append(row)
+        return " ".join(f"{v:.12e}" for v in pose.flatten().tolist())
+
+    nodded = []
+    rewritten(own_sequence.parents[1] / "poses/04.txt", lambda _, row: nodding(row))
+    slope, level = (open_log(path).ego.world_from_body[1:-1] for path in (own_sequence, odometry))
+    assert len(nodded) == len(slope) and slope[0, 2, 2] < 0.997
+    assert (slope[1:, 2, 2] > 0.9997).all() and (level[:, 2, 2] > 0.9999).all()
+    for first in (slope[0], level[0]):
+        assert first[:3, 3].abs().max() < 1e-9 and abs(float(first[1, 0])) < 1e-9 and first[0, 0] > 0.99
+
+
 def test_a_piece_of_a_sequence_is_read_as_far_as_its_pictures_go(odometry, own_sequence, capsys):
     for file in ("image_2/000005.png", "image_3/000005.png", "velodyne/000005.bin"):
         (own_sequence / file).unlink()
