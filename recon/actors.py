@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -77,7 +78,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     each point is compared with where the object was when the point was taken: a second lidar passes it at another moment, and in
     sweeps between those that boxes were drawn in there is no box. Where there is one, it is the measure of its own moment.
     """
-    points: list[tuple[np.ndarray, np.ndarray]] = []
+    points: deque[tuple[np.ndarray, np.ndarray]] = deque()
     scanned = {t.name: t.times_us.astype(np.float64) for t in tracks}
     stamps = {t.name: {int(time): i for i, time in enumerate(t.times_us)} for t in tracks}
     offsets: list[float] = []
@@ -100,9 +101,12 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     retimed = [_retimed(t, scanned[t.name], usual) for t in tracks]
     corrected = tuple(track for track, _ in retimed)
 
-    static = []
+    # of a long drive there is no room for a point twice: what is sorted takes the place of what was read
+    static = np.empty((sum(len(times) for _, times in points), 3))
+    counts: list[int] = []
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
-    for sweep, (xyz, times) in zip(sweeps, points, strict=True):
+    for sweep in sweeps:
+        xyz, times = points.popleft()
         keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
         # some stamp a sweep as it begins, others as it ends
         middle = (int(times.min()) + int(times.max())) // 2 if len(times) else sweep.time_us
@@ -121,10 +125,12 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
             keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
             if (own := _own(local, track) & path.covers_each(moments).numpy()[of]).any():
                 found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
-        static.append(xyz[keep])
+        still, done = xyz[keep], sum(counts)
+        static[done : done + len(still)] = still
+        counts.append(len(still))
     return Split(
-        np.concatenate(static) if static else np.zeros((0, 3)),
-        np.repeat([s.index for s in sweeps], [len(xyz) for xyz in static]) if static else np.zeros(0, np.int64),
+        static[: sum(counts)],
+        np.repeat(np.array([s.index for s in sweeps], np.int64), counts),
         {name: (np.concatenate([p for p, _ in got]), np.concatenate([s for _, s in got])) for name, got in found.items() if got},
         corrected,
     )

@@ -29,6 +29,7 @@ from recon.fit.strides import stride_of
 from recon.frames import Frames, check_size, load_frames
 from recon.live import Live
 from recon.log import Log, Sweep, Track
+from recon.memory import check_memory
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.report import held_out_table, table_text
@@ -124,8 +125,11 @@ def reconstruct(
     within = [s for s in held_out_sweeps(log, held_out) if span[0] <= s.time_us <= span[1]]
     for sweep in () if saved else within:
         sweep.read()  # they are used after the fit: a damaged one is told before it
+    sweeps = fitted(log, held_out).sweeps_within(span)
+    if not saved:
+        check_memory(log, sweeps)
     known = (saved[1].get("path"), saved[1].get("movers")) if saved else (None, None)
-    log = readied(log, fitted(log, held_out).sweeps_within(span), config, names, span, size, *known)
+    log = readied(log, sweeps, config, names, span, size, *known)
     unseen = {s.index for s in within}
     within = [s for s in log.sweeps if s.index in unseen]  # where the corrected path has them
     start, fit = begin(fitted(log, held_out), names, span, size, config, held_out, saved[0] if saved else None, device)

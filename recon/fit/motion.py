@@ -155,7 +155,7 @@ class Motion:
         return splats.changed(means=means + shifts)
 
     def near(self, view: View, camera: Camera) -> list[int]:
-        """Groups of the actors that may be in a camera's view at the view's moment: all there are where its lens may look aside, or back."""
+        """Groups of the actors that may be in a camera's view at the view's moment: all of them where its lens may look aside, or back."""
         around = self._around[self.row[view.camera, view.index]]
         if not isinstance(camera.lens, Pinhole | OpenCV):
             return around.groups[1:]

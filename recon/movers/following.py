@@ -131,9 +131,7 @@ class Followed:
         return True
 
 
-def follow(
-    followed: list[Followed], found: list[Cluster], time_us: int, eye: np.ndarray, points: np.ndarray, patience: Patience
-) -> None:
+def follow(followed: list[Followed], found: list[Cluster], time_us: int, eye: np.ndarray, points: np.ndarray, patience: Patience) -> None:
     """Add a sweep's clusters to the objects that they continue, or as new ones (assignment by least total distance, Kuhn 1955).
 
     Of an object of which less is found than there was, all its `points` `[N, 3]` are taken."""

@@ -67,8 +67,10 @@ def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: i
 
 
 def _bare(path: np.ndarray, known: cKDTree, spacing: float) -> np.ndarray:
-    """Places `[N, 2]` of a grid within `REACH` of a path `[P, 2]` that lie apart from all that are known, row by row. They are looked for in
-    squares around the path: a long one's bounding box holds many more."""
+    """Places `[N, 2]` of a grid within `REACH` of a path `[P, 2]` that lie apart from all that are known, row by row.
+
+    They are sought in squares around the path: a long one's bounding box holds many more.
+    """
     low = path.min(0) - REACH
     across = int(np.ceil(REACH / (TILE * spacing)))
     reach = np.arange(-across, across + 1)

@@ -154,10 +154,11 @@ def thin(cloud: Cloud, distance: np.ndarray, budget: int) -> tuple[Cloud, np.nda
 def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
     level = np.round(2 * np.log2(np.maximum(k * distance / 0.04, 1.0))).astype(np.int64)
     side = 0.04 * 2.0 ** (level / 2)
-    cell = np.floor(xyz / side[:, None]).astype(np.int64)
-    cell -= cell.min(0, initial=0)
-    x, y, z = (int(n) + 1 for n in cell.max(0, initial=0))  # a long drive's cells, of 4 cm, have too many bits to be packed blindly
-    key = ((level * x + cell[:, 0]) * y + cell[:, 1]) * z + cell[:, 2]
+    key = level
+    for places in xyz.T:  # a long drive's cells, of 4 cm, have too many bits to be packed blindly
+        cell = np.floor(places / side).astype(np.int64)
+        cell -= cell.min(initial=0)
+        key = key * (int(cell.max(initial=0)) + 1) + cell
     return np.sort(np.unique(key, return_index=True)[1]), side
 
 

@@ -25,6 +25,7 @@ from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.fit.swept import Swept
 from recon.fit.turns import Turns
 from recon.log import LogCamera
+from recon.memory import check_memory
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers, mistake
 from recon.skies import cells
 from render import render_frame
@@ -176,6 +177,20 @@ def test_a_size_that_is_too_small_is_refused_before_any_picture_is_read(drive, t
     monkeypatch.setattr("recon.open_log", lambda *_: pytest.fail("opened the log"))
     with pytest.raises(ValueError, match="28x15 are too small"):
         Recon(drive, tmp_path / "scene", size=(28, 15)).run()
+
+
+def test_a_drive_with_more_lidar_than_memory_is_refused_with_the_fix(drive, tmp_path, monkeypatch):
+    log, info = open_log(drive), tmp_path / "meminfo"
+    monkeypatch.setattr("recon.memory.INFO", info)
+    monkeypatch.setattr("recon.build.readied", lambda *_: pytest.fail("went on"))
+    points = sum(len(s.read().xyz) for s in log.sweeps)
+    info.write_text(f"MemTotal: 99999999 kB\nMemAvailable: {points * 200 // 4096} kB\n")
+    with pytest.raises(ValueError, match=r"7 lidar sweeps of .* GiB are free; reconstruct a part with --duration 1s"):
+        reconstruct(log, tmp_path / "scene", size=SIZE, held_out=0, config=CONFIG)
+    for there in (True, False):
+        monkeypatch.setattr("recon.memory.INFO", info if there else tmp_path / "nowhere")
+        info.write_text(f"MemAvailable: {points * 200 // 512} kB\n")
+        check_memory(log, log.sweeps)
 
 
 def test_a_drive_whose_pictures_end_early_is_fitted_as_far_as_they_go(own_drive, tmp_path):
