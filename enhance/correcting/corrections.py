@@ -10,7 +10,7 @@ import torch
 
 from enhance.correcting.grain import Excess, Grain, of_object, usual_of, without
 from enhance.correcting.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, reaching_over, spots, whole_of
-from enhance.correcting.seam import ENDS, fitted
+from enhance.correcting.seam import fitted
 from enhance.correcting.shade import NONE, optical_depths, read_ground, shaded
 
 STEADY = 8
@@ -101,8 +101,8 @@ def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found:
             grains.append(of_object(part.permute(1, 2, 0), mask, ids <= 0))
         guesses, shades = net(Evidence.stacked(read)), net.shade(torch.stack(around))
         for i, seam, guess, shade, grain in zip(due, seams, guesses, shades, grains, strict=True):
-            colours, left = fitted(*seam, guess, net.usual)
-            new[i] = Correction(colours, shade if left > ENDS else torch.zeros_like(shade), grain, 1)
+            colours, ends = fitted(*seam, guess, net.usual)
+            new[i] = Correction(colours, ends * shade, grain, 1)
     return {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
 
 

@@ -148,6 +148,7 @@ def test_coefficients_offset_scale_and_grey():
 
 def test_a_missing_shadow_darkens_the_ground_by_the_object_and_nothing_else():
     rgb, instance = scene()
+    rgb = torch.where(instance == 5, 0.6, 0.0) + 0.4 * rgb
     instance[20:60, 50:70] = 7
     net = ObjectNet(width=16, heads=2, questions=2, rounds=1).eval()
     with torch.no_grad():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from enhance.correcting.objects import COEFFICIENTS, Objects, _edges, boxes, changed
-from enhance.correcting.seam import ENDS, effects, fitted, usual_changes
+from enhance.correcting.seam import effects, fitted, usual_changes
 from enhance.pairs.isp import Isp, alter
 
 NOTHING = torch.zeros(COEFFICIENTS)
@@ -12,10 +12,10 @@ BROAD = 0.5 * torch.eye(COEFFICIENTS)
 ISP = Isp(exposure=-0.6, red=0.2, blue=-0.2, saturation=0.7)
 
 
-def surface(seed=0, grain=0.01, h=240, w=360):
+def surface(seed=0, grain=0.01, h=240, w=360, wide=8):
     """A picture of stripes of many colours that go on from side to side, but for a little grain."""
     drawn = torch.Generator().manual_seed(seed)
-    stripes = (0.15 + 0.7 * torch.rand(3, h // 8, 1, generator=drawn)).repeat_interleave(8, 1)
+    stripes = (0.15 + 0.7 * torch.rand(3, h // wide, 1, generator=drawn)).repeat_interleave(wide, 1)
     return (stripes + grain * torch.randn(3, h, w, generator=drawn)).clamp(0.02, 0.98)
 
 
@@ -56,22 +56,30 @@ def test_a_wrong_guess_is_undone_and_one_without_usual_changes_kept():
 
 def test_what_is_right_stays_nearly_so_and_its_surface_does_not_end():
     right, ids = surface(2), region()
-    coefficients, gap = found(right, ids)
-    assert left(right, right, ids, coefficients)[0] < 2 and gap < ENDS
+    coefficients, ends = found(right, ids)
+    assert left(right, right, ids, coefficients)[0] < 2 and ends == 0
 
 
 def test_an_object_of_other_colours_ends_at_its_seam():
-    other, ids = surface(3), region()
-    rgb = torch.where(ids == 1, surface(4, 0.1), other)
-    assert found(rgb, ids)[1] > ENDS
+    ids, patches = region(), torch.rand(3, 12, 18, generator=torch.Generator().manual_seed(4))
+    rgb = torch.where(ids == 1, patches.repeat_interleave(20, 1).repeat_interleave(20, 2), surface(3, wide=40))
+    assert found(rgb, ids)[1] == 1
+
+
+@pytest.mark.parametrize("grain", [0.02, 0.04, 0.08, 0.16])
+def test_a_surface_goes_on_however_rough_it_is(grain):
+    """Of flecks three pixels wide: across the seam colours differ as they do beside it."""
+    drawn = torch.Generator().manual_seed(6)
+    rough = (0.5 + grain * torch.randn(3, 80, 120, generator=drawn)).clamp(0.02, 0.98)
+    assert found(rough.repeat_interleave(3, 1).repeat_interleave(3, 2), region())[1] < 0.2
 
 
 def test_neighbouring_objects_and_the_picture_s_end_are_no_surroundings():
     rgb, ids = surface(), torch.full((240, 360), 2, dtype=torch.int32)
     ids[:, 90:270] = 1  # from the top of the picture to its end, between two other objects
     guess = torch.ones(COEFFICIENTS)
-    coefficients, gap = found(rgb, ids, guess)
-    assert torch.equal(coefficients, guess) and gap == float("inf")
+    coefficients, ends = found(rgb, ids, guess)
+    assert torch.equal(coefficients, guess) and ends == 0
 
 
 def test_effects_are_those_of_the_change():
