@@ -17,11 +17,12 @@ STEADY = 8
 """Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
 
 SLIGHT = 4 / 255
-"""Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong."""
+"""Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong. Of
+one twice as large three quarters are made."""
 FILLS = 0.8
 """Share of the frame from which an object keeps its colours: what little is around one that large tells nothing for sure on new places."""
-DEEP = 0.3
-"""Optical depth that a missing shadow has somewhere; an object that lacks less has its shadow."""
+DEEP = 0.25
+"""Optical depth up to which an object that lacks no more anywhere has its shadow; of one twice as deep three quarters are drawn."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +121,11 @@ def _shade(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], aft
     total = torch.zeros_like(out[0])
     for i, box in found.items():
         depths = after[i].depths
-        if depths.max() < DEEP:
+        surely = _surely(float(depths.max()), DEEP)
+        if surely == 0:
             continue
         lines = along(box.outer_rows, box.rows, out.device), along(box.outer_columns, box.columns, out.device)
-        total[box.outer_rows, box.outer_columns] += (optical_depths(*lines, depths) - NONE).clamp_min(0)
+        total[box.outer_rows, box.outer_columns] += surely * (optical_depths(*lines, depths) - NONE).clamp_min(0)
     y, x = ((total > 0) & (instance <= 0)).nonzero().unbind(1)
     out[:, y, x] = shaded(out[:, y, x].T, total[y, x]).T
 
@@ -134,5 +136,12 @@ def _recolour(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], 
         part, mask = out[:, box.rows, box.columns], instance[box.rows, box.columns] == i
         given, height = part.permute(1, 2, 0), along(box.rows, box.rows, out.device)
         change = changed(given, height[:, None].expand(mask.shape), after[i].colours[None])
-        if (change.square().mean(-1) * mask).sum() > SLIGHT**2 * mask.sum():
-            part.copy_(torch.where(mask, (given + change).clamp(0, 1).permute(2, 0, 1), part))
+        surely = _surely(float(change.square().mean(-1)[mask].mean().sqrt()), SLIGHT)
+        if surely > 0:
+            part.copy_(torch.where(mask, (given + surely * change).clamp(0, 1).permute(2, 0, 1), part))
+
+
+def _surely(found: float, slight: float) -> float:
+    """How much of a correction is made: none up to a slight one, and the more the larger it is, so that none comes or goes at once in a
+    clip whose averages wander about what is slight."""
+    return max(0.0, 1 - (slight / max(found, 1e-9)) ** 2)

@@ -5,7 +5,7 @@ import torch
 
 from enhance import Enhancer
 from enhance.clip import telling
-from enhance.correcting.corrections import STEADY, Correction, correct
+from enhance.correcting.corrections import DEEP, SLIGHT, STEADY, Correction, correct
 from enhance.correcting.objects import (
     COEFFICIENTS,
     FEWEST,
@@ -158,6 +158,26 @@ def test_a_missing_shadow_darkens_the_ground_by_the_object_and_nothing_else():
     assert darker[26, 20:44].all() and not darker[instance == 5].any() and torch.equal(better[:, :, 75:], rgb[:, :, 75:])
     assert (better <= rgb + 1e-6).all()
     assert not (correct(net, rgb, instance, {})[0] != rgb).any(0)[instance > 0].any()
+
+
+def added(colours=0.0, depth=0.0):
+    """What is added to a grey object and its ground that are told to be off by so much: largest changes of the one and the other."""
+    _, instance = scene()
+    rgb, coefficients = torch.full((3, 64, 96), 0.5), torch.zeros(COEFFICIENTS)
+    coefficients[:3] = colours
+    known = {5: Correction(coefficients, torch.full((KNOTS,), depth), None, STEADY + 1)}  # of which none is due in this frame
+    difference = (correct(ObjectNet(), rgb, instance, known)[0] - rgb).abs()
+    return float(difference[:, instance == 5].max()), float(difference[:, instance != 5].max())
+
+
+def test_corrections_fade_in_beyond_what_is_slight():
+    """Averages over a clip that wander about a threshold must not make colours or a shadow come and go."""
+    steps = torch.linspace(0, 3, 61).tolist()
+    colours = torch.tensor([added(colours=SLIGHT * k)[0] for k in steps])
+    shadow = torch.tensor([added(depth=DEEP * k)[1] for k in steps])
+    for made in (colours, shadow):
+        assert (made[:21] == 0).all() and made[30] > 0 and (made.diff() >= 0).all() and made.diff().max() < 0.1 * made[-1]
+    assert 2.5 * SLIGHT < colours[-1] < 3 * SLIGHT
 
 
 def test_draws_repeat_and_are_right_or_wrong():
