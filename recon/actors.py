@@ -103,7 +103,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
 
     # of a long drive there is no room for a point twice: what is sorted takes the place of what was read
     static = np.empty((sum(len(times) for _, times in points), 3))
-    counts: list[int] = []
+    done, counts = 0, []
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
     for sweep in sweeps:
         xyz, times = points.popleft()
@@ -125,11 +125,11 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
             keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
             if (own := _own(local, track) & path.covers_each(moments).numpy()[of]).any():
                 found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
-        still, done = xyz[keep], sum(counts)
-        static[done : done + len(still)] = still
-        counts.append(len(still))
+        counts.append(int(keep.sum()))
+        static[done : done + counts[-1]] = xyz[keep]
+        done += counts[-1]
     return Split(
-        static[: sum(counts)],
+        static[:done],
         np.repeat(np.array([s.index for s in sweeps], np.int64), counts),
         {name: (np.concatenate([p for p, _ in got]), np.concatenate([s for _, s in got])) for name, got in found.items() if got},
         corrected,

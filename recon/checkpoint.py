@@ -127,16 +127,6 @@ def _start(plain: dict, fit: dict) -> Start:
     splats = Splats(fit["fields"], fit["sizes"], fit["reach"])
     ego, ground = Trajectory(*plain["ego"]), Ground(heights, tuple(origin), cell)
     measured, swept = tuple(Measured(*m) for m in plain["measured"]), Swept(plain["swept"])
-    told = (
-        fit["sky"],
-        fit["exposures"],
-        ego,
-        ground,
-        plain["ground_shown"],
-        rig,
-        measured,
-        swept,
-        tuple(plain["gains"]),
-        tuple(plain["skies"]),
-    )
+    gains, skies = tuple(plain["gains"]), tuple(plain["skies"])
+    told = (fit["sky"], fit["exposures"], ego, ground, plain["ground_shown"], rig, measured, swept, gains, skies)
     return Start(splats, tracks_of(plain["tracks"]), *told)

@@ -162,11 +162,11 @@ def _observations(path: Path, count: int) -> dict[str, list[dict]]:
     """Every cuboid by its track's uuid, in time order: frame index and the row."""
     found: dict[str, list[dict]] = {}
     folder = path / "annotations" / "cuboids"
-    files = [(index, file) for index in range(count) if (file := _pickle(folder, index)) is not None]
+    files = {index: file for index in range(count) if (file := _pickle(folder, index)) is not None}
     if files and len(files) < count:
-        first = next(i for i in range(count) if i not in dict(files))
+        first = next(i for i in range(count) if i not in files)
         print(f"{folder} has the boxes of {len(files)} of {count} sweeps, and not {first:02d}{PICKLES[0]}: fetch all", file=sys.stderr)
-    for index, file in files:
+    for index, file in files.items():
         table = read_frame(file)
         needed = ["uuid", "label", "yaw", "stationary", *(f"{a}.{k}" for a in ("position", "dimensions") for k in "xyz")]
         missing = [k for k in needed if k not in table]
