@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.align import MOVED, as_aligned
+from recon.corrected import MOVED, as_corrected
 from recon.log import Log
 from recon.readers.sfm import adjust
 from recon.seeds.triangulate import AHEAD, picture_name, posed
@@ -59,4 +59,4 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
         return log
     print(f"{log.path}: its pictures meet within {before:.2f} pixels by its recorded poses, and {after:.2f} corrected", file=sys.stderr)
     path = {"times_us": camera.times_us[[chosen[k] for k in known]].tolist(), "poses": torch.from_numpy(moves).flatten(1).tolist()}
-    return as_aligned(log, {MOVED: path})
+    return as_corrected(log, {MOVED: path})

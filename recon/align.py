@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,9 +17,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from recon.corrected import MOVED, as_corrected
 from recon.fit.model import small_poses
-from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
-from scenes.trajectory import Trajectory
+from recon.log import Log, Sweep
 
 APART = (1, 3, 9, 27)
 """Sweeps apart that are laid on one another."""
@@ -36,9 +36,6 @@ points lie on one of the lidar's rings and may span anything."""
 
 TOGETHER_US = 25_000
 """Sweeps that begin within so much time are one: a car's lidars turn together."""
-
-MOVED = "path_correction"
-"""In the meta of a log and of scenes fitted to it: by which poses, at which times, the recorded world was moved."""
 
 SAMPLES = 1500
 """Points of a sweep that are laid on another one."""
@@ -110,7 +107,7 @@ def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lamb
     print(f"{log.path}: its sweeps lie up to {_unlike(found):.2f} m apart by its recorded poses, which are corrected", file=sys.stderr)
     poses = about(np.stack([cloud.centre for cloud in surfaces(turns)]), found)
     path = {"times_us": [turn[0].time_us for turn in turns], "poses": poses.flatten(1).tolist()}
-    return as_aligned(log, {MOVED: path})
+    return as_corrected(log, {MOVED: path})
 
 
 def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
@@ -118,15 +115,6 @@ def about(centres: np.ndarray, deltas: np.ndarray) -> torch.Tensor:
     poses, centre = small_poses(torch.from_numpy(deltas)), torch.from_numpy(centres)
     poses[:, :3, 3] += centre - (poses[:, :3, :3] @ centre[:, :, None])[..., 0]
     return poses
-
-
-def as_aligned(log: Log, meta: dict) -> Log:
-    """A log as recorded, moved as the `meta` of a log or scene says that was `aligned`, and saying so too; as it is where nothing was."""
-    path = meta.get(MOVED)
-    if path is None:
-        return log
-    poses = torch.tensor(path["poses"], dtype=torch.float64).view(-1, 4, 4)
-    return moved(replace(log, meta={**log.meta, MOVED: path}), Trajectory(torch.tensor(path["times_us"]), poses))
 
 
 def _turns(sweeps: Sequence[Sweep]) -> list[list[Sweep]]:
@@ -138,30 +126,6 @@ def _turns(sweeps: Sequence[Sweep]) -> list[list[Sweep]]:
         else:
             turns.append([sweep])
     return turns
-
-
-def moved(log: Log, correction: Trajectory) -> Log:
-    """The log with all that it knows of the world moved by a correction that depends on the time."""
-
-    def at(times_us: torch.Tensor) -> torch.Tensor:
-        return correction.near_each(times_us)
-
-    def camera(c: LogCamera) -> LogCamera:
-        return replace(c, world_from_cam=at(c.times_us) @ c.world_from_cam)
-
-    def sweep(s: Sweep) -> Sweep:
-        def read() -> LidarPoints:
-            points, pose = s.read(), correction.near(s.time_us).numpy()
-            return replace(points, xyz=points.xyz @ pose[:3, :3].T + pose[:3, 3])
-
-        return replace(s, read=read)
-
-    def track(t: Track) -> Track:
-        return replace(t, world_from_box=at(torch.from_numpy(t.times_us)) @ t.world_from_box)
-
-    ego = replace(log.ego, world_from_body=at(log.ego.times_us) @ log.ego.world_from_body)
-    cameras = {name: camera(c) for name, c in log.cameras.items()}
-    return replace(log, ego=ego, cameras=cameras, sweeps=tuple(map(sweep, log.sweeps)), tracks=tuple(map(track, log.tracks)))
 
 
 def _apart(count: int, step: int) -> list[int]:

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.adjust import adjusted
 from recon.album import keep_album
-from recon.align import MOVED, aligned, as_aligned
-from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint, tracks_of
+from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint
+from recon.corrected import MOVED, RAISED
 from recon.exposed import exposed_by
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
@@ -28,10 +27,10 @@ from recon.fit.run import run
 from recon.fit.strides import stride_of
 from recon.frames import Frames, check_size, load_frames
 from recon.live import Live
-from recon.log import Log, Sweep, Track
+from recon.log import Log, Track
 from recon.memory import check_memory
-from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps, off_path_table, off_path_text
+from recon.ready import fitted, moving_things, readied
 from recon.report import held_out_table, table_text
 from recon.seeds.triangulate import triangulated
 from recon.skies import seen_sky
@@ -142,7 +141,7 @@ def reconstruct(
         return spent_before + time.monotonic() - began
 
     def keep() -> None:
-        so_far = {"seconds": seconds(), "live": live.curve, "path": {MOVED: log.meta.get(MOVED)}}
+        so_far = {"seconds": seconds(), "live": live.curve, "path": {kind: log.meta.get(kind) for kind in (MOVED, RAISED)}}
         so_far["movers"] = plain_tracks(log.tracks) if "movers" in log.meta else None
         save_checkpoint(checkpoint, held, start, fit.tensors() | so_far)
 
@@ -183,55 +182,6 @@ def check_free(output: str | Path, resume: bool = False, overwrite: bool = False
     if begun.exists() and not (resume or overwrite):
         raise FileExistsError(f"{begun} is a fit that was interrupted; go on with it by --resume, or give -w to begin again")
     return output
-
-
-def fitted(log: Log, held_out: int) -> Log:
-    """The log without the sweeps against which a scene is measured."""
-    unseen = held_out_sweeps(log, held_out)
-    return replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
-
-
-def readied(
-    log: Log,
-    sweeps: Sequence[Sweep],
-    config: FitConfig,
-    names: Sequence[str],
-    span: tuple[int, int],
-    size: tuple[int, int],
-    known: dict | None = None,
-    movers: Sequence[dict] | None = None,
-) -> Log:
-    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, or as is `known` from before
-    (`as_aligned`); and with the movers that sweeps show where it has no boxes, or that were found before (`plain_tracks`)."""
-    if known is not None:
-        log = as_aligned(log, known)
-    elif "path" in config.refine and sweeps:
-        with Progress("sweeps") as steps:
-            log = aligned(log, sweeps, steps.step)
-    elif "path" in config.refine and log.points is None:  # else the poses come from the pictures
-        log = adjusted(log, names[0], span, size)
-    places = {s.index for s in sweeps}
-    if movers is not None:
-        return _moved_by(log, tracks_of(movers))
-    return annotated(log, [s for s in log.sweeps if s.index in places])
-
-
-def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
-    """The log, with the movers that `sweeps` show where it has no boxes of its own."""
-    if log.tracks or not sweeps:
-        return log
-    with Progress("movers", total=len(sweeps)) as steps:
-        found = with_movers(log, sweeps, steps.step)
-    print(f"{log.path} has no boxes: its lidar shows {_things(len(found.tracks))}", file=sys.stderr)
-    return _moved_by(log, found.tracks)
-
-
-def _things(count: int) -> str:
-    return f"{count} thing{'s that move' if count != 1 else ' that moves'}"
-
-
-def _moved_by(log: Log, tracks: Sequence[Track]) -> Log:
-    return replace(log, tracks=tuple(tracks), meta={**log.meta, "movers": "found in lidar"})
 
 
 def choose(
@@ -310,7 +260,10 @@ def begin(
         known = None if exposed is None else torch.stack([exposed[name].exposure for name in names])
         start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), sparse, known)
     if sparse is not None and not log.tracks:
-        print(f"{log.path} has neither boxes nor lidar: its pictures show {_things(len(start.tracks))} along the street", file=sys.stderr)
+        print(
+            f"{log.path} has neither boxes nor lidar: its pictures show {moving_things(len(start.tracks))} along the street",
+            file=sys.stderr,
+        )
     return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
 
 

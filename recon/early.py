@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from recon.build import annotated, assemble, begin, choose
+from recon.build import assemble, begin, choose
 from recon.fit.config import FitConfig
 from recon.log import Log
+from recon.ready import annotated
 from render.progress import Progress
 from scenes.files import save
 from scenes.usd.scene import is_scene

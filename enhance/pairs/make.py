@@ -19,8 +19,8 @@ from enhance.pairs.diffusion_renderer import Relit
 from enhance.pairs.refits import REFITS, SHORT, Less, Refit, as_reconstructed, exposed_as, refits, shots_of
 from enhance.pairs.shards import KINDS, NOTE, PairSet, is_whole, to_bytes, write_shard
 from recon import open_log, stopped_early
-from recon.align import as_aligned
 from recon.assets.extract import FEWEST_SPLATS, Candidate, candidates
+from recon.corrected import as_corrected
 from recon.early import SHORT as EARLY
 from recon.egomask import with_ego_masks
 from recon.log import Log, LogCamera
@@ -145,7 +145,7 @@ def prepare_sources(
         )
     less = Less.drawn(seed)
     half_done = replace(EARLY, seed=seed, budget=round(EARLY.budget * less.fit.budget / SHORT.budget))
-    there, half_done = as_aligned(log, scene.meta), exposed_as(scene, half_done)
+    there, half_done = as_corrected(log, scene.meta), exposed_as(scene, half_done)
     early = stopped_early(there, folder / FITS[0], names, config=half_done, device=device) if "underfit" in kinds else []
     shots = shots_of(as_reconstructed(log, scene), scene) if {"underfit", "reinsert"} & set(kinds) else []
     unfinished = [Refit(References(shots, s.to(device)), tuple(names)) for s in map(load, early) if isinstance(s, Scene)]

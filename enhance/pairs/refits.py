@@ -19,8 +19,8 @@ import torch
 
 from enhance.pairs.clips import scene_time
 from recon.album import at_once
-from recon.align import as_aligned
 from recon.build import assemble, begin, choose
+from recon.corrected import as_corrected
 from recon.fit.config import FitConfig
 from recon.frames import size_like
 from recon.log import Log, LogCamera, Track
@@ -121,7 +121,7 @@ def _read(scene: Scene, camera: LogCamera, index: int, width: int, height: int) 
 
 def as_reconstructed(log: Log, scene: Scene) -> Log:
     """The recording at the poses and by the clocks that the scene's fit corrected, with the scene's cameras only."""
-    log, cameras = as_aligned(log, scene.meta), {}
+    log, cameras = as_corrected(log, scene.meta), {}
     for name in scene.rig:
         camera = log.camera(name)
         times = [scene_time(scene, name, int(t)) for t in camera.times_us]

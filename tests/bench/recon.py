@@ -25,12 +25,13 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.align import as_aligned
-from recon.build import HELD_OUT, annotated, assemble, begin, choose, fit_config, readied
+from recon.build import HELD_OUT, assemble, begin, choose, fit_config
+from recon.corrected import as_corrected
 from recon.fit.config import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Sweep, Track
 from recon.offpath import held_out_sweeps, off_path_table
+from recon.ready import annotated, readied
 from recon.report import held_out_table, read_out
 from recon.tracks import LIMBED
 from render import render_frame
@@ -223,7 +224,7 @@ def main() -> None:
         found = told(scene, frames, rig, masks)
         whole = whole or found
         cells = ["-" if math.isnan(found[n]) else f"{found[n]:.2f}" + (f" ({found[n] - whole[n]:+.2f})" if what else "") for n in columns]
-        there = as_aligned(whole_log, used.meta)
+        there = as_corrected(whole_log, used.meta)
         depth = depth_errors(scene, there, [s for s in there.sweeps if s.index in asked_about])
         print(f"{what or 'nothing':<24}" + "".join(f"{t:>22}" for t in cells) + f"{depth:>14}{spent:>8.0f}", flush=True)
 

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from recon import open_log
-from recon.build import begin, choose, fit_config, readied
+from recon.build import begin, choose, fit_config
 from recon.log import Track
+from recon.ready import readied
 from scenes.camera import Camera
 from scenes.poses import inverse
 

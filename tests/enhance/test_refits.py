@@ -9,7 +9,7 @@ from made_drive import write_drive
 
 from enhance.pairs.refits import SHORT, Less, as_reconstructed, by_turns, exposed_as, refits, rendered_aside, thinned
 from recon import open_log
-from recon.align import MOVED
+from recon.corrected import MOVED
 from recon.fit.fit import Fit
 from render import render_frame
 from render.compare import psnr

@@ -6,9 +6,10 @@ import torch
 from painted import SIZE, drive
 
 from recon.adjust import adjusted
-from recon.align import MOVED, about, as_aligned, moved
-from recon.build import readied
+from recon.align import about
+from recon.corrected import MOVED, as_corrected, moved
 from recon.fit.config import FitConfig
+from recon.ready import readied
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -44,9 +45,9 @@ def test_poses_that_jitter_are_put_where_pictures_meet(bare, jittered, capsys, m
     assert nearer < 0.2 * far and less < 0.2 * turned
     there, was = (log.ego.world_from_body[:, :3, 3] for log in (better, jittered))
     assert (there - was).mean(0).norm() < 0.01, "the world stays where it is"
-    again = as_aligned(jittered, {MOVED: better.meta[MOVED]})
+    again = as_corrected(jittered, {MOVED: better.meta[MOVED]})
     assert torch.equal(again.ego.world_from_body, better.ego.world_from_body) and again.meta[MOVED] == better.meta[MOVED]
-    monkeypatch.setattr("recon.build.adjusted", lambda *_: pytest.fail("sought where pictures meet again"))
+    monkeypatch.setattr("recon.ready.adjusted", lambda *_: pytest.fail("sought where pictures meet again"))
     resumed = readied(jittered, (), FitConfig(), [name], ALL, SIZE, {MOVED: better.meta[MOVED]})
     assert torch.equal(resumed.ego.world_from_body, better.ego.world_from_body)
     assert readied(jittered, (), FitConfig(), [name], ALL, SIZE, {MOVED: None}) is jittered

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.align import about, aligned, as_aligned, moved
+from recon.align import about, aligned
+from recon.corrected import as_corrected, moved
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
 from scenes.lenses import Pinhole
 from scenes.poses import inverse
@@ -101,10 +102,10 @@ def test_a_correction_takes_everything_with_it():
 def test_a_recording_is_moved_again_as_its_scene_says():
     log, _ = drifting(height=0.4)
     better = aligned(log, log.sweeps)
-    again = as_aligned(log, json.loads(json.dumps(better.meta)))
+    again = as_corrected(log, json.loads(json.dumps(better.meta)))
     torch.testing.assert_close(again.ego.world_from_body, better.ego.world_from_body, atol=1e-12, rtol=0)
     np.testing.assert_allclose(again.sweeps[7].read().xyz, better.sweeps[7].read().xyz, atol=1e-9)
-    assert as_aligned(log, {}) is log
+    assert as_corrected(log, {}) is log
 
 
 def test_lidars_that_turn_together_are_laid_on_others_together():

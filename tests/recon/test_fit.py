@@ -14,10 +14,10 @@ from PIL import Image
 
 from recon import open_log, reconstruct, stopped_early
 from recon.actors import split_points
-from recon.align import moved
 from recon.build import _span, assemble, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
+from recon.corrected import RAISED, as_corrected, moved
 from recon.fit.config import FitConfig
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
@@ -124,7 +124,7 @@ def test_an_interrupted_fit_goes_on_as_if_it_had_never_stopped(drive, tmp_path, 
         late.setattr("recon.build.keep_album", lambda *_: os.kill(os.getpid(), signal.SIGINT) or time.sleep(9))
         reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     assert checkpoint_path(out).is_file() and [p.name for p in tmp_path.iterdir()] == ["scene.fit"]
-    monkeypatch.setattr("recon.build.aligned", lambda *_: pytest.fail("sought how sweeps meet again"))
+    monkeypatch.setattr("recon.ready.aligned", lambda *_: pytest.fail("sought how sweeps meet again"))
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=CONFIG, resume=True)
     for name, tensor in resumed.background.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(whole[1].background.gaussians, name)), name
@@ -139,7 +139,7 @@ def test_movers_that_were_found_in_lidar_are_not_sought_again(drive, tmp_path, m
         sought.append(len(sweeps))
         return replace(log_, tracks=log.tracks)
 
-    monkeypatch.setattr("recon.build.with_movers", found)
+    monkeypatch.setattr("recon.ready.with_movers", found)
     at_once = reconstruct(bare, tmp_path / "other", size=SIZE, held_out=4, config=config)
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
         stopped.setattr(Fit, "step", lambda self: os.kill(os.getpid(), signal.SIGINT) if self.step_count == 12 else step(self))
@@ -155,13 +155,34 @@ def test_movers_that_were_found_in_lidar_are_not_sought_again(drive, tmp_path, m
     assert resumed.meta["movers"] == at_once.meta["movers"]
 
 
+def test_heights_that_were_found_are_not_sought_again(drive, tmp_path, monkeypatch):
+    config, log, out, step = replace(CONFIG, steps=4), open_log(drive), tmp_path / "scene", Fit.step
+    name, asked = next(iter(log.cameras)), []
+
+    def raised(log, names, sweeps, span_us, report):
+        asked.append((names, [s.index for s in sweeps]))
+        return as_corrected(log, {RAISED: {name: 0.5}})
+
+    monkeypatch.setattr("recon.ready.heights_by_road", raised)
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr(Fit, "step", lambda self: os.kill(os.getpid(), signal.SIGINT) if self.step_count == 2 else step(self))
+        reconstruct(log, out, size=SIZE, held_out=4, config=config)
+    resumed = reconstruct(log, out, size=SIZE, held_out=4, config=config, resume=True)
+    assert asked == [([name], [s.index for s in log.sweeps if s.index not in (2, 6)])], "once, and not by sweeps held out"
+    assert resumed.meta[RAISED] == {name: 0.5}
+    off = resumed.rig[name].body_from_cam[:3, 3] - log.rig({name: SIZE})[name].body_from_cam[:3, 3]
+    torch.testing.assert_close(off, torch.tensor([0, 0, 0.5], dtype=torch.float64), atol=0.01, rtol=0)
+    plain = reconstruct(log, tmp_path / "other", size=SIZE, held_out=4, config=config.without("heights"))
+    assert RAISED not in plain.meta and len(asked) == 1
+
+
 def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, tmp_path, monkeypatch):
     log, measured = open_log(drive), []
 
     def raised(log, sweeps, report):
         return moved(log, Trajectory(log.ego.times_us[:1], translation(0.0, 0.0, 0.5)[None]))
 
-    monkeypatch.setattr("recon.build.aligned", raised)
+    monkeypatch.setattr("recon.ready.aligned", raised)
     monkeypatch.setattr("recon.build.off_path_table", lambda scene, log, sweeps, frames: measured.extend(sweeps) or [])
     reconstruct(log, tmp_path / "scene", size=SIZE, held_out=4, config=replace(CONFIG, steps=1))
     assert [s.index for s in measured] == [2, 6]

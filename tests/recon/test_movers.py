@@ -6,11 +6,11 @@ import pytest
 import torch
 from made_sweeps import MOUNT, Box, drive, standing
 
-from recon.build import annotated
 from recon.log import LidarPoints, Sweep, Track
 from recon.movers.boxing import headings, smoothed
 from recon.movers.freespace import range_image, tally
 from recon.movers.search import with_movers
+from recon.ready import annotated
 
 CAR = (4.4, 1.8, 1.5)
 WALLS = [standing(20, side * 14, (140, 1, 8)) for side in (-1, 1)]

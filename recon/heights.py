@@ -1,0 +1,226 @@
+"""Cameras that stand higher or lower above the road than their drive says: what their pictures show of the road does not meet.
+
+A mount that is off by centimetres hardly shows in what stands upright. A picture carried onto the ground by it (inverse perspective
+mapping, Mallot et al. 1991) is off by as many percent of its distance as the height is, so that a line seen from 13 m lies elsewhere than
+from 10. Splats make up for that by lying thick, at angles that look right from the recorded path, and a painted dash becomes a fir from
+beside it. Of two pictures, one taken a few metres after the other, the same pieces of bare road are laid out and correlated; all pairs
+together tell the height. A camera that is tilted wrongly shows much the same, but the more so the farther off a piece is, by which the two
+are told apart.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from recon.corrected import RAISED, as_corrected
+from recon.ground import estimate_ground
+from recon.log import Log, LogCamera, Sweep
+from scenes.ground import Ground
+
+WAY, WITHIN_US = 2.5, 3_000_000
+"""Metres between the pictures of a pair, which are no farther apart in time."""
+
+PAIRS, FEWEST = 30, 12
+"""Of a camera, spread over the drive; and how many pieces must have met for its height to be told."""
+
+AHEAD = (3.0, 4.5, 6.0, 7.5)
+"""Heights of the camera above the ground at which the pieces of road lie that are laid out, along its view."""
+
+HALF, MARGIN, STEP = 1.5, 0.3, 0.03
+"""Metres: half the sides of a piece, how much around it has to be free, and between its points."""
+
+SMOOTH = 10
+"""Points over which a piece's brightness is evened out."""
+
+STANDS, FEW, OWN = 0.3, 2, 2.0
+"""Metres above the ground from which on a lidar point stands there, how many may, between a camera and the far side of a piece, and how
+near the camera they are the recording car's."""
+
+NEAR, SOON_US = 30.0, 150_000
+"""Metres from the body up to which a sweep is asked, and how far in time it may be from a picture."""
+
+ALIKE = 0.25
+"""Correlation from which on two pictures show the same."""
+
+OFF = 0.1
+"""Part of its height that a camera may be off: a piece is looked for as far away."""
+
+TILT = 1.0
+"""Pixels by which a mount is likely to be tilted: what it was calibrated to."""
+
+OVERLAP = 4.0
+"""Pieces lie on one another and err alike: so many count as one."""
+
+LEAST, SURE = 0.02, 3.0
+"""Metres from which on a height is corrected, and standard errors that it has to differ by."""
+
+
+@dataclass(frozen=True)
+class Street:
+    """What sweeps tell of a street: its ground, and by a moment what was seen near the body then, `[N, 3]`."""
+
+    ground: Ground
+    seen: dict[int, np.ndarray]
+
+    @staticmethod
+    def of(log: Log, sweeps: Sequence[Sweep], times_us: np.ndarray, span_us: tuple[int, int]) -> Street | None:
+        """By those of the sweeps that are nearest to the moments; None where there is none."""
+        stamps = np.array([sweep.time_us for sweep in sweeps], dtype=np.int64)
+        chosen = {int(np.abs(stamps - time).argmin()) for time in times_us} if len(stamps) else set()
+        seen = {}
+        for i in sorted(chosen):
+            xyz = sweeps[i].read().xyz
+            seen[int(stamps[i])] = xyz[np.linalg.norm(xyz - log.ego.near(int(stamps[i]))[:3, 3].numpy(), axis=1) < NEAR]
+        points = np.concatenate([*seen.values(), np.zeros((0, 3))])
+        return Street(estimate_ground(points, log.ego.within(span_us)), seen) if len(points) else None
+
+    def above(self, xyz: np.ndarray) -> np.ndarray:
+        """Metres `[...]` above the ground."""
+        return xyz[..., 2] - self.ground.height(torch.from_numpy(xyz[..., :2])).numpy()
+
+    def bare(self, eye: np.ndarray, middle: np.ndarray, time_us: int) -> bool:
+        """Whether nothing stands at a moment between an eye `[3]` and the far side of a piece of road about a point `[3]`."""
+        stamp = min(self.seen, key=lambda stamp: abs(stamp - time_us))
+        if abs(stamp - time_us) > SOON_US:
+            return False
+        way = middle[:2] - eye[:2]
+        far = float(np.linalg.norm(way))
+        ahead, xyz = way / far, self.seen[stamp]
+        along, across = ((xyz[:, :2] - eye[:2]) @ np.stack([ahead, [-ahead[1], ahead[0]]], 1)).T
+        xyz = xyz[(along > OWN) & (along < far + HALF + MARGIN) & (np.abs(across) < HALF + MARGIN)]
+        off = self.above(xyz)
+        return bool(((off > STANDS) & (off < float(self.above(eye)) + STANDS)).sum() <= FEW)
+
+
+def heights_by_road(
+    log: Log, names: Sequence[str], sweeps: Sequence[Sweep], span_us: tuple[int, int], report: Callable[[], None] = lambda: None
+) -> Log:
+    """The log with those of the cameras `names` moved up or down whose pictures of the road, in a span, show that they are elsewhere than
+    recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. `report` is called for each camera."""
+    pairs = {name: _pairs(log.camera(name), span_us) for name in names}
+    times = [log.camera(name).times_us[k] for name in names for pair in pairs[name] for k in pair]
+    street = Street.of(log, sweeps, np.array(times, dtype=np.int64), span_us)
+    if street is None:
+        return log
+    found = {}
+    for name in names:
+        if metres := _higher(log, log.camera(name), pairs[name], street):
+            found[name] = metres
+            way = "higher" if metres > 0 else "lower"
+            print(
+                f"{log.path}: {name} is taken {100 * abs(metres):.1f} cm {way} than recorded, where its pictures of the road meet",
+                file=sys.stderr,
+            )
+        report()
+    return as_corrected(log, {RAISED: found}) if found else log
+
+
+def _pairs(camera: LogCamera, span_us: tuple[int, int]) -> list[tuple[int, int]]:
+    """Indices of pictures of the span, and of the first taken `WAY` further on; `PAIRS` of them at most."""
+    times, places = camera.times_us.numpy(), camera.world_from_cam[:, :2, 3].numpy()
+    chosen = np.flatnonzero((times >= span_us[0]) & (times <= span_us[1]))
+    pairs = []
+    for i in chosen:
+        later = chosen[(chosen > i) & (times[chosen] - times[i] <= WITHIN_US)]
+        far = later[np.linalg.norm(places[later] - places[i], axis=1) >= WAY]
+        if len(far):
+            pairs.append((int(i), int(far[0])))
+    return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, PAIRS).round().astype(int))] if pairs else []
+
+
+def _higher(log: Log, camera: LogCamera, pairs: Sequence[tuple[int, int]], street: Street) -> float:
+    """Metres by which a camera stands higher above the ground than recorded; 0 where its pictures do not tell."""
+
+    @lru_cache(2 * PAIRS)
+    def grey(index: int) -> np.ndarray:
+        return camera.image(index).mean(2).astype(np.uint8)
+
+    pieces = (_apart(log, camera, *pair, ahead, grey, street) for pair in pairs for ahead in AHEAD)
+    told = [piece for piece in pieces if piece is not None]
+    if len(told) < FEWEST:
+        return 0.0
+    far, off = np.array(told).T
+    metres, error = _height(far, off, TILT / camera.lens.focal()[1])
+    return metres if abs(metres) >= max(LEAST, SURE * error) else 0.0
+
+
+def _height(far: np.ndarray, off: np.ndarray, tilt: float) -> tuple[float, float]:
+    """The height by which a camera is off, in metres, and its standard error, of pieces at distances `[N]` that tell `off` `[N]` each.
+
+    A camera that is tilted by an angle a, likely to be `tilt` radians, shows what one does that is 2 a d lower, at a distance d. Least
+    squares with Cauchy's weights."""
+    terms = np.stack([np.ones_like(far), 2 * far], 1)
+    known = np.diag([0.0, 1 / tilt**2])
+    weight = np.ones_like(off)
+    for _ in range(20):
+        normal = (terms * weight[:, None]).T @ terms / OVERLAP + known
+        best = np.linalg.solve(normal, (terms * weight[:, None]).T @ off / OVERLAP)
+        left = off - terms @ best
+        spread = max(2e-3, 1.5 * float(np.median(np.abs(left))))
+        weight = 1 / (1 + (left / spread) ** 2) / spread**2
+    return float(best[0]), math.sqrt(np.linalg.inv(normal)[0, 0])
+
+
+def _apart(
+    log: Log, camera: LogCamera, first: int, second: int, ahead: float, grey: Callable[[int], np.ndarray], street: Street
+) -> tuple[float, float] | None:
+    """How far off a piece of road is that two pictures show, in metres, and by how much the camera would be higher by it alone; None where
+    they do not show the same."""
+    eyes = [camera.world_from_cam[i, :3, 3].numpy() for i in (first, second)]
+    view, height = camera.world_from_cam[second, :2, 2].numpy(), float(street.above(eyes[1]))
+    middle = np.append(eyes[1][:2] + ahead * height * view / max(1e-6, float(np.linalg.norm(view))), 0.0)
+    if not all(street.bare(eye, middle, int(camera.times_us[i])) for eye, i in zip(eyes, (first, second), strict=True)):
+        return None
+    way = float(np.linalg.norm(eyes[1][:2] - eyes[0][:2]))
+    forward = (eyes[1][:2] - eyes[0][:2]) / way
+    u = np.arange(-HALF, HALF, STEP)
+    x, y = np.meshgrid(u, u, indexing="ij")
+    spots = middle[:2] + x[..., None] * forward + y[..., None] * [-forward[1], forward[0]]
+    spots = np.concatenate([spots, street.ground.height(torch.from_numpy(spots)).numpy()[..., None]], 2)
+    laid = [_laid_out(log, camera, i, grey, spots) for i in (first, second)]
+    if laid[0] is None or laid[1] is None:
+        return None
+    shift = _shift(laid[0], laid[1], math.ceil(OFF * (way + height) / STEP))
+    far = float(np.mean([np.linalg.norm(middle[:2] - eye[:2]) for eye in eyes]))
+    return None if shift is None else (far, -height * shift * STEP / (way + shift * STEP))
+
+
+def _laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.ndarray], spots: np.ndarray) -> np.ndarray | None:
+    """What a picture shows at spots `[X, Y, 3]` of the ground, seen from where the camera was as their rows were read; None where it does
+    not show all."""
+    pose, time = camera.world_from_cam[index].numpy(), int(camera.times_us[index])
+    speed = (log.ego.near(time + 50_000) - log.ego.near(time - 50_000))[:3, 3].numpy() / 100_000
+    late = np.zeros((*spots.shape[:2], 1))
+    for _ in range(2):
+        local = torch.from_numpy((spots - pose[:3, 3] - speed * late) @ pose[:3, :3]).reshape(-1, 3)
+        if not bool((camera.lens.valid(local) & (camera.lens.depth(local) > 0)).all()):
+            return None
+        column, row = camera.lens.project(local).numpy().reshape(*spots.shape[:2], 2).transpose(2, 0, 1)
+        if row.min() < 0 or column.min() < 0 or row.max() > camera.height or column.max() > camera.width:
+            return None
+        part = {"rows": row / camera.height, "columns": column / camera.width}.get(camera.shutter, np.full_like(row, 0.5))
+        late = ((part - 0.5) * camera.readout_us)[..., None]
+    return ndimage.map_coordinates(grey(index).astype(np.float32), [row - 0.5, column - 0.5], order=1, mode="nearest")
+
+
+def _shift(one: np.ndarray, other: np.ndarray, most: int) -> float | None:
+    """Points by which what `one` `[X, Y]` shows lies farther along x than in `other`, at most `most`; None where they are not alike.
+
+    The peak of their correlation, to a part of a point by the parabola through it."""
+    window = np.hanning(len(one))[:, None] * np.hanning(one.shape[1])
+    a, b = ((image - ndimage.gaussian_filter(image, SMOOTH)) * window for image in (one, other))
+    likeness = np.fft.irfft2(np.fft.rfft2(a) * np.fft.rfft2(b).conj(), one.shape) / max(1e-9, float(np.linalg.norm(a) * np.linalg.norm(b)))
+    near = np.roll(likeness, (most, 2), (0, 1))[: 2 * most + 1, :5]  # across the way they lie as recorded, but for a few centimetres
+    at, aside = np.unravel_index(near.argmax(), near.shape)
+    if near[at, aside] < ALIKE or not 0 < at < 2 * most:
+        return None
+    before, peak, after = near[at - 1 : at + 2, aside]
+    return float(at - most + 0.5 * (before - after) / min(-1e-9, before - 2 * peak + after))

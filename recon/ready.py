@@ -1,0 +1,79 @@
+"""A log as a fit takes it: without what the scene is measured against, put right, and with boxes of what moves."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+
+from recon.adjust import adjusted
+from recon.align import aligned
+from recon.checkpoint import tracks_of
+from recon.corrected import as_corrected
+from recon.fit.config import FitConfig
+from recon.heights import heights_by_road
+from recon.log import Log, Sweep, Track
+from recon.movers.search import with_movers
+from recon.offpath import held_out_sweeps
+from render.progress import Progress
+
+
+def fitted(log: Log, held_out: int) -> Log:
+    """The log without the sweeps against which a scene is measured."""
+    unseen = held_out_sweeps(log, held_out)
+    return replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen))
+
+
+def readied(
+    log: Log,
+    sweeps: Sequence[Sweep],
+    config: FitConfig,
+    names: Sequence[str],
+    span: tuple[int, int],
+    size: tuple[int, int],
+    known: dict | None = None,
+    movers: Sequence[dict] | None = None,
+) -> Log:
+    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and cameras put as high as their
+    pictures of the road say, or as is `known` from before (`as_corrected`); and with the movers that sweeps show where it has no boxes, or
+    that were found before (`plain_tracks`)."""
+    log = _corrected(log, sweeps, config, names, span, size) if known is None else as_corrected(log, known)
+    places = {s.index for s in sweeps}
+    if movers is not None:
+        return _moved_by(log, tracks_of(movers))
+    return annotated(log, [s for s in log.sweeps if s.index in places])
+
+
+def _corrected(
+    log: Log, sweeps: Sequence[Sweep], config: FitConfig, names: Sequence[str], span: tuple[int, int], size: tuple[int, int]
+) -> Log:
+    """The log with what lidar and pictures show to be wrong with its path and its cameras' heights put right."""
+    if not sweeps:  # poses that come from the pictures meet in them
+        return adjusted(log, names[0], span, size) if "path" in config.refine and log.points is None else log
+    if "path" in config.refine:
+        with Progress("sweeps") as steps:
+            log = aligned(log, sweeps, steps.step)
+    if "heights" in config.refine:
+        here = {s.index for s in sweeps}
+        with Progress("camera heights", total=len(names)) as steps:
+            log = heights_by_road(log, names, [s for s in log.sweeps if s.index in here], span, steps.step)
+    return log
+
+
+def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
+    """The log, with the movers that `sweeps` show where it has no boxes of its own."""
+    if log.tracks or not sweeps:
+        return log
+    with Progress("movers", total=len(sweeps)) as steps:
+        found = with_movers(log, sweeps, steps.step)
+    print(f"{log.path} has no boxes: its lidar shows {moving_things(len(found.tracks))}", file=sys.stderr)
+    return _moved_by(log, found.tracks)
+
+
+def moving_things(count: int) -> str:
+    """So many, in words."""
+    return f"{count} thing{'s that move' if count != 1 else ' that moves'}"
+
+
+def _moved_by(log: Log, tracks: Sequence[Track]) -> Log:
+    return replace(log, tracks=tuple(tracks), meta={**log.meta, "movers": "found in lidar"})
