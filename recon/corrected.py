@@ -1,4 +1,4 @@
-"""What was found wrong with a recording, put right: all that it knows of the world moved along a corrected path, and cameras up or down.
+"""What was found wrong with a recording, put right: all that it knows of the world is moved along a corrected path, and cameras on the car.
 
 A log and the scenes fitted to it say in their `meta` what was corrected, so that it can be done again to the recording as it is read.
 """
@@ -10,24 +10,25 @@ from dataclasses import replace
 
 import torch
 
+from recon.fit.model import small_poses
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
 from scenes.trajectory import Trajectory
 
 MOVED = "path_correction"
 """In `meta`: by which poses, at which times, the recorded world was moved."""
 
-RAISED = "camera_heights"
-"""In `meta`: by how many metres cameras, by name, stand higher above the road than recorded."""
+REMOUNTED = "mount_corrections"
+"""In `meta`: of cameras, by name, by how many metres they stand higher, and how many radians they look farther up, than recorded."""
 
 
 def as_corrected(log: Log, meta: Mapping) -> Log:
     """A log as recorded, put right as the `meta` of a log or scene says, and saying so too; as it is where nothing was."""
-    path, heights = meta.get(MOVED), meta.get(RAISED)
+    path, mounts = meta.get(MOVED), meta.get(REMOUNTED)
     if path is not None:
         poses = torch.tensor(path["poses"], dtype=torch.float64).view(-1, 4, 4)
         log = moved(replace(log, meta={**log.meta, MOVED: path}), Trajectory(torch.tensor(path["times_us"]), poses))
-    if heights is not None:
-        log = raised(replace(log, meta={**log.meta, RAISED: heights}), heights)
+    if mounts is not None:
+        log = remounted(replace(log, meta={**log.meta, REMOUNTED: mounts}), mounts)
     return log
 
 
@@ -55,12 +56,14 @@ def moved(log: Log, correction: Trajectory) -> Log:
     return replace(log, ego=ego, cameras=cameras, sweeps=tuple(map(sweep, log.sweeps)), tracks=tuple(map(track, log.tracks)))
 
 
-def raised(log: Log, heights: Mapping[str, float]) -> Log:
-    """The log with cameras, by name, so many metres higher, along the body's own axis. Names that it has not are passed over."""
+def remounted(log: Log, mounts: Mapping[str, tuple[float, float]]) -> Log:
+    """The log with cameras, by name, so many metres higher, along the body's own axis, and so many radians tilted up. Names that it has not
+    are passed over."""
 
     def camera(c: LogCamera) -> LogCamera:
-        poses = c.world_from_cam.clone()
-        poses[:, :3, 3] += heights[c.name] * log.ego.near_each(c.times_us)[:, :3, 2]
+        metres, radians = mounts[c.name]
+        poses = c.world_from_cam @ small_poses(torch.tensor([radians, 0, 0, 0, 0, 0]))
+        poses[:, :3, 3] += metres * log.ego.near_each(c.times_us)[:, :3, 2]
         return replace(c, world_from_cam=poses)
 
-    return replace(log, cameras={name: camera(c) if name in heights else c for name, c in log.cameras.items()})
+    return replace(log, cameras={name: camera(c) if name in mounts else c for name, c in log.cameras.items()})

@@ -11,8 +11,8 @@ from recon.align import aligned
 from recon.checkpoint import tracks_of
 from recon.corrected import as_corrected
 from recon.fit.config import FitConfig
-from recon.heights import heights_by_road
 from recon.log import Log, Sweep, Track
+from recon.mounts import mounts_by_road
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps
 from render.progress import Progress
@@ -34,8 +34,8 @@ def readied(
     known: dict | None = None,
     movers: Sequence[dict] | None = None,
 ) -> Log:
-    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and cameras put as high as their
-    pictures of the road say, or as is `known` from before (`as_corrected`); and with the movers that sweeps show where it has no boxes, or
+    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and cameras put where their
+    pictures of the road meet, or as is `known` from before (`as_corrected`); and with the movers that sweeps show where it has no boxes, or
     that were found before (`plain_tracks`)."""
     log = _corrected(log, sweeps, config, names, span, size) if known is None else as_corrected(log, known)
     places = {s.index for s in sweeps}
@@ -47,16 +47,16 @@ def readied(
 def _corrected(
     log: Log, sweeps: Sequence[Sweep], config: FitConfig, names: Sequence[str], span: tuple[int, int], size: tuple[int, int]
 ) -> Log:
-    """The log with what lidar and pictures show to be wrong with its path and its cameras' heights put right."""
+    """The log with what lidar and pictures show to be wrong with its path and its cameras' mounts put right."""
     if not sweeps:  # poses that come from the pictures meet in them
         return adjusted(log, names[0], span, size) if "path" in config.refine and log.points is None else log
     if "path" in config.refine:
         with Progress("sweeps") as steps:
             log = aligned(log, sweeps, steps.step)
-    if "heights" in config.refine:
+    if "road" in config.refine:
         here = {s.index for s in sweeps}
-        with Progress("camera heights", total=len(names)) as steps:
-            log = heights_by_road(log, names, [s for s in log.sweeps if s.index in here], span, steps.step)
+        with Progress("mounts", total=len(names)) as steps:
+            log = mounts_by_road(log, names, [s for s in log.sweeps if s.index in here], span, steps.step)
     return log
 
 

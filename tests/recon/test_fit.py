@@ -17,7 +17,7 @@ from recon.actors import split_points
 from recon.build import _span, assemble, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
-from recon.corrected import RAISED, as_corrected, moved
+from recon.corrected import REMOUNTED, as_corrected, moved
 from recon.fit.config import FitConfig
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
@@ -155,25 +155,25 @@ def test_movers_that_were_found_in_lidar_are_not_sought_again(drive, tmp_path, m
     assert resumed.meta["movers"] == at_once.meta["movers"]
 
 
-def test_heights_that_were_found_are_not_sought_again(drive, tmp_path, monkeypatch):
+def test_mounts_that_were_found_are_not_sought_again(drive, tmp_path, monkeypatch):
     config, log, out, step = replace(CONFIG, steps=4), open_log(drive), tmp_path / "scene", Fit.step
     name, asked = next(iter(log.cameras)), []
 
     def raised(log, names, sweeps, span_us, report):
         asked.append((names, [s.index for s in sweeps]))
-        return as_corrected(log, {RAISED: {name: 0.5}})
+        return as_corrected(log, {REMOUNTED: {name: [0.5, 0.0]}})
 
-    monkeypatch.setattr("recon.ready.heights_by_road", raised)
+    monkeypatch.setattr("recon.ready.mounts_by_road", raised)
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
         stopped.setattr(Fit, "step", lambda self: os.kill(os.getpid(), signal.SIGINT) if self.step_count == 2 else step(self))
         reconstruct(log, out, size=SIZE, held_out=4, config=config)
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=config, resume=True)
     assert asked == [([name], [s.index for s in log.sweeps if s.index not in (2, 6)])], "once, and not by sweeps held out"
-    assert resumed.meta[RAISED] == {name: 0.5}
+    assert resumed.meta[REMOUNTED] == {name: [0.5, 0.0]}
     off = resumed.rig[name].body_from_cam[:3, 3] - log.rig({name: SIZE})[name].body_from_cam[:3, 3]
     torch.testing.assert_close(off, torch.tensor([0, 0, 0.5], dtype=torch.float64), atol=0.01, rtol=0)
-    plain = reconstruct(log, tmp_path / "other", size=SIZE, held_out=4, config=config.without("heights"))
-    assert RAISED not in plain.meta and len(asked) == 1
+    plain = reconstruct(log, tmp_path / "other", size=SIZE, held_out=4, config=config.without("road"))
+    assert REMOUNTED not in plain.meta and len(asked) == 1
 
 
 def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, tmp_path, monkeypatch):

@@ -1,11 +1,11 @@
-"""Cameras that stand higher or lower above the road than their drive says: what their pictures show of the road does not meet.
+"""Cameras that are fixed to the car elsewhere than recorded: what their pictures show of the road does not meet.
 
 A mount that is off by centimetres hardly shows in what stands upright. A picture carried onto the ground by it (inverse perspective
 mapping, Mallot et al. 1991) is off by as many percent of its distance as the height is, so that a line seen from 13 m lies elsewhere than
 from 10. Splats make up for that by lying thick, at angles that look right from the recorded path, and a painted dash becomes a fir from
-beside it. Of two pictures, one taken a few metres after the other, the same pieces of bare road are laid out and correlated; all pairs
-together tell the height. A camera that is tilted wrongly shows much the same, but the more so the farther off a piece is, by which the two
-are told apart.
+beside it. Of two pictures, one taken a few metres after the other, the same pieces of bare road are laid out and correlated. A camera
+that is tilted shows much the same as one that stands too low, but the more so the farther off a piece is; what this leaves open is settled
+by how far off mounts are likely to be.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.corrected import RAISED, as_corrected
+from recon.corrected import REMOUNTED, as_corrected
 from recon.ground import estimate_ground
 from recon.log import Log, LogCamera, Sweep
 from scenes.ground import Ground
@@ -29,7 +29,7 @@ WAY, WITHIN_US = 2.5, 3_000_000
 """Metres between the pictures of a pair, which are no farther apart in time."""
 
 PAIRS, FEWEST = 30, 12
-"""Of a camera, spread over the drive; and how many pieces must have met for its height to be told."""
+"""Of a camera, spread over the drive; and how many pieces must have met for its mount to be told."""
 
 AHEAD = (3.0, 4.5, 6.0, 7.5)
 """Heights of the camera above the ground at which the pieces of road lie that are laid out, along its view."""
@@ -53,14 +53,14 @@ ALIKE = 0.25
 OFF = 0.1
 """Part of its height that a camera may be off: a piece is looked for as far away."""
 
-TILT = 1.0
-"""Pixels by which a mount is likely to be tilted: what it was calibrated to."""
+PLACE, TILT = 0.03, 1.0
+"""Metres by which a mount is likely to be off, and pixels by which it is to be tilted: what cameras are calibrated to."""
 
 OVERLAP = 4.0
 """Pieces lie on one another and err alike: so many count as one."""
 
 LEAST, SURE = 0.02, 3.0
-"""Metres from which on a height is corrected, and standard errors that it has to differ by."""
+"""Metres from which on what pieces tell in the mean is corrected, and standard errors that it has to differ by."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,12 @@ class Street:
         return bool(((off > STANDS) & (off < float(self.above(eye)) + STANDS)).sum() <= FEW)
 
 
-def heights_by_road(
+def mounts_by_road(
     log: Log, names: Sequence[str], sweeps: Sequence[Sweep], span_us: tuple[int, int], report: Callable[[], None] = lambda: None
 ) -> Log:
-    """The log with those of the cameras `names` moved up or down whose pictures of the road, in a span, show that they are elsewhere than
-    recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. `report` is called for each camera."""
+    """The log with those of the cameras `names` moved up or down and tilted whose pictures of the road, in a span, show that they are
+    elsewhere than recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. `report` is called for
+    each camera."""
     pairs = {name: _pairs(log.camera(name), span_us) for name in names}
     times = [log.camera(name).times_us[k] for name in names for pair in pairs[name] for k in pair]
     street = Street.of(log, sweeps, np.array(times, dtype=np.int64), span_us)
@@ -112,15 +113,13 @@ def heights_by_road(
         return log
     found = {}
     for name in names:
-        if metres := _higher(log, log.camera(name), pairs[name], street):
-            found[name] = metres
-            way = "higher" if metres > 0 else "lower"
-            print(
-                f"{log.path}: {name} is taken {100 * abs(metres):.1f} cm {way} than recorded, where its pictures of the road meet",
-                file=sys.stderr,
-            )
+        if off := _off(log, log.camera(name), pairs[name], street):
+            (metres, radians), found[name] = off, off
+            moved = f"{100 * abs(metres):.1f} cm {'higher' if metres > 0 else 'lower'}"
+            turned = f"{1e3 * abs(radians):.1f} mrad farther {'up' if radians > 0 else 'down'}"
+            print(f"{log.path}: {name} is taken {moved} and {turned} than recorded, where its pictures of the road meet", file=sys.stderr)
         report()
-    return as_corrected(log, {RAISED: found}) if found else log
+    return as_corrected(log, {REMOUNTED: found}) if found else log
 
 
 def _pairs(camera: LogCamera, span_us: tuple[int, int]) -> list[tuple[int, int]]:
@@ -136,8 +135,9 @@ def _pairs(camera: LogCamera, span_us: tuple[int, int]) -> list[tuple[int, int]]
     return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, PAIRS).round().astype(int))] if pairs else []
 
 
-def _higher(log: Log, camera: LogCamera, pairs: Sequence[tuple[int, int]], street: Street) -> float:
-    """Metres by which a camera stands higher above the ground than recorded; 0 where its pictures do not tell."""
+def _off(log: Log, camera: LogCamera, pairs: Sequence[tuple[int, int]], street: Street) -> tuple[float, float] | None:
+    """Metres by which a camera stands higher than recorded, and radians by which it looks farther up; None where its pictures do not tell,
+    or meet."""
 
     @lru_cache(2 * PAIRS)
     def grey(index: int) -> np.ndarray:
@@ -146,37 +146,35 @@ def _higher(log: Log, camera: LogCamera, pairs: Sequence[tuple[int, int]], stree
     pieces = (_apart(log, camera, *pair, ahead, grey, street) for pair in pairs for ahead in AHEAD)
     told = [piece for piece in pieces if piece is not None]
     if len(told) < FEWEST:
-        return 0.0
-    far, off = np.array(told).T
-    metres, error = _height(far, off, TILT / camera.lens.focal()[1])
-    return metres if abs(metres) >= max(LEAST, SURE * error) else 0.0
+        return None
+    lever, off = np.array(told).T
+    return _settled(lever, off, TILT / camera.lens.focal()[1])
 
 
-def _height(far: np.ndarray, off: np.ndarray, tilt: float) -> tuple[float, float]:
-    """The height by which a camera is off, in metres, and its standard error, of pieces at distances `[N]` that tell `off` `[N]` each.
-
-    A camera that is tilted by an angle a, likely to be `tilt` radians, shows what one does that is 2 a d lower, at a distance d. Least
-    squares with Cauchy's weights."""
-    terms = np.stack([np.ones_like(far), 2 * far], 1)
-    known = np.diag([0.0, 1 / tilt**2])
+def _settled(lever: np.ndarray, off: np.ndarray, tilt: float) -> tuple[float, float] | None:
+    """The likeliest height and tilt of which pieces tell `off` `[N]` metres of height, or as many per `lever` `[N]` radians of tilt, where
+    `tilt` is likely; None where they may as well be as recorded. Least squares with Cauchy's weights, and Gaussian priors."""
+    terms = np.stack([np.ones_like(lever), lever], 1)
+    prior = np.diag([1 / PLACE**2, 1 / tilt**2])
     weight = np.ones_like(off)
     for _ in range(20):
-        normal = (terms * weight[:, None]).T @ terms / OVERLAP + known
-        best = np.linalg.solve(normal, (terms * weight[:, None]).T @ off / OVERLAP)
+        best = np.linalg.solve((terms * weight[:, None]).T @ terms / OVERLAP + prior, (terms * weight[:, None]).T @ off / OVERLAP)
         left = off - terms @ best
         spread = max(2e-3, 1.5 * float(np.median(np.abs(left))))
         weight = 1 / (1 + (left / spread) ** 2) / spread**2
-    return float(best[0]), math.sqrt(np.linalg.inv(normal)[0, 0])
+    mean, error = float((weight * off).sum() / weight.sum()), math.sqrt(OVERLAP / weight.sum())
+    return (float(best[0]), float(best[1])) if abs(mean) >= max(LEAST, SURE * error) else None
 
 
 def _apart(
     log: Log, camera: LogCamera, first: int, second: int, ahead: float, grey: Callable[[int], np.ndarray], street: Street
 ) -> tuple[float, float] | None:
-    """How far off a piece of road is that two pictures show, in metres, and by how much the camera would be higher by it alone; None where
-    they do not show the same."""
+    """By how many metres of height a radian of tilt moves a piece of road that two pictures of a camera show, and how much higher it would
+    stand by the piece alone; None where they do not show the same."""
     eyes = [camera.world_from_cam[i, :3, 3].numpy() for i in (first, second)]
     view, height = camera.world_from_cam[second, :2, 2].numpy(), float(street.above(eyes[1]))
-    middle = np.append(eyes[1][:2] + ahead * height * view / max(1e-6, float(np.linalg.norm(view))), 0.0)
+    view = view / max(1e-6, float(np.linalg.norm(view)))
+    middle = np.append(eyes[1][:2] + ahead * height * view, 0.0)
     if not all(street.bare(eye, middle, int(camera.times_us[i])) for eye, i in zip(eyes, (first, second), strict=True)):
         return None
     way = float(np.linalg.norm(eyes[1][:2] - eyes[0][:2]))
@@ -190,7 +188,8 @@ def _apart(
         return None
     shift = _shift(laid[0], laid[1], math.ceil(OFF * (way + height) / STEP))
     far = float(np.mean([np.linalg.norm(middle[:2] - eye[:2]) for eye in eyes]))
-    return None if shift is None else (far, -height * shift * STEP / (way + shift * STEP))
+    lever = far * (1 + float(view @ forward) ** 2)  # tilted, a piece moves by the square of its distance; aside, by its bearing
+    return None if shift is None else (lever, -height * shift * STEP / (way + shift * STEP))
 
 
 def _laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.ndarray], spots: np.ndarray) -> np.ndarray | None:

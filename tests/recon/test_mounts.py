@@ -1,4 +1,4 @@
-"""Cameras whose pictures of the road do not meet are put as high above it as they do."""
+"""Cameras whose pictures of the road do not meet are moved and tilted until they do."""
 
 import io
 import json
@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
-from recon.corrected import RAISED, as_corrected
-from recon.heights import heights_by_road
+from recon.corrected import REMOUNTED, as_corrected
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
+from recon.mounts import mounts_by_road
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory
 
@@ -64,49 +64,61 @@ def drive(height: float = HEIGHT, tilt: float = 0.0, readout_us: int = 0, wall: 
     return Log("made", "made", {"front": camera}, tuple(sweeps), (), Trajectory(times, body), {})
 
 
+def lies(log: Log) -> tuple[float, float]:
+    """How the camera's poses differ from where `drive` records them: metres higher, radians farther up."""
+    higher, turned = (log.camera("front").world_from_cam - drive().camera("front").world_from_cam)[7, 2, 2:].tolist()
+    return turned, higher
+
+
 @pytest.mark.parametrize("off", [-0.08, 0.08])
 def test_a_camera_that_is_recorded_too_high_or_low_is_moved(off, capsys):
     log, reports = drive(HEIGHT + off), []
-    better = heights_by_road(log, ["front"], log.sweeps, ALL, lambda: reports.append(1))
-    moved = better.camera("front").world_from_cam - log.camera("front").world_from_cam
-    assert float(moved[0, 2, 3]) == pytest.approx(off, abs=0.02) and float(moved.std(0).max()) < 1e-12, "all the way"
-    assert float(moved[:, :2].abs().max()) == 0 and torch.equal(better.ego.world_from_body, log.ego.world_from_body)
-    assert f"cm {'higher' if off > 0 else 'lower'} than recorded" in capsys.readouterr().err and len(reports) == 1
+    better = mounts_by_road(log, ["front"], log.sweeps, ALL, lambda: reports.append(1))
+    metres, radians = lies(better)
+    assert 0.5 < metres / off < 1.3 and abs(radians) < 0.002, "by far the most is its height"
+    assert float((better.camera("front").world_from_cam - log.camera("front").world_from_cam).std(0).max()) < 1e-12, "all the way"
+    assert torch.equal(better.ego.world_from_body, log.ego.world_from_body)
+    assert f"cm {'higher' if off > 0 else 'lower'} and" in capsys.readouterr().err and len(reports) == 1
+    assert mounts_by_road(better, ["front"], better.sweeps, ALL) is better, "where its pictures meet"
     again = as_corrected(log, json.loads(json.dumps(better.meta)))
     assert torch.equal(again.camera("front").world_from_cam, better.camera("front").world_from_cam)
-    assert again.meta[RAISED] == better.meta[RAISED]
+    assert {name: tuple(off) for name, off in again.meta[REMOUNTED].items()} == better.meta[REMOUNTED]
+
+
+@pytest.mark.parametrize("down", [0.004, -0.004])
+def test_a_camera_that_is_tilted_is_tilted_back(down):
+    """By as much as is likely: the rest is taken for height."""
+    log = drive(tilt=down)
+    better = mounts_by_road(log, ["front"], log.sweeps, ALL)
+    metres, radians = lies(better)
+    assert 0.3 < -radians / down < 1.1 and abs(metres) < 0.06
+    assert mounts_by_road(better, ["front"], better.sweeps, ALL) is better
 
 
 @pytest.mark.parametrize("readout_us", [0, 100_000, -100_000])
 def test_a_camera_that_stands_as_recorded_is_left_alone(readout_us, capsys):
     log = drive(readout_us=readout_us)
-    assert heights_by_road(log, ["front"], log.sweeps, ALL) is log and not capsys.readouterr().err
+    assert mounts_by_road(log, ["front"], log.sweeps, ALL) is log and not capsys.readouterr().err
 
 
-def test_rows_that_are_read_one_after_the_other_are_told_from_height():
+def test_rows_that_are_read_one_after_the_other_are_no_wrong_mount():
     """As if all were read at once, this shutter's pictures lie some percent apart."""
     log = drive(readout_us=100_000)
     wrong = replace(log, cameras={"front": replace(log.camera("front"), shutter="global", readout_us=0)})
-    assert heights_by_road(log, ["front"], log.sweeps, ALL) is log
-    assert heights_by_road(wrong, ["front"], wrong.sweeps, ALL) is not wrong
-
-
-@pytest.mark.parametrize("tilt", [0.0015, -0.0015])
-def test_a_tilted_camera_is_no_higher(tilt):
-    log = drive(tilt=tilt)
-    assert heights_by_road(log, ["front"], log.sweeps, ALL) is log
+    assert mounts_by_road(log, ["front"], log.sweeps, ALL) is log
+    assert mounts_by_road(wrong, ["front"], wrong.sweeps, ALL) is not wrong
 
 
 def test_what_stands_before_the_road_is_not_taken_for_it():
     log = drive(HEIGHT - 0.08, wall=True)
-    assert heights_by_road(log, ["front"], log.sweeps, ALL) is log
+    assert mounts_by_road(log, ["front"], log.sweeps, ALL) is log
 
 
 def test_where_nothing_tells_nothing_is_done():
     log = drive(HEIGHT - 0.08)
-    assert heights_by_road(log, ["front"], (), ALL) is log, "no ground"
-    assert heights_by_road(log, ["front"], log.sweeps, (0, 400_000)) is log, "too few pictures"
+    assert mounts_by_road(log, ["front"], (), ALL) is log, "no ground"
+    assert mounts_by_road(log, ["front"], log.sweeps, (0, 400_000)) is log, "too few pictures"
     parked = replace(log.camera("front"), world_from_cam=log.camera("front").world_from_cam[:1].expand(COUNT, 4, 4))
-    assert heights_by_road(replace(log, cameras={"front": parked}), ["front"], log.sweeps, ALL).meta == {}, "it stands"
+    assert mounts_by_road(replace(log, cameras={"front": parked}), ["front"], log.sweeps, ALL).meta == {}, "it stands"
     behind = replace(log, sweeps=tuple(replace(s, time_us=s.time_us + 10_000_000) for s in log.sweeps))
-    assert heights_by_road(behind, ["front"], behind.sweeps, ALL) is behind, "no sweep was taken then"
+    assert mounts_by_road(behind, ["front"], behind.sweeps, ALL) is behind, "no sweep was taken then"
