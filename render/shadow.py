@@ -5,7 +5,8 @@ the places around it is traced once (render/occlusion.py); a frame only looks it
 that is where a pixel's ray meets the plane that the asset stands on, since the depth of splatted asphalt is rough; the rendered depth
 says what the pixel sees. Light is taken away in linear light, whatever the surface.
 
-Inserted assets are those with `inserted` in their meta, or `edited`; other recorded actors keep the shadows of their photos.
+Inserted assets are those with `inserted` in their meta, or `edited`; other recorded actors keep the shadows of their photos, and edited
+ones those that came along with them (scenes/shade.py).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from scenes.lenses import Orthographic
 from scenes.light import light_of
 from scenes.poses import inverse, yaw, yaw_of
 from scenes.scene import Scene, end_pose
+from scenes.shade import has_shade
 from scenes.sky import linear_from_srgb, srgb_from_linear
 from scenes.trajectory import Trajectory
 
@@ -80,7 +82,7 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     """The inserted assets whose shadow can fall into the view, first those into most of it."""
     found = []
     for i, actor in enumerate(scene.actors):
-        if not actor.anew or not actor.trajectory.covers(camera.time_us):
+        if not actor.anew or not actor.trajectory.covers(camera.time_us) or has_shade(actor.asset):
             continue
         shade = _shade(scene)
         directions, weights = shade.at(actor, camera.time_us)

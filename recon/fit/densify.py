@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from recon.fit.model import FIELDS, Splats
-from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
+from scenes.shade import BLACK
 
 FAINT = 0.02
 """Opacity under which a splat is dropped."""

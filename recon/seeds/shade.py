@@ -10,6 +10,7 @@ from recon.log import Track
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
+from scenes.shade import BLACK
 
 SPACING, WIDE = 0.4, 0.6
 """Metres between its splats, and the standard deviation of one along the ground, in spacings."""
@@ -21,8 +22,8 @@ cars that pass drive 002's left camera comes to 33.2 dB, with this to 33.6, and 
 ABOVE, THICK = 0.02, 0.01
 """Metres above the ground in which it lies, and its thickness: it must be drawn over the road."""
 
-BLACK, LOGIT = 0.02, -2.2
-"""Its colour, which stays, and the logit of its opacity. What the pictures do not hold up fades (`FADE` in `recon/fit/fit.py`)."""
+LOGIT = -2.2
+"""The logit of its opacity. Its colour stays; what the pictures do not hold up fades (`FADE` in `recon/fit/fit.py`)."""
 
 
 def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:

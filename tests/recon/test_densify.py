@@ -3,9 +3,9 @@ import torch
 
 from recon.fit.densify import Growth, grow, kept, shade_of
 from recon.fit.model import Splats
-from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
+from scenes.shade import BLACK
 
 
 def some(count, seed=0, spread=0.5):

@@ -13,10 +13,10 @@ from recon.fit.model import Splats
 from recon.fit.unseen import SEEN
 from recon.log import Track
 from recon.mirror import FEWEST, THERE
-from recon.seeds.shade import BLACK
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import translation
+from scenes.shade import BLACK
 from tests.recon.test_fit import CONFIG, SIZE
 from tests.recon.test_flanks import an_end
 

@@ -11,13 +11,13 @@ from recon.build import begin, choose
 from recon.fit.fit import GUESSED_FROM
 from recon.fit.model import Splats
 from recon.fit.unseen import NEIGHBOURS, SEEN, SWOLLEN, Shown, as_neighbours, curtains, footprint, pennants, swollen
-from recon.seeds.shade import BLACK
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Fisheye, Pinhole
+from scenes.shade import BLACK
 from tests.bench.presets import random_splats
 from tests.recon.test_fit import CONFIG, SIZE
 

@@ -1,16 +1,20 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from street import START_US, car
 from street import street as made_street
 
+from recon.log import Track
+from recon.seeds.shade import shade
 from render import render_frame
 from render.frame_types import Frame
 from render.occlusion import shadow_box, trace_field
 from render.shadow import Shade, cast, shadow_casters
-from scenes import Camera, Equirectangular, OpenCV, Orthographic, Placed, Sky
+from scenes import Camera, Equirectangular, Gaussians, OpenCV, Orthographic, Placed, Sky
+from scenes.edit import Edit, edited
 from scenes.hdr import load_hdr
 from scenes.insert import insert
 from scenes.light import disc, light_of
@@ -271,3 +275,19 @@ def test_what_houses_keep_off_does_not_depend_on_the_frames_before(street):
     behind = [backward.at(car_there, t)[1] for t in reversed(times)]
     assert len({tuple(v.tolist()) for v in ahead}) > 1
     assert all(torch.equal(a, b) for a, b in zip(ahead, reversed(behind), strict=True))
+
+
+def test_an_actor_that_brought_its_shade_along_casts_no_second_shadow(street):
+    (actor,) = street.actors
+    poses, times = actor.trajectory.world_from_body, actor.trajectory.times_us.numpy()
+    laid = shade(Track("veh_1", "car", True, actor.asset.size.numpy(), times, poses, np.full(len(times), -1), ()), street.ground, 1)
+    half = replace(laid, sh=laid.sh.half().float())  # as files of half precision hold it
+    asset = replace(actor.asset, gaussians=Gaussians.cat([actor.asset.gaussians, half]))
+    scene, bare = replace(street, actors=(replace(actor, asset=asset),)), street
+
+    def casters(scene, **edit):
+        return len(shadow_casters(edited(scene, Edit(**edit)), street.camera("front_camera", START_US)))
+
+    moved = {"shift": {"veh_1": (0.0, 0.5)}}
+    assert casters(bare, **moved) == 1 and casters(scene, **moved) == 0
+    assert casters(scene, **moved, replace={"veh_1": CAR}) == 1, "its shade went with it"
