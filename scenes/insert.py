@@ -23,6 +23,7 @@ from scenes.trajectory import Trajectory
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
 LONGEST_US = 3_600_000_000  # from the clip's first frame: no drive lasts longer, and each pose takes a look at the ground
 SIDEWAYS = 30  # degrees from its way by which what goes may be turned: beyond, no wheel drives so
+SLIDES = 0.5  # metres so from which it is told: what hardly moves shakes on the spot
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,9 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
             f"{placement.asset} is turned by {math.degrees(placement.yaw):g}deg from the lane that it goes along, so it slides sideways"
         )
         warnings.append(f"{turned}; give a yaw of 0deg or 180deg, or the path straight, to go where it faces")
+    if placement.trajectory is not None and (slid := _sliding(xy, headings)) is not None:
+        where = f"{placement.asset} slides sideways {(int(times[slid]) - start_us) / 1e6:g}s after the clip's first frame"
+        warnings.append(f"{where}; say in {placement.trajectory} by yaw_deg where it faces, or give more points where it turns")
     for point, heading in zip(xy, headings, strict=True):
         poses.append(standing_pose(scene, point, float(heading), asset.size))
     beyond = max(outside_ground(scene, point) for point in xy)
@@ -187,12 +191,24 @@ def _along(points: list[Waypoint], body: torch.Tensor, start_us: int) -> tuple[t
     return start_us + between(t).round().long(), _world(body, between(xy)), yaw_of(body) + between(turn)
 
 
+def _sliding(xy: torch.Tensor, headings: torch.Tensor) -> int | None:
+    """The first of points `[T, 2]` from which what has these headings `[T]` goes sideways; None where that is not for `SLIDES` metres."""
+    step = xy.diff(dim=0)
+    along = step[:, 0] * headings[:-1].cos() + step[:, 1] * headings[:-1].sin()
+    sideways = along.abs() < math.cos(math.radians(SIDEWAYS)) * step.norm(dim=1)
+    return int(sideways.nonzero()[0]) if float(step[sideways].norm(dim=1).sum()) > SLIDES else None
+
+
 def _direction(xy: torch.Tensor) -> torch.Tensor:
-    """Where the path goes at each point `[T, 2]`, radians; where it stands, the last direction it had (at first, the first it gets)."""
-    step = torch.cat([xy[1:2] - xy[:1], xy[2:] - xy[:-2], xy[-1:] - xy[-2:-1]])
+    """Where the path goes at each point `[T, 2]`, radians; where it stands, the last direction it had (at first, the first it gets): what
+    stops turns as it drives on, not on the spot."""
+    ahead = torch.cat([xy.diff(dim=0), torch.zeros(1, 2, dtype=torch.float64)])
+    behind = ahead.roll(1, 0)
+    step = ahead + behind
     angles = torch.atan2(step[:, 1], step[:, 0])
     moving = step.norm(dim=-1) > 1e-3
     last = angles[moving][0] if moving.any() else torch.zeros((), dtype=torch.float64)
+    moving[1:-1] &= behind[1:-1].norm(dim=-1) > 1e-3
     kept = []
     for angle, moves in zip(angles, moving, strict=True):
         last = angle if moves else last

@@ -99,6 +99,26 @@ def test_an_inserted_track_is_not_that_of_a_layer_that_a_kill_left(street, tmp_p
     assert insert(killed, car(), Placement("car/0001", 12, 3)).actor.track == "inserted_car_0001_2"
 
 
+def on_way(street, file, rows):
+    file.write_text("time_s,x_m,y_m\n" + rows)
+    return insert(street, car(), Placement("car", trajectory=file), start_us=START_US)
+
+
+def test_what_stops_on_its_way_turns_as_it_drives_on(street, tmp_path):
+    path = on_way(street, tmp_path / "t.csv", "0,10,0\n1,20,0\n3,20,0\n4,24,3\n5,28,6\n").actor.trajectory
+    turned = math.degrees(math.atan2(3, 4))
+    for after, degrees in ((0, 0), (1, 0), (2, 0), (3, 0), (3.5, turned / 2), (4, turned), (5, turned)):
+        assert math.degrees(float(yaw_of(path.at(START_US + round(1e6 * after))))) == pytest.approx(degrees, abs=0.01), after
+    waits = on_way(street, tmp_path / "t.csv", "0,10,0\n1,10,0\n2,10,4\n3,14,4\n").actor.trajectory
+    assert float(yaw_of(waits.at(START_US))) == pytest.approx(math.pi / 2), "it waits as it will set off"
+
+
+def test_a_trajectory_on_which_it_slides_sideways_is_told(street, tmp_path):
+    (told,) = on_way(street, tmp_path / "t.csv", "0,16,-3\n2,12,-3\n4,16,-3\n").warnings
+    assert "slides sideways 2.4s after the clip's first frame; say in" in told and "t.csv by yaw_deg" in told
+    assert on_way(street, tmp_path / "t.csv", "0,10,-3\n1,14,-3\n1.5,16,-3\n1.6,16,-3.1\n").warnings == ()
+
+
 def test_a_trajectory_file_is_followed(street, tmp_path):
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,10,0\n0.3,13,0\n0.6,13,3\n")
     result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"), start_us=START_US)
