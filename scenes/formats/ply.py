@@ -4,7 +4,8 @@ x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (channel-major: all of red's, all o
 scale_0..2 (ln), rot_0..3 (wxyz); binary little-endian floats. The reader takes any order, number type and byte order, more
 properties and ASCII, and what other tools write: red, green, blue instead of f_dc (nerfstudio), no scale_2 (2D splats), harmonics of
 degree 4 (Brush; those of degree 3 are kept), filter_3D (Mip-Splatting and what builds on it), logits and scales of 0 and 1 that are
-infinite. It maps the file: what the header claims is checked against its size before anything is allocated.
+infinite. Positions in doubles are refused where floats, which splats are, would move them: those of a map's coordinates. It maps the
+file: what the header claims is checked against its size before anything is allocated.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ _FIELDS = {
 _RGB = ("red", "green", "blue")
 _FULL = {"u1": 255.0, "u2": 65535.0}
 _FILTER = "filter_3D"
+_ASTRAY = 0.01
+"""Units by which floats may move a position that a file gives in doubles."""
 ANTIALIASED = "comment SplatRenderMode: mip"
 _REST_COUNTS = [3 * (k - 1) for k in (*SH_COUNTS, 25)]
 
@@ -63,12 +66,15 @@ def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
     fields, rest = _check_splats(path, elements)
     vertices = _read_vertices(path, order, elements, offset)
     n, k = len(vertices), kept_harmonics(1 + rest // 3, path)
+    finer = "f8" in {next(e.properties[axis] for e in elements if e.name == "vertex") for axis in fields["means"]}
     values = {name: np.empty((n, len(names)), np.float32) for name, names in fields.items() if name not in ("dc", "rgb")}
     sh, higher = np.empty((n, k, 3), np.float32), [f"f_rest_{i}" for i in range(rest)]
     for start in range(0, n, _ROWS):  # one pass over the file, in parts that stay in the processor's cache
         rows, part = slice(start, start + _ROWS), vertices[start : start + _ROWS]
         for name, value in values.items():
             value[rows] = _columns(part, fields[name])
+        if finer:
+            _check_rounded(path, part, values["means"][rows])
         sh[rows, 0] = _columns(part, fields["dc"]) if "dc" in fields else _constants(part, elements)
         sh[rows, 1:] = _columns(part, higher).reshape(len(part), 3, rest // 3).transpose(0, 2, 1)[:, : k - 1]
     logits, scales = values["opacity"][:, 0], values["scales"]
@@ -80,6 +86,18 @@ def load_ply(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
         scales, logits = _filtered(scales, logits, values["filter"])
     parts = values["means"], values["quats"], scales, logits, sh
     return clean(Gaussians(*(torch.from_numpy(np.ascontiguousarray(f)) for f in parts)), str(path))
+
+
+def _check_rounded(path: Path, part: np.ndarray, means: np.ndarray) -> None:
+    """ValueError where positions `[N, 3]` of records that hold doubles lost what tells neighbours apart."""
+    for axis, name in enumerate(("x", "y", "z")):
+        with np.errstate(invalid="ignore"):  # what is not finite is refused by others, or left out
+            astray = np.abs(part[name] - means[:, axis])
+        astray[~np.isfinite(astray)] = 0
+        if len(part) and astray.max() > _ASTRAY:
+            far = part[name][astray.argmax()]
+            lost = f"{path} has a splat at {name} = {far:.12g}, which 32 bits, as splats have, would move by {astray.max():.2g}"
+            raise ValueError(f"{lost}; take a round number, as {np.round(far, -5):.12g}, from the {name} of all, and give that file")
 
 
 def _constants(part: np.ndarray, elements: list[Element]) -> np.ndarray:

@@ -19,7 +19,7 @@ def table(*more):
 
 
 def write(path, columns, types=(), comments=()):
-    kinds = {"float": "<f4", "uchar": "u1", "ushort": "<u2"}
+    kinds = {"float": "<f4", "double": "<f8", "uchar": "u1", "ushort": "<u2"}
     named = {name: dict(types).get(name, "float") for name in columns}
     records = np.zeros(N, [(name, kinds[kind]) for name, kind in named.items()])
     for name, column in columns.items():
@@ -91,3 +91,15 @@ def test_mip_splattings_filter_makes_splats_wider_and_fainter(tmp_path):
 def test_a_comment_about_packed_positions_does_not_make_a_file_a_packed_one(tmp_path):
     path = write(tmp_path / "a.ply", table("scale_2", "opacity", *DC), comments=["was property uint packed_position"])
     assert found(path) is PLY and len(load(path)) == N
+
+
+def test_a_maps_coordinates_in_doubles_are_refused_before_they_are_rounded(tmp_path):
+    columns = table("scale_2", "opacity", *DC)
+    doubles = dict.fromkeys(("x", "y", "z"), "double")
+    assert load(write(tmp_path / "near.ply", columns, doubles)).means[:, 0].numpy() == approx(columns["x"])
+    mapped = columns | {"y": 4_200_123 + columns["y"].astype(np.float64)}
+    with pytest.raises(
+        ValueError, match=r"far\.ply has a splat at y = 42001\d\d\.\d+, which 32 bits.*; take a round number, as 4200000, from the y"
+    ):
+        load(write(tmp_path / "far.ply", mapped, doubles))
+    assert len(load(write(tmp_path / "floats.ply", mapped))) == N, "whose tool has rounded them before"
