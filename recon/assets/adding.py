@@ -10,6 +10,7 @@ import torch
 
 from recon.assets.extract import moved, thumbnail
 from recon.assets.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
+from recon.assets.overturned import overturned
 from render.progress import Progress
 from scenes.asset import Asset
 from scenes.databank import Databank
@@ -43,6 +44,7 @@ def add_mesh(
     bank.ready()
     mesh = read_mesh(file, up or "y", forward or "z", scale or 1.0)
     _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), scale or 1.0, force)
+    _check_upright(file, label, torch.from_numpy(mesh.vertices), up or "y", force)
     with Progress("fit", total=config.steps) as steps:
         meta = {**share, "source": file.name}
         asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
@@ -80,6 +82,7 @@ def add_splats(
         {**share, "source": file.name},
     )
     _check_size(file, label, asset.size.tolist(), scale or metres, force)
+    _check_upright(file, label, _solid(asset), up, force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
 
 
@@ -165,12 +168,25 @@ def _misplaced(asset: Asset) -> str:
     filled = [(high[i] - low[i]) / size for i, size in ((0, length), (2, height)) if size > SHEET]
     if min(filled, default=1.0) < 0.5:
         return f"has splats that fill {min(filled):.0%} of its box: its scale or axes are wrong"
-    return ""
+    return "is longer above than below: it stands on its head" if overturned(asset.label, _solid(asset)) else ""
+
+
+def _solid(asset: Asset) -> torch.Tensor:
+    """Means `[M, 3]` of an asset's splats that are not faint."""
+    return asset.gaussians.means[torch.sigmoid(asset.gaussians.logit_opacities) > 0.3]
 
 
 def _check_size(file: Path, label: str, size: list[float], scale: float, force: bool) -> None:
     if not force and (odd := odd_size(label, size, scale)):
         raise ValueError(f"{file} {odd}, or --force to keep it so")
+
+
+def _check_upright(file: Path, label: str, points: torch.Tensor, up: str, force: bool) -> None:
+    if not force and overturned(label, points):
+        other = up[1:] if up.startswith("-") else f"-{up}"
+        raise ValueError(
+            f"{file} is longer above than below, so it seems to stand on its head; give --up={other}, or --force to keep it so"
+        )
 
 
 def _told(asset: Asset) -> str:

@@ -8,7 +8,7 @@ from street import box, car, street
 
 from recon.assets import adding
 from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
-from scenes import Asset, Databank, save
+from scenes import Asset, Databank, Gaussians, save
 from scenes.poses import matrix_from_quat
 from scenes.sizes import SIZES, odd_size
 
@@ -142,6 +142,24 @@ def test_check_finds_what_is_broken_misplaced_or_turned(tmp_path):
     for id, said in (("0002", "its origin or axes are wrong"), ("0003", "stand across"), ("0004", "scale or axes"), ("0005", "")):
         assert f"car/{id}" in problems and said in problems, id
     assert "car/0001" not in problems
+
+
+def saloon() -> Asset:
+    """A car with a cabin, which `car` has not."""
+    cabin = box((2.2, 1.6, 0.7), (0.2, 0.2, 0.2))
+    splats = Gaussians.cat([box((4.2, 1.8, 0.8), (0.8, 0.1, 0.1)), replace(cabin, means=cabin.means + torch.tensor([-0.2, 0.0, 0.8]))])
+    return Asset(splats, (4.2, 1.8, 1.5), "car")
+
+
+def test_a_car_on_its_head_is_found_and_refused(tmp_path):
+    file, bank = tmp_path / "saloon.ply", Databank(tmp_path / "bank")
+    save(saloon().gaussians, file)
+    with pytest.raises(ValueError, match=r"saloon\.ply is longer above than below.* on its head; give --up=z, or --force"):
+        add_splats(bank.path, file, "car", None, "-z", "x", {})
+    assert add_splats(bank.path, file, "car", None, "z", "x", {})[0] == "car/0001" and check_databank(bank.path) == []
+    add_splats(bank.path, file, "car", None, "-z", "x", {}, force=True)
+    assert check_databank(bank.path) == ["car/0002 is longer above than below: it stands on its head"]
+    add_splats(bank.path, file, "stand", None, "-z", "x", {})  # of most classes nobody knows
 
 
 def test_a_ply_is_known_to_hold_splats_or_a_mesh(tmp_path):
