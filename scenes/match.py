@@ -7,7 +7,7 @@ the ground here has more or less of each channel, so has the asset.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import torch
 
@@ -88,10 +88,14 @@ def light_held(name: str, asset: Asset, scene: Scene) -> list[str]:
 
 
 def other_model(name: str, asset: Asset, scene: Scene) -> list[str]:
-    """What to tell of an asset that goes by `name` where its splats were trained otherwise than the scene's: a sentence, or none."""
-    if asset.model == scene.model:
+    """What to tell of an asset that goes by `name` where its splats were trained to be drawn otherwise than the scene's: a sentence, or
+    none. Not how they are projected: both ways come to the same ellipse, but at the rims of wide lenses, and most files do not say."""
+    of_asset, of_scene = (asdict(thing.model) for thing in (asset, scene))
+    other = [key for key in of_asset if key != "projection" and of_asset[key] != of_scene[key]]
+    if not other:
         return []
-    return [f"{name} was trained with {asset.model}, but the scene is rendered with {scene.model}"]
+    trained, drawn = (", ".join(f"{key} {model[key]}" for key in other) for model in (of_asset, of_scene))
+    return [f"{name} was trained with {trained}, but the scene is drawn with {drawn}, so it may look thicker or thinner than it is"]
 
 
 def relit(splats: Gaussians, gain: torch.Tensor) -> Gaussians:

@@ -127,10 +127,13 @@ def test_actors_are_edited_and_the_edit_is_listed_and_undone(door, tmp_path):
 def test_another_asset_of_another_splat_model_and_light_is_said(door, tmp_path):
     shutil.copytree("street", tmp_path / "street")
     bank = Databank(tmp_path / "bank")
-    bank.add(replace(made.car(), model=SplatModel("ewa"), meta={"ground_linear": [0.001, 0.1, 0.1]}))
+    bank.add(replace(made.car(), model=SplatModel(antialias=True), meta={"ground_linear": [0.001, 0.1, 0.1]}))
+    bank.add(replace(made.car(), model=SplatModel("ewa")))
     _, errors = door(["edit", str(tmp_path / "street"), "--replace", "veh_1=car/0001", "--databank", str(bank.path)])
-    assert "warning: car/0001 was trained with SplatModel(projection='ewa'" in errors
+    assert "warning: car/0001 was trained with antialias True, but the scene is drawn with antialias False, so" in errors
     assert "warning: car/0001 should be " in errors and "the limit is 4 times" in errors
+    _, errors = door(["edit", str(tmp_path / "street"), "--replace", "veh_1=car/0002", "--databank", str(bank.path)])
+    assert "was trained with" not in errors, "how splats are projected is said by no PLY, and hardly shows"
 
 
 def test_undoing_an_insertion_says_which_edits_go_with_it(door, tmp_path):
