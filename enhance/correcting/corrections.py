@@ -88,21 +88,23 @@ def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found:
     new: dict[int, Correction] = {}
     if due:
         whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
-        instance = reaching_over(instance)
+        over = reaching_over(instance)
         for i in due:
             box = found[i]
-            part, ids = rgb[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns]
-            mask = ids == i
-            at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
-            y, x = at.yx.unbind(1)
-            read.append(evidence(part[:, y, x].T, at, whole))
-            seams.append((part, ids, i, at.edges, box))
-            places, (y, x) = box.ground(ids <= 0)
+            part, edge, beyond = (x[..., box.outer_rows, box.outer_columns] for x in (rgb, instance, over))
+            for ids in (edge, beyond):
+                mask = ids == i
+                at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
+                y, x = at.yx.unbind(1)
+                read.append(evidence(part[:, y, x].T, at, whole))
+                seams.append((part, ids, i, at.edges, box))
+            places, (y, x) = box.ground(edge <= 0)
             around.append(read_ground(rgb[:, y, x].T, places))
-            grains.append(of_object(part.permute(1, 2, 0), mask, ids <= 0))
-        guesses, shades = net(Evidence.stacked(read)), net.shade(torch.stack(around))
-        for i, seam, guess, shade, grain in zip(due, seams, guesses, shades, grains, strict=True):
-            colours, ends = fitted(*seam, guess, net.usual)
+            grains.append(of_object(part.permute(1, 2, 0), beyond == i, beyond <= 0))
+        fits = [fitted(*seam, guess, net.usual) for seam, guess in zip(seams, net(Evidence.stacked(read)), strict=True)]
+        shades = net.shade(torch.stack(around))
+        for i, edge, beyond, shade, grain in zip(due, fits[::2], fits[1::2], shades, grains, strict=True):
+            colours, ends = edge.with_beyond(beyond)
             new[i] = Correction(colours, ends * shade, grain, 1)
     return {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
 

@@ -8,6 +8,8 @@ noise is weighed by what changes are usual (a Gaussian, of training objects).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
 from enhance.correcting.objects import COEFFICIENTS, LUMA, Box, Objects
@@ -26,16 +28,42 @@ FURTHER = 5
 """Pixels from a side's colour to the next one on, which are as far apart as the two sides' are."""
 EVEN = 6 / 255
 """Least that colours of one surface are taken to differ by."""
-GOES_ON, ENDS = 1.2, 1.6
+GOES_ON, ENDS = 1.2, 1.5
 """What a seam's fit leaves, to what colours as far apart differ by in the surroundings alone: up to the one a surface goes on there, so
 that nothing was put in and no shadow is missing, and from the other an object ends. Of regions of photos it is 0.9 to 1.0 in the median and
-1.1 to 1.4 in one of twenty, at 320 to 1280 pixels of width alike; of assets put in 1.6 and more."""
+1.1 to 1.4 in one of twenty, at 320 to 1280 pixels of width alike; of assets put in nearly always 1.5 and more."""
+UNDONE, STAYS = 0.6, 0.8
+"""What a seam's fit leaves, to what colours jump by there: up to the one, one change is what makes them jump, and from the other it hardly
+has to do with it. Of regions of photos in other colours it is 0.2 to 0.5, of right ones 0.9 to 1.0; of assets put in 0.8 to 1.0."""
+UNTOLD, TOLD = 48, 96
+"""Profiles up to which too little of an object is seen to say that it ends at its seam, and from which there is enough."""
 
 
-def fitted(
-    rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor, box: Box, guess: torch.Tensor, usual: torch.Tensor
-) -> tuple[torch.Tensor, float]:
-    """Coefficients `[15]` of the change (`objects.changed`) that object `i` needs, and how surely it ends at its seam, 0 to 1.
+@dataclass(frozen=True)
+class Fit:
+    """What a seam says of its object.
+
+    coefficients  `[15]` of the change (`objects.changed`) that it needs
+    by            root mean square of what that changes at the seam; inf where there are too few profiles to say anything
+    undoes        how surely colours jump at the seam by that change, 0 to 1
+    ends          how surely a surface ends at the seam, 0 to 1
+    """
+
+    coefficients: torch.Tensor
+    by: float
+    undoes: float
+    ends: float
+
+    def with_beyond(self, beyond: Fit) -> tuple[torch.Tensor, float]:
+        """Coefficients and how surely the object ends, by this seam, of a mask's edge, and by that of a mask a pixel larger
+        (`objects.reaching_over`). As far as the jump at the edge is undone, what is in other colours ends there, and its surface goes on.
+        Else both show what an object and its ground differ by, each by other pixels, and the smaller change is nearer to the truth."""
+        least = min(beyond, self, key=lambda fit: fit.by).coefficients
+        return torch.lerp(least, self.coefficients, self.undoes), (1 - self.undoes) * max(self.ends, beyond.ends)
+
+
+def fitted(rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor, box: Box, guess: torch.Tensor, usual: torch.Tensor) -> Fit:
+    """The change that object `i` needs, by its seam.
 
     rgb, ids  `[3, h, w]` and `[h, w]`: the box's outer part
     edges     `[E, 4]`: pixels at the object's seam there, and the way out (`Spots.edges`)
@@ -44,19 +72,26 @@ def fitted(
     """
     inside, outside, row, texture = _profiles(rgb, ids, i, edges)
     if len(inside) < FEWEST_PROFILES:
-        return guess, 0.0
+        return Fit(guess, float("inf"), 0.0, 0.0)
     height = box.placed(row + box.outer_rows.start, torch.zeros_like(row))[:, 0]
     does = effects(inside, height)
-    left = outside - inside - does @ guess
-    found, off = _robust(does @ usual, left)
-    return guess + usual @ found, _ends(off, texture)
+    found, off = _robust(does @ usual, outside - inside - does @ guess)
+    coefficients = guess + usual @ found
+    jump = (outside - inside).square().mean(1).median()
+    undoes = _fall(float((off.median() / jump.clamp_min(1e-9)).sqrt()), UNDONE, STAYS)
+    ends = _ends(off, texture) * (1 - _fall(len(inside), UNTOLD, TOLD))
+    return Fit(coefficients, float((does @ coefficients).square().mean().sqrt()), undoes, ends)
 
 
 def _ends(off: torch.Tensor, texture: torch.Tensor) -> float:
     """How surely an object ends, by the mean squares `[N]` that its profiles still differ by and differences `[M, 3]` in what is around."""
     usual = float(texture.square().mean(1).median().sqrt()) if len(texture) >= FEWEST_PROFILES else 0.0
-    beyond = float(off.median().sqrt()) / max(usual, EVEN)
-    return min(1.0, max(0.0, (beyond - GOES_ON) / (ENDS - GOES_ON)))
+    return 1 - _fall(float(off.median().sqrt()) / max(usual, EVEN), GOES_ON, ENDS)
+
+
+def _fall(x: float, start: float, end: float) -> float:
+    """1 up to `start`, 0 from `end`."""
+    return min(1.0, max(0.0, (end - x) / (end - start)))
 
 
 def _robust(does: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

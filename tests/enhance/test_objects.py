@@ -5,6 +5,7 @@ import torch
 
 from enhance import Enhancer
 from enhance.clip import telling
+from enhance.correcting import corrections
 from enhance.correcting.corrections import DEEP, SLIGHT, STEADY, Correction, correct
 from enhance.correcting.objects import (
     COEFFICIENTS,
@@ -21,7 +22,7 @@ from enhance.correcting.objects import (
     spots,
     whole_of,
 )
-from enhance.correcting.shade import KNOTS
+from enhance.correcting.shade import KNOTS, READ
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
 from enhance.training.object_samples import ObjectSampler
 from render import render_clip
@@ -158,6 +159,17 @@ def test_a_missing_shadow_darkens_the_ground_by_the_object_and_nothing_else():
     assert darker[26, 20:44].all() and not darker[instance == 5].any() and torch.equal(better[:, :, 75:], rgb[:, :, 75:])
     assert (better <= rgb + 1e-6).all()
     assert not (correct(net, rgb, instance, {})[0] != rgb).any(0)[instance > 0].any()
+
+
+def test_the_ground_is_read_up_to_the_mask_s_edge(monkeypatch):
+    """As it was learnt: where an object touches its ground it is darkest, and without that it seems to lack a shadow."""
+    rgb, instance = scene()
+    seen = []
+    monkeypatch.setattr(corrections, "read_ground", lambda rgb, places: seen.append(places) or torch.zeros(READ))
+    correct(stirred(), rgb, instance, {})
+    (box,) = boxes(instance).values()
+    below = box.placed(torch.tensor([box.rows.stop]), torch.tensor([30]))
+    assert (seen[0] == below).all(1).any()
 
 
 def added(colours=0.0, depth=0.0):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from enhance.correcting.objects import COEFFICIENTS, Objects, _edges, boxes, changed
-from enhance.correcting.seam import effects, fitted, usual_changes
+from enhance.correcting.objects import COEFFICIENTS, Objects, _edges, boxes, changed, reaching_over
+from enhance.correcting.seam import Fit, effects, fitted, usual_changes
 from enhance.pairs.isp import Isp, alter
 
 NOTHING = torch.zeros(COEFFICIENTS)
@@ -25,10 +25,18 @@ def region(h=240, w=360):
     return ids
 
 
-def found(rgb, ids, guess=NOTHING, usual=BROAD):
+def seam(rgb, ids, guess=NOTHING, usual=BROAD, over=0):
+    """The fit along the edge of a mask, or along that of one some pixels larger."""
     box = boxes(ids)[1]
+    for _ in range(over):
+        ids = reaching_over(ids)
     part, inner = rgb[:, box.outer_rows, box.outer_columns], ids[box.outer_rows, box.outer_columns]
     return fitted(part, inner, 1, _edges(inner == 1), box, guess, usual)
+
+
+def found(rgb, ids, guess=NOTHING, usual=BROAD):
+    fit = seam(rgb, ids, guess, usual)
+    return fit.coefficients, fit.ends
 
 
 def left(rgb, right, ids, coefficients):
@@ -64,6 +72,35 @@ def test_an_object_of_other_colours_ends_at_its_seam():
     ids, patches = region(), torch.rand(3, 12, 18, generator=torch.Generator().manual_seed(4))
     rgb = torch.where(ids == 1, patches.repeat_interleave(20, 1).repeat_interleave(20, 2), surface(3, wide=40))
     assert found(rgb, ids)[1] == 1
+
+
+def test_what_ends_at_the_mask_s_edge_is_put_right_by_the_seam_there():
+    """A mask a pixel larger has some of what is right on its side, along slanting edges above all."""
+    right = surface(5, wide=16)
+    y, x = torch.meshgrid(torch.arange(240) - 120, torch.arange(360) - 180, indexing="ij")
+    ids = (abs(x) + 1.5 * abs(y) < 130).int()
+    rgb = alter(right, (ids == 1).float()[None], ISP)
+    edge, beyond = seam(rgb, ids), seam(rgb, ids, over=1)
+    coefficients, ends = edge.with_beyond(beyond)
+    assert left(rgb, right, ids, coefficients)[0] < 0.8 * left(rgb, right, ids, beyond.coefficients)[0]
+    assert edge.undoes == 1 and ends == 0
+
+
+def test_what_no_change_undoes_is_taken_for_the_smaller_one():
+    assert seam(surface(2), region()).undoes == 0
+    small, large = Fit(NOTHING, 0.1, 0, 1), Fit(NOTHING + 1, 0.2, 0, 0)
+    for one, other in ((small, large), (large, small)):
+        coefficients, ends = one.with_beyond(other)
+        assert torch.equal(coefficients, NOTHING) and ends == 1
+
+
+def test_what_shows_little_of_its_seam_is_not_said_to_end_there():
+    patches = torch.rand(3, 12, 18, generator=torch.Generator().manual_seed(4)).repeat_interleave(20, 1).repeat_interleave(20, 2)
+    for side, ends in ((12, 0), (40, 1)):
+        ids = torch.zeros(240, 360, dtype=torch.int32)
+        ids[100 : 100 + side, 150 : 150 + side] = 1
+        flat = torch.full_like(patches, 0.5)
+        assert seam(torch.where(ids == 1, patches.roll(7, 1).roll(5, 2), flat), ids).ends == ends
 
 
 @pytest.mark.parametrize("grain", [0.02, 0.04, 0.08, 0.16])
