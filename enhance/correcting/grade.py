@@ -3,7 +3,8 @@
 Exposure, white balance, tone and saturation of a whole picture are set by the linear map that moves its colours least to have the mean and
 covariance of the photos' (Monge and Kantorovich; Pitié and Kokaram 2007). Of the photos those count that show most nearly the same:
 ranks of brightness over a coarse grid tell, which no exposure and no curve of tone changes. Then goes what the clip has of noise and
-sharpening beyond those photos (`enhance/correcting/grain.py`). What changes no more than the photos differ among themselves is left alone.
+sharpening beyond those photos (`enhance/correcting/grain.py`). What changes no more than photos as unlike differ among themselves is left
+alone.
 """
 
 from __future__ import annotations
@@ -53,7 +54,6 @@ class Grade:
     """Colours and grain of photos of one place.
 
     grey         whether no photo has any colour
-    usual        mean square by which a photo is changed that is given the colours of others
     usual_grain  excess that nine of ten photos have over others
     """
 
@@ -70,11 +70,11 @@ class Grade:
         if not colours:
             raise ValueError("there are no photos whose colours could be taken")
         self.colours, self.ranks = colours, torch.stack(ranks)
-        self.usual, self.usual_grain = 0.0, Excess(torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        self.usual_grain = Excess(torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        self.apart: list[list[tuple[float, float]]] = []
         if len(colours) > 1:
-            others = [self.nearest(r, but=i) for i, r in enumerate(self.ranks)]
-            self.usual = float(np.median([Map.between(c, o).changes(c) for c, (o, _) in zip(colours, others, strict=True)]))
-            each = [Excess.of(g, o) for g, (_, o) in zip(self.grains, others, strict=True)]
+            self.apart = [self._apart(i) for i in range(len(colours))]
+            each = [Excess.of(g, self._mean(self._order(i)[:NEAREST])[1]) for i, g in enumerate(self.grains)]
             self.usual_grain = Excess(*(torch.stack(x).quantile(OFTEN, 0) for x in zip(*((e.gain, e.noise) for e in each), strict=True)))
 
     @classmethod
@@ -90,14 +90,33 @@ class Grade:
             raise ValueError(f"{source} holds no photos ({', '.join(PICTURES)})" + (f"; {below} does" if below else ""))
         return cls(chain([first], photos))
 
-    def nearest(self, ranks: torch.Tensor, but: int | None = None) -> tuple[Colours, Grain]:
-        """What a picture with such ranks should have."""
-        likeness = self.ranks @ ranks
-        if but is not None:
-            likeness[but] = -torch.inf
-        count = min(NEAREST, len(self.colours) - (but is not None))
-        best = likeness.topk(count).indices.tolist()
-        return Colours.mean_of([self.colours[i] for i in best]), Grain.mean_of([self.grains[i] for i in best])
+    def nearest(self, ranks: torch.Tensor) -> tuple[Colours, Grain, float]:
+        """What a picture with such ranks should have, and how like it the photos are that say so, 1 at most."""
+        likeness, best = (self.ranks @ ranks).topk(min(NEAREST, len(self.colours)))
+        return *self._mean(best.tolist()), float(likeness.mean())
+
+    def usual(self, likeness: float) -> float:
+        """Mean square by which photos are changed that are given the colours of others which are as little like them as that, the median:
+        those beside one in a drive are the same picture once more, and tell nothing of a clip that was taken further on. 0 of one photo."""
+        return float(np.median([_expected(one, likeness) for one in self.apart])) if self.apart else 0.0
+
+    def _apart(self, i: int) -> list[tuple[float, float]]:
+        """Likeness of the nearest photos, and the mean square by which photo `i` is changed that is given their colours; then of others,
+        each time twice as far down the order of likeness."""
+        order, start, found = self._order(i), 0, []
+        while start < len(order):
+            those = order[start : start + NEAREST]
+            by = Map.between(self.colours[i], self._mean(those)[0])
+            found.append((float((self.ranks[those] @ self.ranks[i]).mean()), by.changes(self.colours[i])))
+            start = 2 * start or NEAREST
+        return found
+
+    def _order(self, i: int) -> list[int]:
+        """The other photos, the likest first."""
+        return [k for k in (self.ranks @ self.ranks[i]).argsort(descending=True).tolist() if k != i]
+
+    def _mean(self, those: list[int]) -> tuple[Colours, Grain]:
+        return Colours.mean_of([self.colours[i] for i in those]), Grain.mean_of([self.grains[i] for i in those])
 
 
 @dataclass(frozen=True)
@@ -133,11 +152,11 @@ class Graded:
         before = memory if memory is not None and memory.last.shape == last.shape and alike(last, memory.last)[0] else None
         share = 1.0 if before is None else 1 / min(before.count + 1, STEADY)
 
-        colours, grain = self.grade.nearest(_ranks(small))
+        colours, grain, likeness = self.grade.nearest(_ranks(small))
         mine = Colours.of(small.flatten(0, 1) if counts is None else _counted(small, counts))
         by = Map.between(mine, colours) if before is None else before.map.toward(Map.between(mine, colours), share)
         change = by.changes(mine)
-        surely = max(0.0, 1 - self.grade.usual / change) if change > 0 else 0.0
+        surely = max(0.0, 1 - self.grade.usual(likeness) / change) if change > 0 else 0.0
         better = SAME.toward(by, surely)(rgb) if surely else rgb
 
         own = Grain.of(better, counts)
@@ -149,6 +168,13 @@ class Graded:
             replace(frame, rgb=better) if isinstance(frame, Frame) else better, None if memory is None else memory.inner
         )
         return better, Settled(by, own, grain, 1 if before is None else min(before.count + 1, STEADY), last, inner)
+
+
+def _expected(apart: list[tuple[float, float]], likeness: float) -> float:
+    """Mean square of a photo's change by others of such a likeness: between those that are more and less like; where all are more, in
+    proportion to what is unlike."""
+    unlike, by = 1 - np.array([like for like, _ in apart]), [by for _, by in apart]
+    return float(np.interp(1 - likeness, unlike, by)) * max(1.0, (1 - likeness) / max(unlike[-1], 1e-9))
 
 
 def _counted(small: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:

@@ -85,6 +85,18 @@ def test_photos_of_what_the_frame_shows_are_what_counts():
         assert psnr(better, view) > 25
 
 
+def test_photos_that_are_there_once_more_do_not_say_what_is_usual():
+    """As where a car stood: neighbours are alike to a level, and the clip was taken further on, where the place itself looks different."""
+    drive = [altered(place(1, 4 * moment), Isp(exposure=0.03 * moment)) for moment in range(7)]
+    photos, frame = [p for p in drive[:6] for _ in range(4)], drive[6]
+    grade = Grade(photos)
+    assert grade.usual(1.0) < 1e-6 < grade.usual(0.9)
+    better, _ = Graded(Asis(), grade).step(frame)
+    assert psnr(better, frame) > 45
+    spoilt = altered(frame)
+    assert psnr(Graded(Asis(), grade).step(spoilt)[0], frame) > psnr(spoilt, frame) + 8
+
+
 def test_the_map_is_steady_over_a_clip_and_found_anew_after_a_cut():
     graded = Graded(Asis(), Grade([*photos(1), *photos(2)]))
     _, memory = graded.step(altered(place(1, 6)))
