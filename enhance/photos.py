@@ -22,15 +22,7 @@ class Photos:
     """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
 
     def __init__(self, paths: tuple[str | Path, ...], stride: int = 8, width: int = 960):
-        self.frames: list[np.ndarray] = []
-        for path in map(Path, paths):
-            before = len(self.frames)
-            for frame in frames_of(path, stride):
-                if min(frame.shape[:2]) < SMALLEST:
-                    raise ValueError(f"{path} holds a picture of {frame.shape[1]}x{frame.shape[0]} pixels, too small to tell; leave it out")
-                self.frames.append((shrunk(frame, width) * 255).round().to(torch.uint8).numpy())
-            if len(self.frames) == before:
-                raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PICTURES)} or a video")
+        self.frames: list[np.ndarray] = [photo for path in paths for photo in photos_of(Path(path), stride, width)]
 
     def crop(self, rng: np.random.Generator, size: int) -> torch.Tensor:
         """A crop `[3, size, size]` of one photo, as it is or shrunk."""
@@ -39,6 +31,18 @@ class Photos:
         y, x = (int(rng.integers(side - n + 1)) for side in photo.shape[:2])
         rgb = torch.from_numpy(photo[y : y + n, x : x + n]).permute(2, 0, 1).float() / 255
         return rgb if n == size else F.interpolate(rgb[None], (size, size), mode="area")[0]
+
+
+def photos_of(path: Path, stride: int, width: int) -> Iterator[np.ndarray]:
+    """The frames of a path, uint8 `[H, W, 3]`, `width` pixels wide at most, one after the other. ValueError for one that is too small to
+    tell, and where there is none."""
+    count = 0
+    for count, frame in enumerate(frames_of(path, stride), 1):  # noqa: B007 - asked for after the last
+        if min(frame.shape[:2]) < SMALLEST:
+            raise ValueError(f"{path} holds a picture of {frame.shape[1]}x{frame.shape[0]} pixels, too small to tell; leave it out")
+        yield (shrunk(frame, width) * 255).round().to(torch.uint8).numpy()
+    if count == 0:
+        raise ValueError(f"{path} holds no photos; give a folder of {', '.join(PICTURES)} or a video")
 
 
 def frames_of(path: Path, stride: int, most: int | None = None) -> Iterator[torch.Tensor]:

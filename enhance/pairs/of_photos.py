@@ -14,7 +14,7 @@ from enhance.pairs.isp import alter, random_pipeline
 from enhance.pairs.make import claim
 from enhance.pairs.masks import random_mask
 from enhance.pairs.shards import is_whole, to_bytes, write_shard
-from enhance.photos import Photos
+from enhance.photos import photos_of
 
 STRIDE = 8
 MADE = ("isp", "isp_frame", "clean")
@@ -33,12 +33,12 @@ def make_photo_pairs(paths: Sequence[str | Path], out: str | Path, seed: int = 0
     out, config = Path(out), PairConfig(width)
     check_names(paths)
     for path in map(Path, paths):
-        photos = Photos((path,), STRIDE, config.width).frames
-        digest = hashlib.sha256()
-        for photo in photos:  # all: a pair that is there is not made again of another photo
+        count, digest = 0, hashlib.sha256()
+        for photo in photos_of(path, STRIDE, config.width):  # all: a pair that is there is not made again of another photo
             digest.update(photo.tobytes())
-        claim(out, {"seed": seed, "width": config.width}, {f"source {path.stem}": f"{len(photos)} {digest.hexdigest()[:16]}"})
-        for i, photo in enumerate(photos):
+            count += 1
+        claim(out, {"seed": seed, "width": config.width}, {f"source {path.stem}": f"{count} {digest.hexdigest()[:16]}"})
+        for i, photo in enumerate(photos_of(path, STRIDE, config.width)):  # read again: a long video has no room in memory
             if all(is_whole(_file(out, kind, path.stem, i)) for kind in MADE):
                 continue
             rng = np.random.default_rng([seed, i])

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from enhance.pairs.make import claim_pairs, held_out_camera, kinds_for, make_pai
 from enhance.pairs.of_photos import make_photo_pairs
 from enhance.pairs.refits import REFITS, Refit, as_reconstructed, shots_of
 from enhance.pairs.shards import KINDS, PairSet
+from enhance.photos import photos_of
 from recon import open_log
 from recon.assets.extract import FEWEST_SPLATS, Candidate
 from recon.log import LogCamera
@@ -435,3 +438,20 @@ def test_pairs_of_photos_go_on_where_they_stopped(tmp_path):
     write_image(tmp_path / "photos" / "2.png", torch.zeros(60, 80, 3))
     with pytest.raises(ValueError, match="holds pairs of another source photos, or of this one before it was changed"):
         made()
+
+
+def test_pairs_of_photos_hold_one_photo_at_a_time(tmp_path, monkeypatch):
+    """A long video has no room in memory."""
+    (tmp_path / "photos").mkdir()
+    for i in range(5):
+        write_image(tmp_path / "photos" / f"{i}.png", torch.rand(32, 48, 3))
+    module, given = sys.modules["enhance.pairs.of_photos"], []
+
+    def watched(*asked):
+        for photo in photos_of(*asked):
+            assert sum(one() is not None for one in given) <= 1  # the one before, which a loop still names
+            given.append(weakref.ref(photo))
+            yield photo
+
+    monkeypatch.setattr(module, "photos_of", watched)
+    assert len(PairSet(make_photo_pairs([tmp_path / "photos"], tmp_path / "made", width=48)).of("isp")) == 5 and len(given) == 10
