@@ -103,8 +103,8 @@ def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found:
             grains.append(of_object(part.permute(1, 2, 0), beyond == i, beyond <= 0))
         fits = [fitted(*seam, guess, net.usual) for seam, guess in zip(seams, net(Evidence.stacked(read)), strict=True)]
         shades = net.shade(torch.stack(around))
-        for i, edge, beyond, shade, grain in zip(due, fits[::2], fits[1::2], shades, grains, strict=True):
-            colours, ends = edge.with_beyond(beyond)
+        for i, at_edge, further, shade, grain in zip(due, fits[::2], fits[1::2], shades, grains, strict=True):
+            colours, ends = at_edge.with_beyond(further)
             new[i] = Correction(colours, ends * shade, grain, 1)
     return {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
 
