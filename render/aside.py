@@ -13,11 +13,11 @@ from render.rasterize import rasterize
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera
 from scenes.collide import HALF, into, met
-from scenes.insert import outside_ground, standing_pose
 from scenes.lenses import Pinhole
 from scenes.poses import yaw_of
 from scenes.scene import Scene
 from scenes.spread import spread
+from scenes.standing import outside_ground, standing_pose
 from scenes.trajectory import Trajectory
 
 LOOKS = 40

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from scenes.collide import collisions
 from scenes.edit import Edit
-from scenes.insert import outside_ground
 from scenes.scene import Scene
 from scenes.seen import seeing, unseen_warning
+from scenes.standing import outside_ground
 from scenes.trajectory import Trajectory
 
 

@@ -127,7 +127,7 @@ class Edit:
     shift: UseAppendAction[tuple[Shift, ...]] = ()
     """An actor and the metres forward and left, along its own body, that it moves by, as veh_3=0m,1.5m."""
     replace: UseAppendAction[tuple[Replacement, ...]] = ()
-    """An actor and the asset that takes its place and path, as veh_4=car/0003."""
+    """An actor and the asset that takes its place and path, with its wheels on the ground, as veh_4=car/0003."""
     retime: UseAppendAction[tuple[Retiming, ...]] = ()
     """An actor and how much later it does everything, as veh_5=+0.5s."""
     undo: UseAppendAction[tuple[Track, ...]] = ()

@@ -14,6 +14,7 @@ from scenes.metres import require_metres
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.scene import Scene
+from scenes.standing import stood
 from scenes.trajectory import Trajectory
 
 HIDDEN = -15.0
@@ -55,7 +56,7 @@ class Edit:
 
     def apply(self, actor: Actor, scene: Scene) -> Actor:
         """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were; another asset
-        as it looks where it is at the drive's first moment, or nearest to that."""
+        with its wheels right on it, and as it looks where it is at the drive's first moment, or nearest to that."""
         asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
         if actor.track in self.shift:
             path = shifted(path, self.shift[actor.track], scene)
@@ -64,6 +65,7 @@ class Edit:
             deformation = deformation and deformation.later(self.retime[actor.track])
         if actor.track in self.replace:
             deformation = None  # another body bends elsewhere
+            path = stood(path, asset.size, scene)
             asset = at_place(asset, scene, path, int(scene.ego.times_us[0]))
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
 

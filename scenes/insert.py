@@ -18,6 +18,7 @@ from scenes.metres import require_metres
 from scenes.placement import Placement, Waypoint, read_waypoints
 from scenes.poses import yaw_of
 from scenes.scene import Scene
+from scenes.standing import outside_ground, standing_pose
 from scenes.trajectory import Trajectory
 
 STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
@@ -86,49 +87,6 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     actor = Actor(marked, path, _track(scene, placement.asset))
     warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us)).values()]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
-
-
-def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:
-    """`world_from_asset` `[4, 4]` at a world point `[2]`, heading in radians, on the plane that fits the ground under its footprint."""
-    forward = torch.tensor([math.cos(heading), math.sin(heading)], dtype=torch.float64)
-    left = torch.stack([-forward[1], forward[0]])
-    spread = torch.linspace(-0.4, 0.4, 5, dtype=torch.float64)
-    u, v = torch.meshgrid(spread, spread, indexing="ij")
-    along, across = (u * size[0]).reshape(-1), (v * size[1]).reshape(-1)
-    heights = ground_heights(scene, xy + along[:, None] * forward + across[:, None] * left)
-    # the grid is symmetric about its centre, so the least-squares plane separates into a mean and two slopes
-    rise, bank = (along * heights).sum() / (along * along).sum(), (across * heights).sum() / (across * across).sum()
-    x_axis = torch.cat([forward, rise[None]])
-    x_axis = x_axis / x_axis.norm()
-    y_axis = torch.cat([left, bank[None]])
-    z_axis = torch.linalg.cross(x_axis, y_axis)
-    z_axis = z_axis / z_axis.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([x_axis, torch.linalg.cross(z_axis, x_axis), z_axis], 1)
-    pose[:2, 3], pose[2, 3] = xy, heights.mean()
-    return pose
-
-
-def ground_heights(scene: Scene, xy: torch.Tensor) -> torch.Tensor:
-    """World heights `[N]` float64 of the ground at points `[N, 2]`; without a ground, the low end of the splats within 3 m."""
-    if scene.ground is not None:
-        return scene.ground.height(xy)
-    placed = scene.background
-    means = placed.gaussians.means.double() @ placed.world_from_local[:3, :3].T + placed.world_from_local[:3, 3]
-    around = (means[:, :2] - xy.mean(0)).norm(dim=-1) < 3
-    if not around.any():
-        raise ValueError("the scene has neither a ground nor splats at that place; put the asset nearer to the recorded street")
-    return means[around, 2].quantile(0.1).expand(len(xy))
-
-
-def outside_ground(scene: Scene, xy: torch.Tensor) -> float:
-    """Metres by which a world point `[2]` lies outside the scene's ground; 0 inside, and where there is no ground."""
-    if scene.ground is None:
-        return 0.0
-    rows, columns = scene.ground.heights.shape
-    low = torch.tensor(scene.ground.origin, dtype=torch.float64)
-    high = low + scene.ground.cell * torch.tensor([columns - 1, rows - 1], dtype=torch.float64)
-    return float(torch.maximum(low - xy, xy - high).clamp_min(0).norm())
 
 
 def _straight(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -21,11 +21,11 @@ from scenes.asset import Actor, Asset
 from scenes.camera import Camera
 from scenes.collide import collisions
 from scenes.gaussians import Placed
-from scenes.insert import outside_ground, standing_pose
 from scenes.match import matched
 from scenes.poses import yaw_of
 from scenes.scene import Scene
 from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.standing import outside_ground, standing_pose
 from scenes.trajectory import Trajectory
 
 TRIES = 40

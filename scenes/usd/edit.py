@@ -110,13 +110,12 @@ def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: b
         for actor in changed:
             prim = layer.OverridePrim(prims[actor.track])
             set_own_data(prim, edited=name)
-            if actor.track in edit.shift or actor.track in edit.retime:
-                author_path(prim, actor.trajectory, origin)
-                if (deformation := _in_step(actor, recorded)) is not None:
-                    author_weights(prim, deformation, origin)
+            author_path(prim, actor.trajectory, origin)
             if actor.track in edit.replace:
                 block_deformation(prim)
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
+            elif (deformation := _in_step(actor, recorded)) is not None:
+                author_weights(prim, deformation, origin)
         if hidden or len(painted):
             layer.GetRootLayer().subLayerPaths = [f"./{name}/hidden.usda"]
 

@@ -14,7 +14,7 @@ from render.portraits import Portraits
 from render.references import READS, References
 from scenes import Actor, Camera, Trajectory
 from scenes.asset import AssetPhoto
-from scenes.insert import standing_pose
+from scenes.standing import standing_pose
 
 CAMERA = "front_camera"
 

@@ -6,9 +6,10 @@ import torch
 from street import START_US, STEP_US, car
 
 from scenes import Ground, Trajectory
-from scenes.insert import insert, standing_pose
+from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation, yaw, yaw_of
+from scenes.standing import standing_pose
 
 
 def ramp(rise=0.1, bank=0.0):
