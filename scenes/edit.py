@@ -86,7 +86,9 @@ def check_edit(edit: Edit, scene: Scene) -> None:
             where, names = str(scene.meta.get("path", scene.meta.get("name", "the scene"))), [*have, *standing]
             if by := next((e["name"] for e in scene.meta.get("edits", []) if track in e.get("remove", ())), None):
                 raise ValueError(f"{track} is not in {where} any more: the edit {by} removed it; --undo {by} brings it back")
-            raise ValueError(unknown("actor", track, where, names))
+            option = next(key for key in ("remove", "shift", "replace", "retime") if track in getattr(edit, key))
+            each = f"--{option} {{}}" + ("" if option == "remove" else "=...")
+            raise ValueError(unknown("actor", track, where, names, each))
         if track not in have and track not in edit.remove:
             raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):

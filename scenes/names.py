@@ -5,6 +5,9 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+MANY, FEW = 20, 6
+"""Names from which on not all are told, and how many of them are then."""
+
 
 def nearest(name: str, options: Iterable[str]) -> str:
     """' Did you mean x?' for the option closest in spelling to `name`, or ''."""
@@ -18,10 +21,17 @@ def _likeness(name: str, option: str) -> float:
     return max(difflib.SequenceMatcher(None, name.casefold(), part.casefold()).ratio() for part in parts)
 
 
-def unknown(kind: str, name: str, where: str, options: Iterable[str]) -> str:
-    """The house's sentence for a name that does not exist: what, where, what there is, the nearest."""
+def unknown(kind: str, name: str, where: str, options: Iterable[str], each: str | None = None) -> str:
+    """The house's sentence for a name that does not exist: what, where, what there is, the nearest; of many only those likest to it.
+    each: where an option takes one name and may be repeated, how it takes one, as "--remove {}": so several are to be given."""
+    parts = [part.strip() for part in name.split(",") if part.strip()]
+    if each and len(parts) > 1:
+        return f'{kind} "{name}" is not in {where}; if these are several, repeat the option: {" ".join(each.format(p) for p in parts)}'
     options = list(options)
     have = ", ".join(options) or "nothing"
+    if len(options) > MANY:
+        likest = sorted(options, key=lambda option: -_likeness(name, option))[:FEW]
+        have = f"{len(options)}, the likest of which are {', '.join(likest)}"
     return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'
 
 

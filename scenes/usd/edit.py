@@ -182,7 +182,7 @@ def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
     with open_stage(scene / "scene.usda") as stage:
         have = [e["name"] for e in read_edits(stage)]
         if name not in have and not (_is_name(name) and ((edits / f"{name}.usda").exists() or (edits / name).exists())):
-            raise ValueError(unknown("edit", name, str(scene), have))
+            raise ValueError(unknown("edit", name, str(scene), have, "--undo {}"))
         gone = Undone(name, tuple(_idle_without(stage, name)), _held(stage, name))
     for each in (*gone.idle, name):
         drop_sublayer(scene, f"./edits/{each}.usda")

@@ -79,6 +79,8 @@ def test_an_edit_is_undone_by_deleting_its_layer_and_tidied_up_by_undo(saved):
     assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
     with pytest.raises(ValueError, match='edit "mine" is not in'):
         undo(saved, "mine")
+    with pytest.raises(ValueError, match="--undo mine --undo more$"):
+        undo(saved, "mine,more")
 
 
 def test_usds_validators_find_nothing_in_an_edited_scene(saved):
@@ -424,6 +426,8 @@ def test_a_scene_whose_root_held_the_recording_can_be_edited(saved):
     ("edit", "said"),
     [
         (Edit(remove=("veh_9",)), 'actor "veh_9" is not in .* it has veh_1, veh_2, veh_3. Did you mean'),
+        (Edit(remove=("veh_1,veh_2",)), 'actor "veh_1,veh_2" is not in .*; if .* repeat the option: --remove veh_1 --remove veh_2$'),
+        (Edit(retime={"veh_1, veh_2": 9}), "repeat the option: --retime veh_1=... --retime veh_2=...$"),
         (Edit(remove=("veh_1",), shift={"veh_1": (1, 0)}), "removed and changed at once"),
         (Edit(retime={"veh_3": 1000}), "veh_3 stands still"),
         (Edit(shift={"veh_1": (0.0, 0.0)}), "by nought, which changes nothing"),
