@@ -14,7 +14,7 @@ from scenes.metres import require_metres
 from scenes.names import unknown
 from scenes.poses import inverse
 from scenes.scene import Scene
-from scenes.standing import stood
+from scenes.standing import moved, stood
 from scenes.trajectory import Trajectory
 
 HIDDEN = -15.0
@@ -59,7 +59,7 @@ class Edit:
         with its wheels right on it, and as it looks where it is at the drive's first moment, or nearest to that."""
         asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
         if actor.track in self.shift:
-            path = shifted(path, self.shift[actor.track], scene)
+            path = moved(path, self.shift[actor.track], actor.asset.size, scene)
         if actor.track in self.retime:
             path = replace(path, times_us=path.times_us + self.retime[actor.track])
             deformation = deformation and deformation.later(self.retime[actor.track])
@@ -215,15 +215,3 @@ def _dense(path: Trajectory, step: float) -> torch.Tensor:
         return poses
     middles = (path.times_us[:-1] + path.times_us[1:]) // 2
     return torch.cat([poses, torch.stack([path.at(int(t)) for t in middles])])
-
-
-def shifted(path: Trajectory, by: tuple[float, float], scene: Scene) -> Trajectory:
-    """A path moved by metres forward and left along its own body, as high above the ground as before where the ground is known."""
-    there = path.shifted(forward=by[0], lateral=by[1])
-    if scene.ground is None:
-        return there
-    poses = there.world_from_body.clone()
-    poses[:, 2, 3] += scene.ground.height(poses[:, :2, 3]) - scene.ground.height(path.world_from_body[:, :2, 3])
-    # the shift along a tilted body already climbs with it; the ground alone decides how high the wheels are
-    poses[:, 2, 3] += path.world_from_body[:, 2, 3] - there.world_from_body[:, 2, 3]
-    return replace(there, world_from_body=poses)

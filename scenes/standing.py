@@ -1,4 +1,4 @@
-"""What stands on the ground: the pose of an asset at a place, and the path of one that takes a recorded actor's place."""
+"""What stands on the ground: the pose of an asset at a place, and the paths of recorded actors that are replaced or moved."""
 
 from __future__ import annotations
 
@@ -24,12 +24,34 @@ def stood(path: Trajectory, size: torch.Tensor, scene: Scene) -> Trajectory:
     is only roughly. As recorded where the ground is not known, or is not what the box stood on; between the two it goes over smoothly."""
     if scene.ground is None:
         return path
-    was = path.world_from_body
-    stands = torch.stack([standing_pose(scene, pose[:2, 3], float(yaw_of(pose)), size) for pose in was])
-    near = (FAR - (stands[:, 2, 3] - was[:, 2, 3]).abs()) / (FAR - NEAR)
-    beyond = torch.tensor([outside_ground(scene, pose[:2, 3]) for pose in was], dtype=torch.float64)
-    share = near.clamp(0, 1) * (1 - beyond / EDGE).clamp_min(0)
-    return replace(path, world_from_body=interpolate(was, stands, share))
+    below = _below(path, size, scene)
+    return replace(path, world_from_body=interpolate(path.world_from_body, below, _share(path, below, scene)))
+
+
+def moved(path: Trajectory, by: tuple[float, float], size: torch.Tensor, scene: Scene) -> Trajectory:
+    """The path of a body of a size `[3]`, moved by metres forward and left along it: as high above the ground as before, and as tilted
+    to it, where the ground is known and what it stood on."""
+    there = path.shifted(forward=by[0], lateral=by[1])
+    if scene.ground is None:
+        return there
+    before, after = _below(path, size, scene), _below(there, size, scene)
+    poses = there.world_from_body.clone()
+    poses[:, :3, :3] = after[:, :3, :3] @ before[:, :3, :3].mT @ poses[:, :3, :3]
+    # the shift along a tilted body already climbs with it; the ground alone decides how high the wheels are
+    poses[:, 2, 3] = path.world_from_body[:, 2, 3] + after[:, 2, 3] - before[:, 2, 3]
+    return replace(there, world_from_body=interpolate(there.world_from_body, poses, _share(path, before, scene)))
+
+
+def _below(path: Trajectory, size: torch.Tensor, scene: Scene) -> torch.Tensor:
+    """Poses `[T, 4, 4]` of what stands on the ground where a path goes."""
+    return torch.stack([standing_pose(scene, pose[:2, 3], float(yaw_of(pose)), size) for pose in path.world_from_body])
+
+
+def _share(path: Trajectory, below: torch.Tensor, scene: Scene) -> torch.Tensor:
+    """0 to 1 `[T]`: how far the ground, on which stands what is posed `below` `[T, 4, 4]`, is taken to be what a recorded box stood on."""
+    near = (FAR - (below[:, 2, 3] - path.world_from_body[:, 2, 3]).abs()) / (FAR - NEAR)
+    beyond = torch.tensor([outside_ground(scene, pose[:2, 3]) for pose in path.world_from_body], dtype=torch.float64)
+    return near.clamp(0, 1) * (1 - beyond / EDGE).clamp_min(0)
 
 
 def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:

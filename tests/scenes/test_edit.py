@@ -1,5 +1,6 @@
 """Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -409,6 +410,20 @@ def test_a_shifted_actor_stays_on_the_ground():
     scene = replace(busy(), ground=slope)
     after = edited(scene, Edit(shift={"veh_2": (0.0, 2.0)})).actors[1].trajectory
     torch.testing.assert_close(after.world_from_body[:, 2, 3], torch.full((9,), 0.2, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_a_shifted_actor_tilts_as_much_more_as_the_ground_does():
+    crowned = Ground((-0.04 * torch.arange(-20.0, 20.0).abs())[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
+    scene = replace(busy(), ground=crowned)
+    was, after = (s.actors[1].trajectory.world_from_body for s in (scene, edited(scene, Edit(shift={"veh_2": (0.0, 6.0)}))))
+    assert torch.allclose(after[:, 1, 3], was[:, 1, 3] + 6) and torch.allclose(after[:, 2, 3], was[:, 2, 3], atol=1e-6)
+    assert after[:, 2, 1].tolist() == pytest.approx([-math.sin(2 * math.atan(0.04))] * 9, abs=1e-6)
+
+
+def test_an_actor_on_a_bridge_is_shifted_along_the_bridge():
+    slope = Ground((0.1 * torch.arange(-20.0, 20.0) - 6)[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
+    after = edited(replace(busy(), ground=slope), Edit(shift={"veh_2": (0.0, 2.0)})).actors[1].trajectory
+    torch.testing.assert_close(after.world_from_body, busy().actors[1].trajectory.shifted(lateral=2.0).world_from_body, atol=1e-9, rtol=0)
 
 
 def test_a_scene_whose_root_held_the_recording_can_be_edited(saved):
