@@ -31,8 +31,9 @@ WAY, WITHIN_US = 2.5, 3_000_000
 PAIRS, FEWEST = 30, 12
 """Of a camera, spread over the drive; and how many pieces must have met for its mount to be told."""
 
-AHEAD = (3.0, 4.5, 6.0, 7.5)
-"""Heights of the camera above the ground at which the pieces of road lie that are laid out, along its view."""
+AHEAD, LOWEST = (3.0, 4.5, 6.0, 7.5), 0.5
+"""Heights of the camera above the ground at which the pieces of road lie that are laid out, along its view; and metres that it must be
+above the ground for them to be what it shows."""
 
 HALF, MARGIN, STEP = 1.5, 0.3, 0.03
 """Metres: half the sides of a piece, how much around it has to be free, and between its points."""
@@ -104,8 +105,8 @@ def mounts_by_road(
     log: Log, names: Sequence[str], sweeps: Sequence[Sweep], span_us: tuple[int, int], report: Callable[[], None] = lambda: None
 ) -> Log:
     """The log with those of the cameras `names` moved up or down and tilted whose pictures of the road, in a span, show that they are
-    elsewhere than recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. `report` is called for
-    each camera."""
+    elsewhere than recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. All pictures of the span
+    count, also those that a fit holds out, as for the path. `report` is called for each camera."""
     pairs = {name: _pairs(log.camera(name), span_us) for name in names}
     times = [log.camera(name).times_us[k] for name in names for pair in pairs[name] for k in pair]
     street = Street.of(log, sweeps, np.array(times, dtype=np.int64), span_us)
@@ -173,6 +174,8 @@ def _apart(
     stand by the piece alone; None where they do not show the same."""
     eyes = [camera.world_from_cam[i, :3, 3].numpy() for i in (first, second)]
     view, height = camera.world_from_cam[second, :2, 2].numpy(), float(street.above(eyes[1]))
+    if height < LOWEST:
+        return None
     view = view / max(1e-6, float(np.linalg.norm(view)))
     middle = np.append(eyes[1][:2] + ahead * height * view, 0.0)
     if not all(street.bare(eye, middle, int(camera.times_us[i])) for eye, i in zip(eyes, (first, second), strict=True)):
