@@ -13,7 +13,7 @@ import torch
 
 from recon.album import keep_album
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint
-from recon.corrected import MOVED, REMOUNTED
+from recon.corrected import KINDS
 from recon.exposed import exposed_by
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
@@ -141,7 +141,7 @@ def reconstruct(
         return spent_before + time.monotonic() - began
 
     def keep() -> None:
-        so_far = {"seconds": seconds(), "live": live.curve, "path": {kind: log.meta.get(kind) for kind in (MOVED, REMOUNTED)}}
+        so_far = {"seconds": seconds(), "live": live.curve, "path": {kind: log.meta.get(kind) for kind in KINDS}}
         so_far["movers"] = plain_tracks(log.tracks) if "movers" in log.meta else None
         save_checkpoint(checkpoint, held, start, fit.tensors() | so_far)
 

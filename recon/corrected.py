@@ -20,6 +20,8 @@ MOVED = "path_correction"
 REMOUNTED = "mount_corrections"
 """In `meta`: of cameras, by name, by how many metres they stand higher, and how many radians they look farther up, than recorded."""
 
+KINDS = (MOVED, REMOUNTED)
+
 
 def as_corrected(log: Log, meta: Mapping) -> Log:
     """A log as recorded, put right as the `meta` of a log or scene says, and saying so too; as it is where nothing was."""

@@ -186,10 +186,11 @@ def _apart(
     x, y = np.meshgrid(u, u, indexing="ij")
     spots = middle[:2] + x[..., None] * forward + y[..., None] * [-forward[1], forward[0]]
     spots = np.concatenate([spots, street.ground.height(torch.from_numpy(spots)).numpy()[..., None]], 2)
-    laid = [_laid_out(log, camera, i, grey, spots) for i in (first, second)]
-    if laid[0] is None or laid[1] is None:
+    one = _laid_out(log, camera, first, grey, spots)
+    other = None if one is None else _laid_out(log, camera, second, grey, spots)
+    if one is None or other is None:
         return None
-    shift = _shift(laid[0], laid[1], math.ceil(OFF * (way + height) / STEP))
+    shift = _shift(one, other, math.ceil(OFF * (way + height) / STEP))
     far = float(np.mean([np.linalg.norm(middle[:2] - eye[:2]) for eye in eyes]))
     lever = far * (1 + float(view @ forward) ** 2)  # tilted, a piece moves by the square of its distance; aside, by its bearing
     return None if shift is None else (lever, -height * shift * STEP / (way + shift * STEP))

@@ -38,10 +38,9 @@ def readied(
     pictures of the road meet, or as is `known` from before (`as_corrected`); and with the movers that sweeps show where it has no boxes, or
     that were found before (`plain_tracks`)."""
     log = _corrected(log, sweeps, config, names, span, size) if known is None else as_corrected(log, known)
-    places = {s.index for s in sweeps}
     if movers is not None:
         return _moved_by(log, tracks_of(movers))
-    return annotated(log, [s for s in log.sweeps if s.index in places])
+    return annotated(log, _as_in(log, sweeps))
 
 
 def _corrected(
@@ -54,10 +53,15 @@ def _corrected(
         with Progress("sweeps") as steps:
             log = aligned(log, sweeps, steps.step)
     if "road" in config.refine:
-        here = {s.index for s in sweeps}
         with Progress("mounts", total=len(names)) as steps:
-            log = mounts_by_road(log, names, [s for s in log.sweeps if s.index in here], span, steps.step)
+            log = mounts_by_road(log, names, _as_in(log, sweeps), span, steps.step)
     return log
+
+
+def _as_in(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
+    """Sweeps as a log has them whose path was corrected."""
+    places = {s.index for s in sweeps}
+    return [s for s in log.sweeps if s.index in places]
 
 
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:

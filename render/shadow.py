@@ -82,9 +82,11 @@ def shadow_casters(scene: Scene, camera: Camera) -> list[Caster]:
     """The inserted assets whose shadow can fall into the view, first those into most of it."""
     found = []
     for i, actor in enumerate(scene.actors):
-        if not actor.anew or not actor.trajectory.covers(camera.time_us) or has_shade(actor.asset):
+        if not actor.anew or not actor.trajectory.covers(camera.time_us):
             continue
         shade = _shade(scene)
+        if shade.is_brought(actor):
+            continue
         directions, weights = shade.at(actor, camera.time_us)
         if not (weights > 0).any():
             continue  # the slope turns away from all the light there is
@@ -156,8 +158,15 @@ class Shade:
     def __init__(self, scene: Scene):
         self.background, self.light = scene.background, light_of(scene)
         self._houses: Blockers | None = None
+        self._brought: dict[str, bool] = {}
         self._passing: dict[tuple[str, int], torch.Tensor] = {}
         self._fields: dict[tuple, Field] = {}
+
+    def is_brought(self, actor: Actor) -> bool:
+        """Whether an actor's own splats hold the light that it keeps from the ground (`scenes/shade.py`)."""
+        if actor.track not in self._brought:
+            self._brought[actor.track] = has_shade(actor.asset)
+        return self._brought[actor.track]
 
     def at(self, actor: Actor, time_us: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Directions `[K, 3]` of the light in the frame of an actor at a time, whose base is the ground there, and how much of each `[K]`

@@ -71,10 +71,11 @@ class Grade:
             raise ValueError("there are no photos whose colours could be taken")
         self.colours, self.ranks = colours, torch.stack(ranks)
         self.usual_grain = Excess(torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-        self.apart: list[list[tuple[float, float]]] = []
+        self.apart: list[tuple[np.ndarray, np.ndarray]] = []
         if len(colours) > 1:
-            self.apart = [self._apart(i) for i in range(len(colours))]
-            each = [Excess.of(g, self._mean(self._order(i)[:NEAREST])[1]) for i, g in enumerate(self.grains)]
+            orders = [self._order(i) for i in range(len(colours))]
+            self.apart = [self._apart(i, order) for i, order in enumerate(orders)]
+            each = [Excess.of(g, self._mean(order[:NEAREST])[1]) for g, order in zip(self.grains, orders, strict=True)]
             self.usual_grain = Excess(*(torch.stack(x).quantile(OFTEN, 0) for x in zip(*((e.gain, e.noise) for e in each), strict=True)))
 
     @classmethod
@@ -98,18 +99,19 @@ class Grade:
     def usual(self, likeness: float) -> float:
         """Mean square by which photos are changed that are given the colours of others which are as little like them as that, the median:
         those beside one in a drive are the same picture once more, and tell nothing of a clip that was taken further on. 0 of one photo."""
-        return float(np.median([_expected(one, likeness) for one in self.apart])) if self.apart else 0.0
+        return float(np.median([_expected(1 - likeness, *one) for one in self.apart])) if self.apart else 0.0
 
-    def _apart(self, i: int) -> list[tuple[float, float]]:
-        """Likeness of the nearest photos, and the mean square by which photo `i` is changed that is given their colours; then of others,
-        each time twice as far down the order of likeness."""
-        order, start, found = self._order(i), 0, []
+    def _apart(self, i: int, order: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """How unlike the nearest photos are, and the mean square by which photo `i` is changed that is given their colours; then of others,
+        each time twice as far down the order of likeness: `[T]` each."""
+        start, found = 0, []
         while start < len(order):
             those = order[start : start + NEAREST]
             by = Map.between(self.colours[i], self._mean(those)[0])
-            found.append((float((self.ranks[those] @ self.ranks[i]).mean()), by.changes(self.colours[i])))
+            found.append((1 - float((self.ranks[those] @ self.ranks[i]).mean()), by.changes(self.colours[i])))
             start = 2 * start or NEAREST
-        return found
+        unlike, changes = np.array(found).T
+        return unlike, changes
 
     def _order(self, i: int) -> list[int]:
         """The other photos, the likest first."""
@@ -170,11 +172,10 @@ class Graded:
         return better, Settled(by, own, grain, 1 if before is None else min(before.count + 1, STEADY), last, inner)
 
 
-def _expected(apart: list[tuple[float, float]], likeness: float) -> float:
-    """Mean square of a photo's change by others of such a likeness: between those that are more and less like; where all are more, in
-    proportion to what is unlike."""
-    unlike, by = 1 - np.array([like for like, _ in apart]), [by for _, by in apart]
-    return float(np.interp(1 - likeness, unlike, by)) * max(1.0, (1 - likeness) / max(unlike[-1], 1e-9))
+def _expected(so_unlike: float, unlike: np.ndarray, changes: np.ndarray) -> float:
+    """Mean square of a photo's change by others that are so unlike it: between those that are less and more so, `[T]`; where all are less,
+    in proportion."""
+    return float(np.interp(so_unlike, unlike, changes)) * max(1.0, so_unlike / max(unlike[-1], 1e-9))
 
 
 def _counted(small: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
