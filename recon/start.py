@@ -18,6 +18,7 @@ from recon.frames import Frames
 from recon.ground import estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
 from recon.movers.traffic import traffic
+from recon.seeds.aside import seen_from_aside
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import agreeing, cloud_from_pictures, points_of
@@ -44,6 +45,9 @@ BEYOND_PART = 0.06
 
 ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Of the splat budget that all movers' lidar points may take, and how many of one: traffic must not leave the street without."""
+
+ASIDE_PART = 0.03
+"""Of the splat budget that what lidar alone saw, but cameras beside the path would, may take besides."""
 
 CARPET_PART = 0.15
 """Of the splat budget that the ground may take that nobody saw: of a way of some hundred metres, 30 cm apart, it takes that much."""
@@ -110,7 +114,7 @@ def prepare(
         gains = np.ones((len(frames.names), 3)) if told is None else told
         cloud, *measured = cloud_from_pictures(log, frames, sparse, agreed, movers, gains)
         ground = estimate_ground(cloud.xyz, driven)
-        beyond = Cloud.cat([])
+        beyond = unseen = Cloud.cat([])
     else:
         ground = estimate_ground(split.static, driven)
         seen = colours(log, frames, split.static, taken, list(split.tracks))
@@ -120,13 +124,14 @@ def prepare(
         if not known.any():
             raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
         cloud = Cloud(split.static[known], rgb[known])
+        unseen = seen_from_aside(log, frames, split.static[~known], cloud, ground)
         report("measuring depth")
         struck = by_lidar(log, frames, sweeps, split, movers)
         beyond, by_pictures = beyond_lidar(log, frames, struck, ground, movers, gains)
         everything = struck.completed(by_lidar_of_movers(log, frames, sweeps, split))
         measured = [everything, by_all_sweeps(log, frames, split, movers).without(by_pictures), by_pictures]
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
-    cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)))
+    cloud, sides = _thinned(path, (cloud, int(budget * SEED_PART)), (beyond, int(budget * BEYOND_PART)), (unseen, int(budget * ASIDE_PART)))
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values()))
     background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
 

@@ -1,0 +1,54 @@
+"""Surfaces past the pictures' borders, where lidar knows them and cameras beside the path would see them."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from recon.frames import Frames
+from recon.log import Log, LogCamera
+from recon.seeds.aside import FARTHEST, seen_from_aside
+from recon.seeds.points import Cloud
+from recon.view import View
+from scenes.ground import Ground
+from scenes.lenses import Pinhole
+from scenes.trajectory import Trajectory
+
+RED, GREY = [0.8, 0.1, 0.1], [0.4, 0.4, 0.4]
+
+
+def ahead() -> tuple[Log, Frames]:
+    """A camera 1.5 m above the ground that looks along x, 90 degrees wide, from five places 1 m apart."""
+    times = 100_000 * torch.arange(5)
+    body = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    body[:, 0, 3] = torch.arange(5)
+    mount = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]], dtype=torch.float64)
+    camera = LogCamera("front", Pinhole(48.0, 48.0, 48.0, 27.0), 96, 54, (), times, body @ mount)
+    log = Log("street", Path(), {"front": camera}, (), (), Trajectory(times, body), {})
+    views = [View(0, i, int(t), torch.zeros(54, 96, 3), False, torch.zeros(1, 1)) for i, t in enumerate(times)]
+    return log, Frames(["front"], [(96, 54)], views)
+
+
+def found(*points: list[float]) -> np.ndarray:
+    log, frames = ahead()
+    level = Ground(torch.zeros(2, 2), (-50.0, -50.0), 100.0)
+    known = Cloud(np.array([[6.0, 5.9, 1.5]] * 9 + [[9.0, -8.9, 1.5]] * 9), np.array([RED] * 9 + [GREY] * 9))
+    cloud = seen_from_aside(log, frames, np.array(points), known, level)
+    return np.column_stack([cloud.xyz, cloud.rgb])
+
+
+def test_a_wall_past_the_border_is_taken_in_the_colours_beside_it():
+    left, right = [5.0, 6.0, 1.5], [5.0, -7.0, 1.5]  # 5 m ahead of where the drive begins, out of its 45 degrees by 1 and 2 m
+    got = found(left, right)
+    np.testing.assert_allclose(got[:, :3], [left, right])
+    np.testing.assert_allclose(got[:, 3:], [RED, GREY])
+
+
+def test_what_pictures_show_and_what_no_view_from_aside_sees_is_left_to_others():
+    shown, behind, beside = [6.0, 2.0, 1.5], [-5.0, 0.0, 1.5], [4.0, 12.0, 1.5]
+    road, far, parked = [5.0, 6.0, 0.1], [FARTHEST + 6, FARTHEST + 8, 1.5], [2.0, 3.0, 1.0]
+    assert len(found(shown, behind, beside, road, far, parked)) == 0
+
+
+def test_a_cell_gives_one_point():
+    assert len(found([5.01, 6.01, 1.51], [5.02, 6.02, 1.52], [5.03, 6.03, 1.53], [5.01, 6.31, 1.53])) == 2
