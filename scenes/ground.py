@@ -31,7 +31,7 @@ class Ground:
         cx, cy = at[..., 0].clamp(0, nx - 1), at[..., 1].clamp(0, ny - 1)
         i, j = cx.floor().clamp_max(nx - 2).long(), cy.floor().clamp_max(ny - 2).long()
         fx, fy = cx - i, cy - j
-        h = self.heights.to(torch.float64)
-        near = h[j, i] * (1 - fx) + h[j, i + 1] * fx
-        far = h[j + 1, i] * (1 - fx) + h[j + 1, i + 1] * fx
+        low, low_next, high, high_next = (self.heights[r, c].to(torch.float64) for r in (j, j + 1) for c in (i, i + 1))
+        near = low * (1 - fx) + low_next * fx
+        far = high * (1 - fx) + high_next * fx
         return near * (1 - fy) + far * fy

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.seeds import dense
+from recon.seeds.dense import FARTHEST, ground_depth
 from recon.seeds.stereo import WINDOW, Plate, box_means, unlike
 from scenes.ground import Ground
 
@@ -71,7 +71,7 @@ def sightings(
         return []
     eye, speeds = plate.eye(), np.arange(-ONCOMING, pace + PASSING, 1.0)
     still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
-    deepest = ground_depth(plate, ground)
+    deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
     inverse_depths = torch.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0])
     standing = torch.cat([box_means(unlike(plate, still, slice(None), 1 / float(w))) for w in inverse_depths])
     of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0].numpy()
@@ -103,13 +103,6 @@ def sightings(
         if all(abs(new[1] - old[1]) > APART * max(new[2], old[2]) for old in kept):
             kept.append(new)
     return [one for *_, z, one in kept if z < DISTANCES[-1]]
-
-
-def ground_depth(plate: Plate, ground: Ground) -> np.ndarray:
-    """Depth z `[h, w]` of the ground that a plate's rays meet; `dense.FARTHEST` at most."""
-    eye = plate.eye()
-    high = float(eye[2] - ground.height(torch.from_numpy(eye[:2].copy())))
-    return np.minimum(dense.ground_depth(plate, ground) * (high / (high + dense.DUG)), dense.FARTHEST)
 
 
 def _base(plate: Plate, ground: Ground, z: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from recon.frames import Frames
+from recon.ground_rays import ground_hits
 from recon.log import Log, SparsePoints, Track
 from recon.project import project
 from recon.seeds.measured import PICTURES, Measured, by_pictures
@@ -180,7 +181,7 @@ def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Gro
     others = companions(i, plates, float(np.median(z))) if len(z) else []
     if not others:
         return None
-    deepest = ground_depth(plates[i], ground)
+    deepest = ground_depth(plates[i], ground, DUG)
     if (shown[:, 2] < ground.height(torch.from_numpy(shown[:, :2])).numpy() - DUG).mean() > BURIED:
         deepest = np.full_like(deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
@@ -204,18 +205,10 @@ def companions(i: int, plates: list[Plate], typical: float) -> list[int]:
     return list(dict.fromkeys(found)) or [int(j) for j in apart.argsort()[:2] if apart[j] < 1]
 
 
-def ground_depth(plate: Plate, ground: Ground) -> np.ndarray:
-    """Depth z `[h, w]` at which a plate's rays are `DUG` under the ground; infinite above the horizon."""
+def ground_depth(plate: Plate, ground: Ground, below: float) -> np.ndarray:
+    """Depth z `[h, w]` at which a plate's rays are so many metres under the ground; infinite above the horizon (`ground_hits`)."""
     back = np.linalg.inv(plate.cam_from_world)
-    eye, world = back[:3, 3], plate.rays().double().numpy() @ back[:3, :3].T
-    falls = world[..., 2] < -1e-3
-    slope = np.where(falls, world[..., 2], -1.0)
-    at = np.broadcast_to(eye[:2], (*falls.shape, 2))
-    for _ in range(4):  # along the ray to the height that the ground has there
-        depth = (ground.height(torch.from_numpy(at.copy())).numpy() - DUG - eye[2]) / slope
-        depth = np.where(falls & (depth > 0), depth, np.inf)  # ground that rises above the eye hides nothing that is known
-        at = eye[:2] + world[..., :2] * np.minimum(depth, FARTHEST)[..., None]
-    return depth
+    return ground_hits(back[:3, 3], plate.rays().double().numpy() @ back[:3, :3].T, ground, below)
 
 
 def agreed(found: list[Depths]) -> list[np.ndarray]:

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from recon.ground_rays import ground_hits
 from recon.log import Track
 from recon.seeds.points import Cloud, nearest_box, splats_from
-from recon.seeds.sweep import FARTHEST, companions, swept_depth
+from recon.seeds.sweep import companions, swept_depth
 from recon.view import View
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
@@ -27,9 +28,6 @@ FAR = 250.0
 
 STEP = 6
 """Pixels between filling splats."""
-
-STEPS = np.geomspace(0.5, FARTHEST, 64)
-"""Depths at which it is asked whether a ray is under the ground."""
 
 EVERY, VIEWS = 5, (6, 30)
 """Every how many views of a camera one is searched, and how many at least and at most: in six of drive 002's front left camera a sign on a
@@ -84,29 +82,13 @@ def unexplained(
     z = swept_depth(pixels, z[want], STEP / 3, view, camera, others)
     rays = camera.lens.unproject(pixels).numpy()
     pose = camera.world_from_cam.numpy()
-    z = np.minimum(z, _to_ground(rays @ pose[:3, :3].T, pose[:3, 3], ground))
+    z = np.minimum(z, ground_hits(pose[:3, 3], rays @ pose[:3, :3].T, ground))
     local = rays * z[:, None]
     # the mean of what of the block is no sky, half of it at least: what the sky shines into would be a pale rim before it, from aside
     street = (~sky[..., None]).astype(np.float32)
     colour, share = (ndimage.uniform_filter(x, (STEP, STEP, 1))[rows[want], columns[want]] for x in (view.evenly() * street, street))
     colour = colour / share / gain
     return Cloud(local @ pose[:3, :3].T + pose[:3, 3], colour), z * STEP / camera.lens.focal()[0]
-
-
-def _to_ground(rays: np.ndarray, eye: np.ndarray, ground: Ground) -> np.ndarray:
-    """How many times their length rays `[N, 3]` from `eye` `[3]` go until they meet the ground, `[N]`; infinite where they do not fall, or
-    a hill falls as fast."""
-    falls = rays[:, 2] < -1e-3
-    at = eye + STEPS[:, None, None] * rays[falls]
-    over = at[..., 2] - ground.height(torch.from_numpy(at[..., :2])).numpy()
-    after = (over <= 0).argmax(0)
-    before, column = np.maximum(after - 1, 0), np.arange(over.shape[1])
-    high, low = over[before, column], over[after, column]
-    share = np.where(high > low, high / np.where(high > low, high - low, 1.0), 1.0)
-    met = STEPS[before] + share * (STEPS[after] - STEPS[before])
-    away = np.full(len(rays), np.inf)
-    away[falls] = np.where((over <= 0).any(0), met, np.inf)
-    return away
 
 
 def _from_below(depth: np.ndarray) -> np.ndarray:

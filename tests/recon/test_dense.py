@@ -158,7 +158,7 @@ def test_the_ground_is_as_far_as_rays_have_to_go_to_it():
     heights = torch.zeros(400, 400)
     ground = Ground(heights, (-100.0, -100.0), 0.5)
     camera = drive([0.0]).camera("front").camera(0, *SIZE)
-    found = ground_depth(plate_of(torch.zeros(180, 320, 3, dtype=torch.uint8), camera), ground)
+    found = ground_depth(plate_of(torch.zeros(180, 320, 3, dtype=torch.uint8), camera), ground, DUG)
     rays = depth_of(camera.resized(160, 90)).numpy()
     below = rays < WALL - 1
     eye = float(camera.world_from_cam[2, 3])
