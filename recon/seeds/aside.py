@@ -17,7 +17,6 @@ from recon.log import Log
 from recon.project import project
 from recon.seeds.carpet import NEAR_GROUND
 from recon.seeds.points import Cloud
-from recon.view import View
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
