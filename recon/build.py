@@ -41,7 +41,7 @@ from recon.tracks import LIMBED
 from render.progress import Progress
 from scenes.asset import Actor, Asset
 from scenes.atomic import atomic_folder
-from scenes.camera import RigCamera
+from scenes.camera import DARKEST, RigCamera
 from scenes.files import save
 from scenes.gaussians import Placed
 from scenes.opening import check_device, fresh
@@ -72,9 +72,6 @@ metres a second), and are fitted as a drive's."""
 
 DROP = 0.2
 """Part of the splats that a step leaves out where photos stand steps apart."""
-
-DARK = 0.05
-"""Part of the light below which no camera's exposure is taken to fall: an affine one may say anything of colours that it never met."""
 
 
 def reconstruct(
@@ -334,7 +331,7 @@ def brightest(rig: Iterable[RigCamera]) -> float:
     for camera in rig:
         gain, offset = camera.exposure[:, :3].sum(1), camera.exposure[:, 3]
         frames = torch.ones(1, 3) if camera.gains is None else camera.gains
-        most = max(most, float(((1 / frames - offset) / gain.clamp_min(DARK)).max()))
+        most = max(most, float(((1 / frames - offset) / gain.clamp_min(DARKEST)).max()))
     return most
 
 

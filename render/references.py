@@ -27,7 +27,7 @@ from render.portraits import portraits_of
 from render.rays import camera_rays, on_device
 from render.seen import GONE, NOISE, PARALLAX, PHOTOS, Seen, faded, run_over
 from scenes.asset import Asset
-from scenes.camera import Camera
+from scenes.camera import DARKEST, Camera
 from scenes.gaussians import Placed
 from scenes.poses import inverse
 from scenes.scene import Scene
@@ -222,7 +222,7 @@ def _gain(scene: Scene, frame: Frame) -> torch.Tensor:
     """How many times as bright as a scene's splats are they are shown, `[H, W, 3]` or `[3]`: what a photo adds is shown alike."""
     assert frame.rgb is not None and frame.instance is not None
     exposure, followed = frame.camera.exposure, scene.followed(frame.camera.time_us)
-    gain = torch.ones(3, dtype=torch.float32) if exposure is None else exposure[:, :3].diagonal().clamp_min(0.05)
+    gain = torch.ones(3, dtype=torch.float32) if exposure is None else exposure[:, :3].diagonal().clamp_min(DARKEST)
     if followed is None:
         return gain.to(frame.rgb)
     lit = torch.stack([gain, *(gain / followed if actor.recorded else gain for actor in scene.actors)])

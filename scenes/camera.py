@@ -15,6 +15,9 @@ from scenes.trajectory import Trajectory, between
 
 SHUTTERS = ("global", "rows", "columns")
 
+DARKEST = 0.05
+"""Gain below which no camera's exposure is taken to fall: a fitted affine one may say anything of colours that it never met."""
+
 
 def neutral_exposure() -> torch.Tensor:
     """The affine colour `[3, 4]` that changes nothing."""

@@ -10,7 +10,7 @@ import torch
 
 from scenes.harmonics import rgb_from_sh
 from scenes.scene import Scene
-from scenes.sky import Sky, linear_from_srgb
+from scenes.sky import LUMINANCE, Sky, linear_from_srgb
 
 SUN_RADIUS = math.radians(0.266)
 """Of the sun's disc; haze and coarse images only make it wider."""
@@ -48,19 +48,18 @@ class Light:
     source: str
 
 
-def light_of(scene: Scene, time_us: int | None = None) -> Light:
+def light_of(scene: Scene) -> Light:
     """The light of a scene's sky image. Where that does not show the sun itself, it is added by time and place, where the scene knows
-    them, as strong as the image's blueness tells; without an image the sky is even. time_us: the drive's first moment by default."""
+    them, as strong as the image's blueness tells; without an image the sky is even. The time is the drive's first moment."""
     if scene.sky is None:
         return Light(_drawn(torch.ones(32, 64, dtype=torch.float64), COUNT), None, "an even sky")
-    luminance = scene.sky.linear.double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+    luminance = scene.sky.linear.double() @ torch.tensor(LUMINANCE, dtype=torch.float64)
     seen = sun_of_sky(scene.sky)
     if seen is not None:
         told = f"the sky's image, the sun at {math.degrees(math.asin(float(seen[2]))):.0f} deg"
         return Light(_drawn(luminance, COUNT), seen, told)
     place, clear = scene.meta.get("geodetic_origin"), clearness(scene.sky)
-    time = int(scene.ego.times_us[0]) if time_us is None else time_us
-    elevation, azimuth = solar_position(time, float(place["lat"]), float(place["long"])) if place else (0.0, 0.0)
+    elevation, azimuth = solar_position(int(scene.ego.times_us[0]), float(place["lat"]), float(place["long"])) if place else (0.0, 0.0)
     # a world with a geodetic origin has x east and y north; azimuth counts from north to the east
     sun = _direction(math.pi / 2 - azimuth, elevation)
     share = clear * clear_sky_share(elevation) if elevation > LOWEST else 0.0
@@ -82,7 +81,7 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
     """
     directions, solid = _directions(*sky.linear.shape[:2])
     up = directions[..., 2] > 0
-    luminance = sky.linear.double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+    luminance = sky.linear.double() @ torch.tensor(LUMINANCE, dtype=torch.float64)
     mean = float((luminance * solid)[up].sum() / solid[up].sum())
     brightest = float((luminance * up).max())
     if brightest < SUN_FROM * max(mean, 1e-9):

@@ -8,6 +8,9 @@ import torch
 
 from scenes.checks import check_tensor
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""What linear red, green and blue add to luminance (ITU-R BT.709)."""
+
 
 def srgb_from_linear(linear: torch.Tensor) -> torch.Tensor:
     """IEC 61966-2-1, values above 1 kept."""

@@ -10,7 +10,8 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from kornia.filters import gaussian_blur2d
 
-LUMA = (0.2126, 0.7152, 0.0722)
+from scenes.sky import LUMINANCE
+
 FLOOR = 0.02
 """Light that a sensor's own noise is worth."""
 
@@ -60,7 +61,7 @@ class Isp:
             [2.0 ** (self.exposure + self.red), 2.0**self.exposure, 2.0 ** (self.exposure + self.blue)], dtype=x.dtype, device=x.device
         )
         # gains, and saturation about the luma that they leave, as one matrix: a GPU waits for samples while colours are made
-        grey = torch.tensor(LUMA, dtype=x.dtype, device=x.device).expand(3, 3)
+        grey = torch.tensor(LUMINANCE, dtype=x.dtype, device=x.device).expand(3, 3)
         mixed = (self.saturation * torch.eye(3, dtype=x.dtype, device=x.device) + (1 - self.saturation) * grey) * gains
         x = (mixed @ x.flatten(-2)).view_as(x)
         x = (x + self.sharpen * (x - _blurred(x)) if self.sharpen else x).clamp(0, 1)
@@ -92,12 +93,12 @@ def random_isp(rng: np.random.Generator, strength: float = 1.0) -> Isp:
     return Isp(**chosen)
 
 
-def random_pipeline(rng: np.random.Generator, strength: float = 1.0) -> Isp:
+def random_pipeline(rng: np.random.Generator) -> Isp:
     """`random_isp`, and in every other picture more or less sharpening, and noise, than its camera left."""
-    isp = random_isp(rng, strength)
+    isp = random_isp(rng)
     sharpen = float(rng.uniform(0.2, 1.5)) if rng.random() < 0.5 else 0.0
     noise = float(2 ** rng.uniform(-7.0, -4.0)) if rng.random() < 0.5 else 0.0
-    return replace(isp, sharpen=strength * sharpen, noise=strength * noise, seed=int(rng.integers(2**31)))
+    return replace(isp, sharpen=sharpen, noise=noise, seed=int(rng.integers(2**31)))
 
 
 def _blurred(x: torch.Tensor) -> torch.Tensor:

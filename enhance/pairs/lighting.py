@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from scenes.light import light_of
 from scenes.scene import Scene
-from scenes.sky import Sky, linear_from_srgb, srgb_from_linear
+from scenes.sky import LUMINANCE, Sky, linear_from_srgb, srgb_from_linear
 
 BOUNCE = 0.2
 """Albedo of the street that lights what faces down."""
@@ -24,7 +24,6 @@ MOST = 3.0
 """Times that a surface gets brighter or darker at most: beyond, its photo has nothing left to show."""
 
 ROWS = 64
-LUMA = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Illumination:
             colours = linear_from_srgb(scene.sky.colour(light.directions)).double().clamp_min(1e-4)
         if light.sun is not None:
             colours = torch.where((light.directions @ light.sun > math.cos(math.radians(1)))[:, None], 1.0, colours)
-        return cls(light.directions, colours / (colours @ LUMA)[:, None] / len(colours))
+        return cls(light.directions, colours / (colours @ colours.new_tensor(LUMINANCE))[:, None] / len(colours))
 
     def on(self, normals: torch.Tensor) -> torch.Tensor:
         """Irradiance `[..., 3]` of surfaces by their normals `[..., 3]` in the world, against that of level ground."""

@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 
 from recon.mirror import FEWEST, SOLID
 from recon.outline import outline
+from recon.seeds.points import alike
 from scenes.gaussians import Gaussians
-from scenes.harmonics import rgb_from_sh, sh_from_rgb
+from scenes.harmonics import rgb_from_sh
 
 END = 1.0
 """Metres from the front or rear within which a splat is of that end."""
@@ -61,7 +62,7 @@ def flanks(known: Gaussians, size: np.ndarray, label: str) -> Gaussians:
         away = cKDTree(outer[:, [0, 2]]).query(left[:, [0, 2]])[0] if len(outer) else np.full(len(left), np.inf)
         lacking = away > THERE
         if len(left) and lacking.mean() > OPEN:
-            made.append(_panels(left[lacking] * [1, side, 1], colour[lacking], known.sh.shape[1]))
+            made.append(alike(left[lacking] * [1, side, 1], colour[lacking], (WIDE * ALONG, THICK, WIDE * UP), LOGIT, known.sh.shape[1]))
     return Gaussians.cat(made) if made else Gaussians.empty(known.sh.shape[1])
 
 
@@ -77,12 +78,3 @@ def _middle_colour(means: np.ndarray, colours: np.ndarray, z: float, at_end: np.
     _, column = np.unique(np.round(means[near, 1] / COLUMN), return_inverse=True)
     total = np.stack([np.bincount(column, colours[near, k]) for k in range(3)], 1)
     return np.median(total / np.bincount(column)[:, None], axis=0)
-
-
-def _panels(places: np.ndarray, rgb: np.ndarray, sh_count: int) -> Gaussians:
-    """Upright splats `[M]` along x at places `[M, 3]`, of one colour from all sides."""
-    n = len(places)
-    sh = torch.zeros(n, sh_count, 3)
-    sh[:, 0] = sh_from_rgb(torch.from_numpy(rgb).float())
-    scales = torch.tensor([WIDE * ALONG, THICK, WIDE * UP]).log().repeat(n, 1)
-    return Gaussians(torch.from_numpy(places).float(), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1), scales, torch.full((n,), LOGIT), sh)

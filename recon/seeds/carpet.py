@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.seeds.points import Cloud
+from recon.seeds.points import Cloud, alike
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
-from scenes.harmonics import sh_from_rgb
 from scenes.trajectory import Trajectory
 
 SPACING, WIDER = 0.3, 1.05
@@ -53,17 +52,8 @@ def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: i
         return Gaussians.empty(sh_count)
     _, nearest = cKDTree(cloud.xyz[lying, :2]).query(xy, range(1, min(ALIKE, int(lying.sum())) + 1), workers=2)
     rgb = np.median(cloud.rgb[lying][nearest], axis=1)
-    n = len(xy)
     means = np.column_stack([xy, ground.height(torch.from_numpy(xy)).numpy()])
-    sh = torch.zeros(n, sh_count, 3)
-    sh[:, 0] = sh_from_rgb(torch.from_numpy(rgb).float())
-    return Gaussians(
-        torch.from_numpy(means).float(),
-        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        torch.tensor([WIDE * spacing, WIDE * spacing, 0.1 * spacing]).log().repeat(n, 1),
-        torch.full((n,), LOGIT),
-        sh,
-    )
+    return alike(means, rgb, (WIDE * spacing, WIDE * spacing, 0.1 * spacing), LOGIT, sh_count)
 
 
 def _bare(path: np.ndarray, known: cKDTree, spacing: float) -> np.ndarray:

@@ -171,6 +171,21 @@ def fewer(splats: Gaussians, count: float) -> Gaussians:
     return replace(some, log_scales=some.log_scales + math.log(len(splats) / max(len(some), 1)) / 2)
 
 
+def alike(means: np.ndarray, rgb: np.ndarray | float, scales: Sequence[float], logit: float, sh_count: int) -> Gaussians:
+    """Splats at `means` `[N, 3]`, of colours rgb (`[N, 3]`, or one for all) from all sides, whose axes are the frame's: all of the same
+    standard deviations `scales` (3 of them, in metres) and opacity logit."""
+    n = len(means)
+    sh = torch.zeros(n, sh_count, 3)
+    sh[:, 0] = sh_from_rgb(rgb if isinstance(rgb, float) else torch.from_numpy(rgb).float())
+    return Gaussians(
+        torch.from_numpy(means).float(),
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        torch.tensor(scales).log().repeat(n, 1),
+        torch.full((n,), logit),
+        sh,
+    )
+
+
 def splats_from(cloud: Cloud, sides: np.ndarray, sh_count: int, largest: np.ndarray | float) -> Gaussians:
     """A flat splat a point: as wide as its neighbours are far, thin across the surface that the neighbours span.
 

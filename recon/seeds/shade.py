@@ -4,12 +4,11 @@ show."""
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from recon.log import Track
+from recon.seeds.points import alike
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
-from scenes.harmonics import sh_from_rgb
 from scenes.shade import BLACK
 
 SPACING, WIDE = 0.4, 0.6
@@ -34,13 +33,5 @@ def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
     half = track.size[:2] / 2 + BESIDE
     x, y = (np.linspace(-h, h, max(2, round(2 * h / SPACING) + 1)) for h in half)
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    n = len(xy)
-    sh = torch.zeros(n, sh_count, 3)
-    sh[:, 0] = sh_from_rgb(BLACK)
-    return Gaussians(
-        torch.from_numpy(np.column_stack([xy, np.full(n, height)])).float(),
-        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
-        torch.tensor([WIDE * SPACING, WIDE * SPACING, THICK]).log().repeat(n, 1),
-        torch.full((n,), LOGIT),
-        sh,
-    )
+    means = np.column_stack([xy, np.full(len(xy), height)])
+    return alike(means, BLACK, (WIDE * SPACING, WIDE * SPACING, THICK), LOGIT, sh_count)
