@@ -16,7 +16,7 @@ def astray(edit: Edit, scene: Scene) -> list[str]:
     """A sentence for each actor that an edit shifts beyond the scene's ground, further than it was."""
     said = []
     for actor in (a for a in scene.actors if a.track in edit.shift):
-        was, now = _beyond(scene, actor.trajectory), _beyond(scene, edit.apply(actor, scene).trajectory)
+        was, now = _beyond(scene, actor.trajectory), _beyond(scene, edit.path(actor, scene))
         if now > was:
             said.append(f"{actor.track} is shifted {now:.3g} m beyond the known ground and keeps the height of its edge there")
     return said

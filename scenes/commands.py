@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 
 @dataclass
 class Info:
-    """Say what a scene, databank, asset or splat file holds."""
+    """Describe a scene, databank, asset or splat file."""
 
     path: AnyPath
     """Folder or file."""
@@ -48,7 +48,7 @@ class Validate:
     path: AnyPath
     """Folder or file."""
     drop_invalid: Flag = False
-    """Count splats with values that are not finite, and check what is left without them."""
+    """Count splats with values that are not finite, and check the rest."""
 
     def run(self) -> None:
         from scenes.files import Dropping, as_is
@@ -74,8 +74,8 @@ class Convert:
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
     """File to write; its suffix says the format: .ply, .compressed.ply, .usdc, .usda, .glb, .spz, .splat or .sog."""
     up: Axis = None
-    """Which axis of the source points up: x, -x, y, ...; -y of most that were trained from photos. It is turned to z, in .glb and .spz to
-    y; where left out it is y in .glb and .spz, what a USD file says, else taken to be z."""
+    """Up axis of the source: x, -x, y, ...; by default y for .glb and .spz, what a USD file says, else z. Splats trained from photos mostly
+    have -y. The target has z up; .glb and .spz have y up."""
     drop_invalid: Flag = False
     """Leave out splats with values that are not finite, and count them, instead of refusing the file."""
     overwrite: Overwrite = False
@@ -123,24 +123,24 @@ class Edit:
     scene: ScenePath
     """Scene folder."""
     remove: UseAppendAction[tuple[Track, ...]] = ()
-    """An actor or a parked vehicle to remove, as veh_12."""
+    """Remove an actor or a parked vehicle, as veh_12."""
     shift: UseAppendAction[tuple[Shift, ...]] = ()
-    """An actor and the metres forward and left, along its own body, that it moves by, as veh_3=0m,1.5m."""
+    """Move an actor by metres forward and left, in its own frame, as veh_3=0m,1.5m."""
     replace: UseAppendAction[tuple[Replacement, ...]] = ()
-    """An actor and the asset that takes its place and path, with its wheels on the ground, as veh_4=car/0003."""
+    """Replace an actor by an asset, on the same path with its wheels on the ground, as veh_4=car/0003."""
     retime: UseAppendAction[tuple[Retiming, ...]] = ()
-    """An actor and how much later it does everything, as veh_5=+0.5s."""
+    """Delay an actor, or with a minus sign advance it, as veh_5=+0.5s."""
     undo: UseAppendAction[tuple[Track, ...]] = ()
-    """An edit to take back, with all its files; those of sidestep insert too."""
+    """Undo an edit by its name, and delete its files; also one that sidestep insert made."""
     name: Name = None
-    """Name of the edit's layer."""
+    """Name of the new edit."""
     databank: Path = Path("databank")
-    """Folder of the databank."""
+    """Folder of the databank: for --replace, and for inserted actors that --shift or --retime brings to other light, or nearer."""
 
     def run(self) -> None:
         asked = bool(self.remove or self.shift or self.replace or self.retime)
         if not asked and not self.undo:
-            raise UsageError("say what to change: --remove, --shift, --replace, --retime, or --undo an edit, as --remove veh_12")
+            raise UsageError("nothing to do: give --remove, --shift, --replace or --retime, as --remove veh_12, or --undo an edit")
         from scenes.alone import alone
         from scenes.usd.edit import undone
 
@@ -165,12 +165,15 @@ class Edit:
         bank = Databank(self.databank)
         assets = {track: bank.load(asset) for track, asset in wanted.items()}
         edit = edits.Edit(self.remove, _once(self.shift, "--shift"), assets, _once(self.retime, "--retime"))
+        own = {a.track: bank.original(a.asset) for a in scene.actors if edit.places(a) and a.track not in assets}
+        edit = replace(edit, originals={track: asset for track, asset in own.items() if asset is not None})
         told = {"remove": self.remove, "shift_m": edit.shift, "replace": wanted, "retime_us": edit.retime}
         name = self.name or free_name(self.scene, "edit")
         edits.check_edit(edit, scene)
         others = [line for track, asset in assets.items() for line in other_model(wanted[track], asset, scene)]
-        lit = {actor.track: edit.apply(actor, scene).asset for actor in scene.actors if actor.track in wanted}
-        others += [line for track, asset in lit.items() for line in light_held(wanted[track], asset, scene)]
+        lit = {actor.track: edit.apply(actor, scene).asset for actor in scene.actors if edit.places(actor)}
+        others += [line for track, asset in lit.items() for line in light_held(wanted.get(track, track), asset, scene)]
+        others += edits.coarse(edit, scene, str(self.databank))
         warnings = [*others, *astray(edit, scene), *meeting(edit, scene), *edits.absences(edit, scene)]
         # last, since finding out what to warn of takes seconds: who stops meanwhile has changed nothing
         add_change(self.scene, name, scene, edit, {"kind": "edit", **{key: value for key, value in told.items() if value}})
@@ -182,7 +185,7 @@ class Edit:
 def _without(scene: Path, edit: Undone) -> str:
     """What `edit --undo` says of an edit that it took out of a scene."""
     also = f", and without {', '.join(edit.idle)}, which changed only what {edit.name} had brought" if edit.idle else ""
-    still = [f"{by} still moves {', '.join(tracks)} from where {edit.name} had put it" for by, tracks in edit.held.items()]
+    still = [f"{by} still goes on from where {edit.name} had put {', '.join(tracks)}, and as what" for by, tracks in edit.held.items()]
     but = f"; but {', and '.join(still)}: undo that too, and give it anew" if still else ""
     return f"{scene} is again as it was without {edit.name}{also}{but}"
 

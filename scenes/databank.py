@@ -67,7 +67,7 @@ class Databank:
                 raise ValueError(f"format {data['format']!r} version {data['version']}, not {FORMAT!r} version {VERSION}")
             entries = [_entry(record) for record in data["entries"]]
         except (ValueError, KeyError, TypeError) as error:
-            fix = "delete it, and the next asset that is added makes it anew of what all say of themselves"
+            fix = "delete it, and the next asset that is added rebuilds it from the assets' own entries"
             raise ValueError(f"{index} is corrupt: {type(error).__name__} {error}; {fix}") from error
         return sorted(entries, key=lambda e: e.id)
 
@@ -159,6 +159,14 @@ class Databank:
             partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
 
+    def original(self, asset: Asset) -> Asset | None:
+        """The asset that one in a scene was made from, by its id, label and size; None where this databank has none, or is none."""
+        if not (self.path / "index.json").is_file():
+            return None
+        same = (e.id for e in self.entries() if (e.id, e.label) == (asset.meta.get("id"), asset.label))
+        found = next((self.load(id) for id in same), None)
+        return found if found is not None and torch.allclose(found.size, asset.size, atol=1e-3) else None
+
     def same(self, asset: Asset) -> str | None:
         """The id of an asset of the same label, source and splats, None where there is none: that which was cut out of a scene before."""
         told = asset.label, str(asset.meta.get("source", "")), len(asset.gaussians)
@@ -167,17 +175,17 @@ class Databank:
 
     def ready(self) -> list[Entry]:
         """The entries that a further one will stand beside: those that assets hold themselves, of a databank whose index was lost; none
-        where there is no databank. To be asked before work whose result is to be added.
+        where there is no databank. Call it before work whose result is to be added.
 
         ValueError where a file has its name, where the index is corrupt, or is lost and an asset's own entry is corrupt; PermissionError
-        where it takes no files.
+        where it is not writable.
         """
         if (file := next((f for f in (self.path, *self.path.parents) if f.is_file()), None)) is not None:
             fix = "give another name with --databank"
             raise ValueError(f"{file} is a file; a databank is a folder, and made where there is none: {fix}")
         there = next(folder for folder in (self.path, *self.path.absolute().parents) if folder.is_dir())
         if not os.access(there, os.W_OK | os.X_OK):
-            raise PermissionError(f"{there} takes no files of yours; give another databank with --databank")
+            raise PermissionError(f"{there} is not writable; give another databank with --databank")
         if (self.path / "index.json").exists():
             return self.entries()
         return [read_entry(file) for file in sorted(self.path.glob("assets/*/*/asset.json"))]

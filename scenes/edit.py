@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from scenes.asset import Actor, Asset
+from scenes.detail import finest_pixel
 from scenes.gaussians import Gaussians
 from scenes.match import at_place
 from scenes.metres import require_metres
@@ -29,6 +30,8 @@ GHOST_MARGIN = 0.1
 PARKED_FLOOR, PARKED_MARGIN = 0.08, 0.25
 """The same of parked vehicles, which are splats of the background: they stand on the street, and lidar boxes cut them close."""
 
+NEARER = 0.8
+"""Part of a pixel's former width at which it is told that an actor has come too near for the detail that is left of it."""
 
 BELOW = 0.6
 """Metres below the base of a parked vehicle's box down to which splats are the street that it stands on."""
@@ -43,31 +46,51 @@ BESIDE = 16
 @dataclass(frozen=True)
 class Edit:
     """Changes of actors by track name: tracks to remove; metres forward and left along the actor's own body; another asset on
-    the same path; microseconds by which everything happens later."""
+    the same path; microseconds by which everything happens later. originals: of actors that were put in from a databank, and are shifted or
+    retimed, the assets as it holds them, of which a scene keeps no more detail than could be seen where it put them."""
 
     remove: tuple[str, ...] = ()
     shift: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     replace: Mapping[str, Asset] = field(default_factory=dict)
     retime: Mapping[str, int] = field(default_factory=dict)
+    originals: Mapping[str, Asset] = field(default_factory=dict)
 
     def tracks(self) -> list[str]:
-        """Every track that it names, once."""
+        """Every track that it changes, once."""
         return list(dict.fromkeys([*self.remove, *self.shift, *self.replace, *self.retime]))
 
-    def apply(self, actor: Actor, scene: Scene) -> Actor:
-        """The actor as it is changed, with `edited` in its asset's meta and its wheels on the scene's ground as they were; another asset
-        with its wheels right on it, and as it looks where it is at the drive's first moment, or nearest to that."""
-        asset, path, deformation = self.replace.get(actor.track, actor.asset), actor.trajectory, actor.deformation
+    def places(self, actor: Actor) -> bool:
+        """Whether it puts an asset in a new place, where it gets that place's light and detail: one that replaces the actor, or, where the
+        actor was put in itself, its own."""
+        return actor.track in self.replace or not actor.recorded and actor.track in {*self.shift, *self.retime}
+
+    def path(self, actor: Actor, scene: Scene) -> Trajectory:
+        """The actor's path as it is changed, with its wheels on the scene's ground as they were, another asset's right on it."""
+        path = actor.trajectory
         if actor.track in self.shift:
             path = moved(path, self.shift[actor.track], actor.asset.size, scene)
         if actor.track in self.retime:
             path = replace(path, times_us=path.times_us + self.retime[actor.track])
-            deformation = deformation and deformation.later(self.retime[actor.track])
+        return stood(path, self.replace[actor.track].size, scene) if actor.track in self.replace else path
+
+    def apply(self, actor: Actor, scene: Scene) -> Actor:
+        """The actor as it is changed, with `edited` in its asset's meta; an asset that it `places` as it looks where it is at the drive's
+        first moment, or nearest to that."""
+        path, deformation = self.path(actor, scene), actor.deformation
         if actor.track in self.replace:
-            deformation = None  # another body bends elsewhere
-            path = stood(path, asset.size, scene)
+            asset, deformation = self.replace[actor.track], None  # another body bends elsewhere
+        else:
+            asset, deformation = self._own(actor), deformation and deformation.later(self.retime.get(actor.track, 0))
+        if self.places(actor):
             asset = at_place(asset, scene, path, int(scene.ego.times_us[0]))
         return replace(actor, asset=replace(asset, meta={**asset.meta, "edited": True}), trajectory=path, deformation=deformation)
+
+    def _own(self, actor: Actor) -> Asset:
+        """An actor's asset, with all the detail that is known of it."""
+        original = self.originals.get(actor.track)
+        if original is None:
+            return actor.asset
+        return replace(original, meta={**original.meta, **{k: v for k, v in actor.asset.meta.items() if k in ("inserted", "edit")}})
 
 
 def named(entry: Mapping) -> list[str]:
@@ -92,11 +115,23 @@ def check_edit(edit: Edit, scene: Scene) -> None:
         if track not in have and track not in edit.remove:
             raise ValueError(f"{track} is parked, and part of the background: it can be removed, and another asset inserted in its place")
         if track in edit.remove and (track in edit.shift or track in edit.replace or track in edit.retime):
-            raise ValueError(f"{track} is removed and changed at once; say one of the two")
+            raise ValueError(f"{track} cannot be both removed and changed by one edit; give one of the two")
         if edit.shift.get(track) == (0, 0) or edit.retime.get(track) == 0:
-            raise ValueError(f"{track} is shifted or retimed by nought, which changes nothing; say by how much, as 0m,1.5m or +0.5s")
+            raise ValueError(f"{track} is shifted or retimed by zero, which changes nothing; say by how much, as 0m,1.5m or +0.5s")
         if track in edit.retime and len(have[track].trajectory) == 1:
             raise ValueError(f"{track} stands still for all times, so it cannot be retimed; shift or remove it")
+
+
+def coarse(edit: Edit, scene: Scene, databank: str) -> list[str]:
+    """What to tell of actors that were put in from a databank, and that an edit brings nearer than they were without their `originals`:
+    a sentence each."""
+    said = []
+    for actor in (a for a in scene.actors if edit.places(a) and a.track not in {*edit.replace, *edit.originals}):
+        if finest_pixel(scene, edit.path(actor, scene)) < NEARER * finest_pixel(scene, actor.trajectory):
+            what = f"the asset {actor.asset.meta['id']}" if "id" in actor.asset.meta else "what it is a copy of"
+            lacks = f"{actor.track} comes nearer, but {databank} does not hold {what}, so it shows no more detail than from where it was"
+            said.append(f"{lacks}; name the databank that does with --databank")
+    return said
 
 
 def absences(edit: Edit, scene: Scene) -> list[str]:
@@ -104,7 +139,7 @@ def absences(edit: Edit, scene: Scene) -> list[str]:
     first, last = (int(t) for t in scene.ego.times_us[[0, -1]])
     said = []
     for actor in (a for a in scene.actors if a.track in edit.retime):
-        was, now = actor.trajectory.span_us(), edit.apply(actor, scene).trajectory.span_us()
+        was, now = actor.trajectory.span_us(), edit.path(actor, scene).span_us()
         if now[0] > max(first, was[0]) or now[1] < min(last, was[1]):
             begin, end = ((t - first) / 1e6 for t in now)
             said.append(

@@ -32,11 +32,6 @@ def author_weights(prim: Usd.Prim, deformation: Deformation, origin: int) -> Non
         weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(row)), time)
 
 
-def block_deformation(prim: Usd.Prim) -> None:
-    """Let a prim have no deformation, whatever weaker layers say."""
-    prim.CreateAttribute(WEIGHTS, Sdf.ValueTypeNames.FloatArray, True).Block()
-
-
 def read_deformation(prim: Usd.Prim, origin: int) -> Deformation | None:
     """The deformation of a prim, None where it has none. ValueError for one whose numbers do not fit together or are not finite."""
     weights = prim.GetAttribute(WEIGHTS)

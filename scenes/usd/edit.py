@@ -23,7 +23,7 @@ from scenes.deformation import Deformation
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.names import unknown
 from scenes.scene import Scene
-from scenes.usd.deformation import author_weights, block_deformation
+from scenes.usd.deformation import author_weights
 from scenes.usd.layers import new_stage, open_stage, own_data, set_own_data, valid_names
 from scenes.usd.root import RECORDED, add_sublayer, drop_sublayer
 from scenes.usd.scene import author_actor, author_path, defines, load_recorded, read_edits, read_metadata
@@ -41,7 +41,7 @@ ASIDE = ".undone."
 """How a folder's name begins in which the files of edits lie that are being undone."""
 
 
-def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, half: bool = False) -> None:
+def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict) -> None:
     """Add actors to a scene folder as the layer edits/<name>.usda; `meta` says what the edit is, as {"kind": "insert", ...}.
 
     Loading the scene then includes the actors, with `inserted` in their asset's meta, and lists the edit in its own. Deleting
@@ -49,10 +49,10 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict, 
     scene stays as it was.
     """
     with alone(scene):
-        _add(Path(scene), name, actors, meta, half)
+        _add(Path(scene), name, actors, meta)
 
 
-def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict, half: bool) -> None:
+def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict) -> None:
     origin = int(read_metadata(scene)["origin_us"])
     _sweep(scene)
     standing, taken = _prims(scene)
@@ -64,7 +64,7 @@ def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict, half: bool
 
     def files(folder: Path) -> None:
         for actor in actors:
-            save_asset(folder / f"{names[actor.track]}.usdc", actor.asset, half)
+            save_asset(folder / f"{names[actor.track]}.usdc", actor.asset)
 
     def author(layer: Usd.Stage) -> None:
         for actor in actors:
@@ -75,20 +75,20 @@ def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict, half: bool
     _write(scene, name, meta, files, author)
 
 
-def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool = False) -> None:
+def add_change(path: str | Path, name: str, scene: Scene, edit: Edit, meta: dict) -> None:
     """Keep an edit of the actors of `scene`, as loaded from the folder `path`, as the layer edits/<name>.usda.
 
     A removed actor becomes inactive, and the splats of a removed parked vehicle transparent, the street below it
-    as beside it; another one's path and asset are outweighed;
+    as beside it; another one's path is outweighed, and its asset where the edit `places` one;
     `edited` in their asset's meta names the edit, and `remove` in its own meta who is gone.
     An edit stands on what it found: of two that change the same actor, the later one counts.
     Raises as `add_edit` and `check_edit`.
     """
     with alone(path):
-        _change(Path(path), name, scene, edit, meta, half)
+        _change(Path(path), name, scene, edit, meta)
 
 
-def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: bool) -> None:
+def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict) -> None:
     check_edit(edit, scene)
     origin, (prims, _) = int(read_metadata(path)["origin_us"]), _prims(path)
     changed = [edit.apply(a, scene) for a in scene.actors if a.track in edit.tracks() and a.track not in edit.remove]
@@ -98,8 +98,8 @@ def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: b
     painted, colours = bared(recorded, edit.remove)
 
     def files(folder: Path) -> None:
-        for actor in (a for a in changed if a.track in edit.replace):
-            save_asset(folder / f"{Path(prims[actor.track]).name}.usdc", actor.asset, half)
+        for actor in filter(edit.places, changed):
+            save_asset(folder / f"{Path(prims[actor.track]).name}.usdc", actor.asset)
         if hidden or len(painted):
             _save_background(path, folder / "hidden.usda", hidden, painted.tolist(), colours.tolist())
 
@@ -111,8 +111,7 @@ def _change(path: Path, name: str, scene: Scene, edit: Edit, meta: dict, half: b
             prim = layer.OverridePrim(prims[actor.track])
             set_own_data(prim, edited=name)
             author_path(prim, actor.trajectory, origin)
-            if actor.track in edit.replace:
-                block_deformation(prim)
+            if edit.places(actor):
                 prim.GetReferences().SetReferences([Sdf.Reference(f"./{name}/{prim.GetName()}.usdc")])
             elif (deformation := _in_step(actor, recorded)) is not None:
                 author_weights(prim, deformation, origin)
@@ -137,7 +136,7 @@ class Undone:
     idle: tuple[str, ...]
     """Edits that changed only actors which it brought, and went with it."""
     held: dict[str, list[str]]
-    """Later edits that moved an actor from where this one had put it, and still do; and which actors."""
+    """Later edits that moved an actor from where this one had put it, and still do, as what it made of it; and which actors."""
 
 
 def undo(scene: str | Path, name: str) -> list[str]:

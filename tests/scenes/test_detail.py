@@ -9,7 +9,7 @@ from render import rasterize
 from render.compare import psnr
 from scenes import Camera, Gaussians, Pinhole, Placed
 from scenes.detail import coarser
-from scenes.edit import Edit, edited
+from scenes.edit import Edit, coarse, edited
 from scenes.insert import insert
 from scenes.placement import Placement
 
@@ -59,3 +59,34 @@ def test_an_asset_in_an_actors_place_has_as_many_splats_as_one_put_there():
     put = insert(scene, asset, Placement("car/0001", 120.0, -3.5))
     other = edited(put.scene, Edit(replace={put.actor.track: asset})).actors[-1]
     assert len(other.asset.gaussians) == len(put.actor.asset.gaussians) < 0.5 * len(asset.gaussians)
+
+
+def far_and_fine():
+    """A scene with a car put 120 m ahead, that car's asset, and the same car put 8 m ahead."""
+    asset, scene = replace(car(), gaussians=fine_car(), meta={"id": "car/0001"}), street()
+    far, near = (insert(scene, asset, Placement("car/0001", x, -3.5)) for x in (120.0, 8.0))
+    return far.scene, asset, near.actor
+
+
+def test_an_inserted_asset_that_is_shifted_nearer_has_the_detail_of_one_put_there():
+    scene, asset, near = far_and_fine()
+    shift = {scene.actors[-1].track: (-112.0, 0.0)}
+    after = edited(scene, Edit(shift=shift, originals={scene.actors[-1].track: asset})).actors[-1]
+    assert torch.equal(after.asset.gaussians.means, near.asset.gaussians.means)
+    assert after.asset.meta["inserted"] and after.asset.meta["edited"] and not after.recorded
+    assert coarse(Edit(shift=shift, originals={scene.actors[-1].track: asset}), scene, "bank") == []
+
+
+def test_it_is_said_where_the_detail_of_what_comes_nearer_is_not_at_hand():
+    scene, _, near = far_and_fine()
+    track = scene.actors[-1].track
+    (said,) = coarse(Edit(shift={track: (-112.0, 0.0)}), scene, "bank")
+    assert said.startswith(f"{track} comes nearer, but bank does not hold the asset car/0001") and said.endswith("--databank")
+    assert coarse(Edit(shift={track: (10.0, 0.0)}), scene, "bank") == []
+    assert len(edited(scene, Edit(shift={track: (-112.0, 0.0)})).actors[-1].asset.gaussians) < len(near.asset.gaussians)
+
+
+def test_what_is_shifted_away_loses_the_detail_that_nobody_sees_from_there():
+    scene = insert(street(), replace(car(), gaussians=fine_car()), Placement("car/0001", 8.0, -3.5)).scene
+    after = edited(scene, Edit(shift={scene.actors[-1].track: (112.0, 0.0)})).actors[-1]
+    assert len(after.asset.gaussians) < 0.5 * len(scene.actors[-1].asset.gaussians)

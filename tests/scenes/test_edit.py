@@ -21,6 +21,7 @@ from scenes.insert import insert
 from scenes.placement import Placement
 from scenes.poses import translation
 from scenes.seen import SECTORS
+from scenes.standing import standing_pose
 from scenes.usd.edit import add_change, add_edit, undo, undone
 from scenes.usd.layers import new_stage, usd_problems
 from scenes.usd.root import RECORDED, add_sublayer
@@ -209,6 +210,35 @@ def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(s
     same(load(saved), busy())
 
 
+@pytest.mark.parametrize("brought", ["inserted", "replacing", "retimed"])
+def test_an_inserted_or_replacing_asset_takes_on_the_light_of_where_it_is_shifted_or_retimed_to(tmp_path, brought):
+    """The street is half as bright from x = 40 on."""
+    scene = busy()
+    g = scene.background.gaussians
+    dark = replace(g, sh=torch.where((g.means[:, :1] > 40)[..., None], sh_from_rgb(rgb_from_sh(g.sh) * 0.7), g.sh))
+    scene = replace(scene, background=replace(scene.background, gaussians=dark))
+    save(scene, tmp_path / "s1")
+    lit = replace(VAN, meta={"id": "van/0001", "ground_linear": [0.15, 0.15, 0.15]})
+    if brought == "replacing":
+        add_change(tmp_path / "s1", "put", load(tmp_path / "s1"), Edit(replace={"veh_3": lit}), {})
+        edit = Edit(shift={"veh_3": (35.0, 0.0)}, originals={"veh_3": lit})
+    else:
+        new = insert(load(tmp_path / "s1"), lit, Placement("van/0001", 15.0, 5.0, speed=100.0 * (brought == "retimed"))).actor
+        add_edit(tmp_path / "s1", "put", [new], {})
+        edit = Edit(shift={new.track: (35.0, 0.0)}) if brought == "inserted" else Edit(retime={new.track: -400_000})
+    put = load(tmp_path / "s1")
+    (was,) = [a for a in put.actors if not a.recorded]
+    there = insert(put, lit, Placement("van/0001", 50.0, 5.0)).actor.asset if brought != "retimed" else None
+    add_change(tmp_path / "s1", "later", put, edit, {})
+    for after in (load(tmp_path / "s1"), edited(put, edit)):
+        (asset,) = [a.asset for a in after.actors if not a.recorded]
+        assert rgb_from_sh(asset.gaussians.sh[:, 0]).mean() < 0.85 * rgb_from_sh(was.asset.gaussians.sh[:, 0]).mean()
+        assert there is None or torch.allclose(asset.gaussians.sh, there.gaussians.sh, atol=0.02)
+    undo(tmp_path / "s1", "later")
+    same(load(tmp_path / "s1"), put)
+    assert torch.equal(next(a for a in load(tmp_path / "s1").actors if not a.recorded).asset.gaussians.sh, was.asset.gaussians.sh)
+
+
 def test_undoing_says_which_later_edits_go_on_from_where_it_put_an_actor(saved):
     add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0), "veh_3": (1.0, 0.0)}), {})
     add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
@@ -257,7 +287,7 @@ def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_nex
 def test_undoing_in_a_folder_that_takes_no_files_says_so_and_leaves_all(saved, monkeypatch):
     put_in(saved)
     for folder in (saved, saved / "edits"):
-        with monkeypatch.context() as context, pytest.raises(PermissionError, match=f"{folder} takes no files of yours"):
+        with monkeypatch.context() as context, pytest.raises(PermissionError, match=f"{folder} is not writable"):
             context.setattr(os, "access", lambda path, mode, folder=folder: Path(path) != folder)  # root may write anywhere
             undo(saved, "new")
     assert load(saved).actors[-1].track == "new"
@@ -420,6 +450,17 @@ def test_a_shifted_actor_tilts_as_much_more_as_the_ground_does():
     assert after[:, 2, 1].tolist() == pytest.approx([-math.sin(2 * math.atan(0.04))] * 9, abs=1e-6)
 
 
+def test_an_actor_that_leans_with_a_slope_climbs_it_once():
+    slope = Ground((0.1 * torch.arange(-20.0, 20.0))[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
+    scene = replace(busy(), ground=slope)
+    actor = scene.actors[1]
+    poses = torch.stack([standing_pose(scene, pose[:2, 3], 0.0, actor.asset.size) for pose in actor.trajectory.world_from_body])
+    leaning = replace(actor, trajectory=replace(actor.trajectory, world_from_body=poses))
+    scene = replace(scene, actors=(scene.actors[0], leaning))
+    after = edited(scene, Edit(shift={"veh_2": (0.0, 4.0)})).actors[1].trajectory.world_from_body
+    torch.testing.assert_close(after[:, 2, 3], slope.height(after[:, :2, 3]), atol=1e-6, rtol=0)
+
+
 def test_an_actor_on_a_bridge_is_shifted_along_the_bridge():
     slope = Ground((0.1 * torch.arange(-20.0, 20.0) - 6)[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
     after = edited(replace(busy(), ground=slope), Edit(shift={"veh_2": (0.0, 2.0)})).actors[1].trajectory
@@ -443,10 +484,10 @@ def test_a_scene_whose_root_held_the_recording_can_be_edited(saved):
         (Edit(remove=("veh_9",)), 'actor "veh_9" is not in .* it has veh_1, veh_2, veh_3. Did you mean'),
         (Edit(remove=("veh_1,veh_2",)), 'actor "veh_1,veh_2" is not in .*; if .* repeat the option: --remove veh_1 --remove veh_2$'),
         (Edit(retime={"veh_1, veh_2": 9}), "repeat the option: --retime veh_1=... --retime veh_2=...$"),
-        (Edit(remove=("veh_1",), shift={"veh_1": (1, 0)}), "removed and changed at once"),
+        (Edit(remove=("veh_1",), shift={"veh_1": (1, 0)}), "both removed and changed"),
         (Edit(retime={"veh_3": 1000}), "veh_3 stands still"),
-        (Edit(shift={"veh_1": (0.0, 0.0)}), "by nought, which changes nothing"),
-        (Edit(retime={"veh_1": 0}), "by nought, which changes nothing"),
+        (Edit(shift={"veh_1": (0.0, 0.0)}), "by zero, which changes nothing"),
+        (Edit(retime={"veh_1": 0}), "by zero, which changes nothing"),
     ],
 )
 def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
@@ -458,7 +499,7 @@ def test_an_edit_that_makes_no_sense_changes_nothing(saved, edit, said):
 
 def test_nothing_is_shifted_by_metres_in_a_scene_that_has_none():
     scene = replace(busy(), meta={**busy().meta, "metric": False})
-    with pytest.raises(ValueError, match="the shift of veh_2 is in metres, but street has none"):
+    with pytest.raises(ValueError, match="the shift of veh_2 is in metres, but street has no metric scale"):
         edited(scene, Edit(shift={"veh_2": (1.0, 0.0)}))
     edited(scene, Edit(remove=("veh_2",)))
 
