@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 import torch
@@ -19,10 +21,19 @@ SMALLEST = 16
 
 
 class Photos:
-    """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept in memory as bytes."""
+    """Real frames beside the pairs: folders of images, and videos of which every `stride`-th frame is kept, as bytes in a temporary file
+    (where `TMPDIR` says): of a long video they are more than memory holds. frames: uint8 `[H, W, 3]` each, read as they are looked at."""
 
     def __init__(self, paths: tuple[str | Path, ...], stride: int = 8, width: int = 960):
-        self.frames: list[np.ndarray] = [photo for path in paths for photo in photos_of(Path(path), stride, width)]
+        shapes = []
+        with TemporaryFile() as file:
+            for photo in (photo for path in paths for photo in photos_of(Path(path), stride, width)):
+                shapes.append(photo.shape)
+                file.write(photo.tobytes())
+            file.flush()
+            kept = np.asarray(np.memmap(file, np.uint8, "c"))  # which outlives the file's name
+        ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
+        self.frames: list[np.ndarray] = [part.reshape(shape) for part, shape in zip(np.split(kept, ends), shapes, strict=True)]
 
     def crop(self, rng: np.random.Generator, size: int) -> torch.Tensor:
         """A crop `[3, size, size]` of one photo, as it is or shrunk."""

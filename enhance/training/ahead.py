@@ -45,7 +45,7 @@ def _loaded(draw: Callable[[int], Any], begin: int, device: torch.device, proces
         num_workers=processes,
         prefetch_factor=DEEP,
         pin_memory=device.type == "cuda",
-        multiprocessing_context="fork",  # what is drawn from, photos in memory too, need not be copied
+        multiprocessing_context="fork",  # what is drawn from need not be copied
         generator=torch.Generator(),  # its own, so that the loader draws nothing from the training's
     )
     yield from loader  # whose processes begin with the first batch that is asked for, and end with this generator

@@ -1,8 +1,11 @@
 """What training draws."""
 
+import mmap
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from enhance.pairs.shards import PairSet, to_bytes, write_shard
 from enhance.photos import Photos
@@ -68,6 +71,19 @@ def test_right_pictures_come_from_pairs_and_photos(pairs, photos):
     assert Sampler(None, Photos((photos,)), seed=1).right(0, 3, 32).rgb.shape == (3, 3, 32, 32)
     assert Sampler(pairs, Photos((photos,)), seed=1).images(0, 6, 32).rgb.shape == (6, 3, 32, 32)
     assert not Sampler(None, Photos((photos,)), seed=1).rendered
+
+
+def test_photos_to_train_on_stay_on_the_disk_as_they_are(tmp_path):
+    rng = np.random.default_rng(0)
+    made = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((20, 30), (40, 24), (17, 16))]
+    for i, photo in enumerate(made):
+        Image.fromarray(photo).save(tmp_path / f"{i}.png")
+    frames = Photos((tmp_path,)).frames
+    assert all(np.array_equal(frame, photo) for frame, photo in zip(frames, made, strict=True))
+    base = frames[0]
+    while isinstance(base.base, np.ndarray):
+        base = base.base
+    assert isinstance(base.base, mmap.mmap) and sum(map(np.size, frames)) == base.size
 
 
 def test_flipping_turns_the_flow_too():
