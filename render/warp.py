@@ -39,12 +39,12 @@ def _steps(height: int, width: int, device: torch.device) -> torch.Tensor:
     return torch.tensor([2 / width, 2 / height], dtype=torch.float32, device=device)
 
 
-def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor, tolerance: float = 1.0) -> torch.Tensor:
-    """Where this frame's pixel was seen in the previous one, bool `[B, 1, H, W]`: going there and back returns within `tolerance` pixels.
+def visible(flow_prev: torch.Tensor, previous_flow_next: torch.Tensor) -> torch.Tensor:
+    """Where this frame's pixel was seen in the previous one, bool `[B, 1, H, W]`: going there and back returns within a pixel.
 
     flow_prev           this frame's flow to the previous one, `[B, 2, H, W]`
     previous_flow_next  the previous frame's flow to this one, `[B, 2, H, W]`
     """
     back, inside = warp(torch.where(torch.isfinite(previous_flow_next), previous_flow_next, 1e6), flow_prev)
     error = (torch.where(torch.isfinite(flow_prev), flow_prev, 1e6) + back).square().sum(1, keepdim=True).sqrt()
-    return (inside > 0) & (error < tolerance)
+    return (inside > 0) & (error < 1.0)

@@ -36,6 +36,9 @@ from scenes.sky import Sky
 from scenes.spread import spread
 from scenes.usd.scene import load_recorded
 
+ROWS, WIDTH = 8, 320
+"""Clips on a contact sheet, and the pixels across each of its pictures."""
+
 FITS = ("early", "refits")
 """Folders of the reconstructions that pairs are made from, beside the pairs."""
 ANYWHERE = ("underfit", "isp", "isp_frame", "clean")
@@ -296,16 +299,16 @@ def _starts(frames: int, config: PairConfig) -> Iterator[int]:
     return iter(range(0, max(frames - config.frames, 0) + 1, config.every))
 
 
-def contact_sheet(pairs: PairSet, kind: str, path: str | Path, rows: int = 8, width: int = 320) -> None:
-    """A picture of up to `rows` clips of a kind, spread over the set: damaged, right, region."""
+def contact_sheet(pairs: PairSet, kind: str, path: str | Path) -> None:
+    """A picture of up to `ROWS` clips of a kind, spread over the set: damaged, right, region."""
     from render.contact import write_contact_sheet
 
     shards = pairs.of(kind)
     lines = []
-    for shard in spread(shards, rows):
+    for shard in spread(shards, ROWS):
         w = shard.window(shard.frames // 2, 1)
         pictures = torch.stack([w.input[0], w.target[0], w.region[0].expand(3, -1, -1)])
-        small = F.interpolate(pictures, (round(shard.height * width / shard.width), width), mode="area")
+        small = F.interpolate(pictures, (round(shard.height * WIDTH / shard.width), WIDTH), mode="area")
         lines.append((shard.path.stem, [picture.permute(1, 2, 0) for picture in small]))
     if lines:
         write_contact_sheet(Path(path), (f"{kind}: given", "wanted", "changed"), lines)
