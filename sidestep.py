@@ -65,26 +65,26 @@ class Insert:
     asset: str
     """The asset, as car/0003."""
     at: Place = None
-    """Metres forward and left of the unshifted body at --start, as 20m,-3.5m."""
+    """Metres forward and left of the recording car at --start, as 20m,-3.5m."""
     yaw: Angle = 0.0
-    """Heading, to the left of the body's, as 5deg."""
+    """Heading relative to the recording car's, counter-clockwise, as 5deg."""
     speed: Speed = 0.0
     """Speed along its heading, as 8m/s."""
     path: Way = "straight"
-    """Straight on, or in a lane beside the recorded path, to which --yaw then is relative; yaw 180deg is oncoming traffic."""
+    """straight: along its heading; lane: parallel to the recorded path, to which --yaw is then relative (180deg for oncoming traffic)."""
     trajectory: FileOrNone = None
-    """CSV with the header time_s,x_m,y_m[,yaw_deg], in place of --at, --yaw, --speed and --path: seconds after --start, metres forward and
-    left."""
+    """CSV file with the header time_s,x_m,y_m[,yaw_deg], instead of --at, --yaw, --speed and --path: seconds from --start, metres forward
+    and left of the recording car at --start."""
     start: Time = 0
-    """When the place holds, after the drive's first moment."""
+    """Time from the start of the drive at which the asset is at --at."""
     databank: Path = Path("databank")
     """Folder of the databank."""
 
     def run(self) -> None:
         if (self.at is None) == (self.trajectory is None):
-            raise UsageError("say where the asset goes with --at X,Y, as --at 20m,-3.5m, or with --trajectory t.csv; one of the two")
+            raise UsageError("give the asset's place with --at X,Y, as --at 20m,-3.5m, or its path with --trajectory t.csv; one of the two")
         if self.trajectory is not None and (self.yaw or self.speed or self.path != "straight"):
-            raise UsageError("--trajectory says it all, also where the asset heads and how fast; leave --yaw, --speed and --path out")
+            raise UsageError("--trajectory also gives heading and speed; leave out --yaw, --speed and --path")
         from scenes import Databank
         from scenes.alone import alone
         from scenes.insert import insert
@@ -117,32 +117,32 @@ class Render:
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
     camera: OneOfRig = None
-    """Camera of the rig, as front_camera, the scene's first where left out; orbit circles the splats of a file."""
+    """Camera of the rig, as front_camera; the scene's first by default. For a splat file: orbit, which circles it."""
     up: Axis = None
-    """Of a file's splats, the axis that points up: x, -x, y, ...; where left out y in .glb and .spz, what a USD file says, else z; -y of
-    most that were trained from photos."""
+    """Up axis of a splat file: x, -x, y, ...; by default y for .glb and .spz, what a USD file says, else z. Splats trained from photos
+    mostly have -y."""
     lateral_shift: Length = 0.0
     """Metres to the left of the recorded path, as 2m; -2m is to the right."""
     insert: UseAppendAction[tuple[Insertion, ...]] = ()
-    """An asset to insert for this clip, as car/0003@12m,3.5m,yaw=5deg,speed=8m/s or car/0003@trajectory=t.csv; metres are forward and left
-    of the unshifted body at the clip's first frame."""
+    """An asset to insert for this clip, as car/0003@12m,3.5m,yaw=5deg,speed=8m/s or car/0003@trajectory=t.csv; metres forward and left
+    of the recording car at the clip's first frame."""
     enhance: Flag = False
     """Repair and harmonize the frames, with detail from the photos that the scene keeps."""
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     no_shadows: Flag = False
-    """Leave out the shadows of inserted assets."""
+    """Do not render the shadows of inserted assets."""
     start: Time = 0
-    """Where to begin, after the camera's first frame."""
+    """Start time, from the camera's first frame."""
     duration: TimeOrAll = None
-    """How long a clip."""
+    """Duration of the clip."""
     fps: Rate = None
-    """Frames a second, evenly spaced in place of the recorded times."""
+    """Frames per second, evenly spaced; by default the frames have their recorded times."""
     size: Size = None
     """Size in pixels, as 640x360."""
     outputs: Outputs = ()
-    """Frames to keep in the folder out/: any of rgb, alpha, depth, median_depth, normal, instance, instance_alpha, flow_prev, flow_next,
-    visible_prev, visible_next, need."""
+    """Buffers to write to the folder out/, one file a frame: any of rgb, alpha, depth, median_depth, normal, instance, instance_alpha,
+    flow_prev, flow_next, visible_prev, visible_next, need."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to render and enhance."""
     databank: Path = Path("databank")
@@ -156,7 +156,7 @@ class Render:
         for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
         if self.weights != "builtin" and not self.enhance:
-            raise UsageError(f"--weights {self.weights} would do nothing without --enhance; add it, or leave --weights out")
+            raise UsageError(f"--weights {self.weights} have no effect without --enhance; add it, or leave out --weights")
         from render.aside import shift_warning
         from render.clip import clip_cameras, clip_times, cut_warning
         from render.record import record, stale_warning
@@ -168,9 +168,7 @@ class Render:
 
         check_device(self.device)
         if self.insert and kind_of(self.scene) in ("asset", "splats"):
-            raise UsageError(
-                f"--insert needs a street to put assets onto; give a scene that sidestep recon wrote, {self.scene} is splats alone"
-            )
+            raise UsageError(f"--insert needs a scene that sidestep recon wrote, with a ground and a path; {self.scene} holds splats only")
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
@@ -209,7 +207,7 @@ class Render:
         print(f"wrote {', '.join(map(str, written))}")
 
 
-DESCRIPTION = "From a recorded drive to a clip of a path that was never driven, with other things on the street."
+DESCRIPTION = "Reconstruct a recorded drive as Gaussian splats, render it from beside its path with inserted assets, and enhance the clip."
 COMMANDS = {
     "recon": Recon, "assets": Assets, "insert": Insert, "edit": Edit, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
     "convert": Convert, "info": Info, "validate": Validate, "doctor": Doctor, "demo": Demo,

@@ -59,7 +59,7 @@ def _folder(path: Path) -> Model:
         return _diffusers_cosmos(path)
     if (path / "enhancer.safetensors").is_file():
         raise ValueError(f"{path} is the folder of a training; give {path / 'enhancer.safetensors'}")
-    raise ValueError(f"{path} holds no model that is known; give {KNOWN}")
+    raise ValueError(f"{path} holds no known model; give {KNOWN}")
 
 
 def _diffusers_cosmos(path: Path) -> Model:
@@ -116,7 +116,7 @@ def _file(path: Path) -> Model | WhiteBox:
     if "encoder.conv1.weight" in state:
         raise ValueError(f"{path} is the Wan autoencoder alone; give the folder with model.pt in it, or a Harmonizer's .pkl")
     first = ", ".join(list(state)[:3])
-    raise ValueError(f"{path} is no enhancer that is known, it holds {first or 'nothing'}; give {KNOWN}")
+    raise ValueError(f"{path} is not a known enhancer: it holds {first or 'nothing'}; give {KNOWN}")
 
 
 def _without(model: Model, names: tuple[str, ...]) -> Model:
@@ -146,7 +146,7 @@ def _script(path: Path) -> torch.jit.ScriptModule:
     try:
         module = torch.jit.load(str(path), map_location="cpu")
     except RuntimeError as error:
-        raise ValueError(f"{path} is no whole TorchScript ({str(error).strip().splitlines()[0]}); fetch it again") from error
+        raise ValueError(f"{path} is not a valid TorchScript ({str(error).strip().splitlines()[0]}); fetch it again") from error
     schema = module.forward.schema if hasattr(module, "forward") else None
     takes = [str(a.type) for a in schema.arguments[1:] if not a.has_default_value()] if schema else []
     gives = [str(r.type) for r in schema.returns] if schema else []
@@ -170,7 +170,7 @@ def read_state(path: Path) -> dict:
         try:
             return load_file(path)
         except SafetensorError as error:
-            raise ValueError(f"{path} is not a whole safetensors file ({error}); fetch it again") from error
+            raise ValueError(f"{path} is not a valid safetensors file ({error}); fetch it again") from error
     try:
         # Transformer Engine's state beside the weights is bytes, never run; torch warns of a pickle that it then refuses, or reads
         with torch.serialization.safe_globals([io.BytesIO]), warnings.catch_warnings(action="ignore", category=UserWarning):
@@ -185,7 +185,7 @@ def read_state(path: Path) -> dict:
         # torch runs a pickle as a program, which damaged bytes end in any way: by an empty stack, an index, struct's own error
         told = str(error).strip().splitlines() if isinstance(error, RuntimeError | zipfile.BadZipFile) else []
         why = told[0].split(". ")[0] if told else "it is damaged, ends too early, or is something else"
-        raise ValueError(f"{path} is no whole checkpoint ({why}); fetch it again") from error
+        raise ValueError(f"{path} is not a valid checkpoint ({why}); fetch it again") from error
     if not isinstance(state, Mapping):
         raise ValueError(f"{path} holds a {type(state).__name__}, not tensors by name; give {KNOWN}")
     return _named(state)

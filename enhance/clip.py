@@ -69,7 +69,7 @@ def enhancement(
     there is nothing to go by. references: of the scene, if it has photos; scene: which tells what was put in (`enhance_frames`)."""
     enhancer = load_saying(weights, device)
     if isinstance(enhancer, Enhancer) and not any(enhancer.repairs) and references is None and scene is not None and not scene.anew():
-        warn(["nothing will be enhanced: the scene keeps no photos to go by, nothing was put in, and these weights repair nothing else"])
+        warn(["nothing will be enhanced: the scene keeps no photos, nothing was inserted, and these weights repair nothing else"])
     outputs = tuple(name for name in enhancer.reads if name != "reference")
     stages: dict[str, Callable] = {"enhance": partial(enhance_frames, enhancer=enhancer, scene=scene)}
     if references is None or "reference" not in enhancer.reads:
@@ -108,7 +108,7 @@ def enhance_video(
     ids = None if instances is None else ObjectIds(instances, clip.count)
     enhancer = enhancer or Enhancer.load()
     if ids is not None and "instance" not in enhancer.reads:
-        raise ValueError(f"{enhancer.about.get('model', 'this model')} cannot be told where objects are; leave --instances out")
+        raise ValueError(f"{enhancer.about.get('model', 'this model')} takes no instance masks; leave out --instances")
     if isinstance(enhancer, Enhancer) and not rendered:
         enhancer = enhancer.for_photos()
     if like is not None:
@@ -139,7 +139,7 @@ def enhance_video(
         warn([f"{out} is without the sound of {source}; {fix}"])
     if not changed:
         why = f"its colours are those of {like}" if like is not None else _why(rendered, instances, told)
-        warn([f"no frame of {source} was changed: {why}; render --enhance tells objects and has photos to go by"])
+        warn([f"no frame of {source} was changed: {why}; render --enhance knows the inserted objects and the scene's photos"])
     return done, changed
 
 
@@ -160,9 +160,9 @@ def _writer(out: str | Path, clip: Pictures | Video) -> PictureWriter | VideoWri
 
 def _why(rendered: bool, instances: str | Path | None, told: bool) -> str:
     if instances is not None and not told:
-        return f"{instances} tells of no object, all of it is 0"
+        return f"{instances} has no object, all of it is 0"
     if instances is not None:
-        return "these weights find the told objects right, or too small to judge"
+        return "these weights find the masked objects right, or too small to judge"
     if rendered:
-        return "these weights' network rests, as it gained too little where it had not been"
-    return "if it shows renders, say --rendered; if something was put in, say where by --instances; if all is in other colours, say --like"
+        return "the repair network of these weights is switched off, as it gained too little on new places"
+    return "give --rendered if it shows renders, --instances where objects were inserted, --like if all of it is in other colours"

@@ -26,25 +26,25 @@ class Pairs:
     data: tuple[Path, ...] = ()
     """The recordings that the scenes were reconstructed from, in the same order."""
     kinds: Names = None
-    """Which damage, of sparse, cycle, crossref, underfit, isp (on instances, and as isp_frame on whole frames), relight, shadow, reinsert,
-    clean; the reconstructions from less that the first four take are fitted once, some minutes each."""
+    """Kinds of degradation: sparse, cycle, crossref, underfit, isp (of instances, and as isp_frame of whole frames), relight, shadow,
+    reinsert, clean. The first four need reconstructions from less data, which are fitted once, some minutes each."""
     cameras: Names = None
     """Cameras to use; the front camera's pairs are never trained on, where there are others."""
     skies: tuple[Path, ...] = ()
-    """HDR skies (.hdr) to light relight and shadow with, beside made-up ones."""
+    """HDR environment maps (.hdr) for the kinds relight and shadow, beside synthetic ones."""
     relit: FolderOrNone = None
-    """Folder in which NVIDIA's DiffusionRenderer, run by yourself, is handed photos and gives them back under other skies, for relight;
-    this command says what to run. Without, relight goes by the splats' normals."""
+    """Folder to exchange photos with NVIDIA's DiffusionRenderer, which you run yourself (this command says how): it relights them for the
+    kind relight, which uses the splats' normals otherwise."""
     databank: FolderOrNone = None
-    """Assets that shadow puts in, beside those cut out of the scene."""
+    """Databank whose assets the kind shadow inserts, beside those cut out of the scene."""
     photos: tuple[Path, ...] = ()
-    """Folders of images, and videos, of places never trained on: pairs of single frames with a region in other colours."""
+    """Folders of images, and videos, of places never trained on: pairs of single frames with a recoloured region, for evaluation."""
     size: Annotated[int, arg(metavar="PIXELS")] = 640
     """Width of the frames."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit and render."""
     seed: int = 0
-    """Same seed, same pairs; another leaves out other frames and fits longer or shorter, with more or fewer splats."""
+    """Random seed: the same gives the same pairs; another holds out other frames, and fits longer or shorter, with more or fewer splats."""
 
     def run(self) -> None:
         from enhance.pairs.clips import PairConfig
@@ -65,16 +65,16 @@ class Pairs:
         _check_seed(self.seed)
         if not (self.scenes or self.photos) or len(self.scenes) != len(self.data):
             counts = f"scenes: {len(self.scenes)}, recordings: {len(self.data)}"
-            raise UsageError(f"give each scene's recording with --data, in the scenes' order; {counts}")
+            raise UsageError(f"give the recording of each scene with --data, in the same order; {counts}")
         names = [path.resolve().name for path in self.scenes]
         if twice := sorted({n for n in names if names.count(n) > 1}):
-            raise UsageError(f"two scenes are called {twice[0]}, by which their pairs' folders are named; make them one after the other")
+            raise UsageError(f"two scenes are called {twice[0]}, as the folders of their pairs would be; run the command once for each")
         config = PairConfig(width=self.size)
         check_kinds(self.kinds or ())
         check_names(self.photos)
         _check_there(*self.skies, *self.photos)
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
-            raise UsageError("--relit is for the kind relight, which is not among --kinds; add it there")
+            raise UsageError("--relit is for the kind relight, which --kinds does not name; add it, or leave out --relit")
         check_device(self.device)
         with stopped_saying(lambda: "the same command goes on from here"):
             drives = []
@@ -120,7 +120,7 @@ def _check_there(*paths: Path) -> None:
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
     """UsageError where names were asked for and none was given."""
     if names == ():
-        raise UsageError(f"{flag} names none; leave it out for all")
+        raise UsageError(f"{flag} is empty; leave it out for all")
 
 
 @dataclass
@@ -132,21 +132,21 @@ class Train:
     output: Output
     """Folder of the training: checkpoint.pt and, at the end, enhancer.safetensors."""
     photos: tuple[Path, ...] = ()
-    """Folders of images, and videos: further clean pictures."""
+    """Folders of images, and videos, as further clean training pictures."""
     time: Annotated[int, written(units.duration_us, "TIME", "7200s")] = 7_200_000_000
-    """How long to train, as 7200s."""
+    """Training time, as 7200s."""
     seed: int = 0
-    """Seed of the first weights and of every sample."""
+    """Random seed of the initial weights and of the samples."""
     start: WeightsOrNone = None
-    """Weights to train further: builtin, or a file that sidestep train wrote; from nothing where none."""
+    """Weights to fine-tune: builtin, or a file that sidestep train wrote; random ones by default."""
     only: Names = None
-    """What of prior, objects, shade, enhancer to train further; the rest of the weights stays as it is."""
+    """Parts of the network to fine-tune: prior, objects, shade, enhancer; the rest is frozen."""
     vgg: FileOrNone = None
-    """torchvision's vgg16 weights, a file of your own, whose features the perceptual loss compares; the autoencoder's own without."""
+    """File of torchvision's vgg16 weights for the perceptual loss; by default it compares the autoencoder's own features."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train; the weights run on either."""
     resume: Flag = False
-    """Go on from the folder's checkpoint."""
+    """Resume from the folder's checkpoint."""
 
     def run(self) -> None:
         from enhance.pairs.shards import PairSet
@@ -157,7 +157,7 @@ class Train:
             raise UsageError("give at least one folder of pairs; sidestep pairs makes them")
         _some("--only", self.only)
         if self.only and self.start is None:
-            raise UsageError("--only takes weights to start from; give --start, as --start builtin")
+            raise UsageError("--only needs weights to fine-tune; give --start, as --start builtin")
         _check_seed(self.seed)
         _check_there(*self.photos)
         check_device(self.device)
@@ -197,15 +197,16 @@ class Enhance:
     weights: str = "builtin"
     """The enhancer's weights: builtin, a file that sidestep train wrote, or a public model's: Harmonizer, Fixer, Difix, Cosmos-Predict2."""
     instances: FolderOrNone = None
-    """Tells where objects were put in, whose colours, shadows and noise are then set right: a .png or .npy for each frame, in which each
-    object has a number or colour of its own and all else is 0. What render --outputs instance keeps has numbers for what was recorded, too:
-    set these to 0; out.json says which were inserted."""
+    """Masks of inserted objects, whose colours, shadows and noise are then corrected: a .png or .npy per frame, in which each object has a
+    number or colour of its own and all else is 0. Those of render --outputs instance number recorded actors, too: set these to 0; out.json
+    says which were inserted."""
     like: Annotated[Path | None, written(Path, "PHOTOS", "none")] = None
-    """Photos of the same place, as a folder of them, one, or a video: the whole clip is given their exposure, white balance, contrast and
-    saturation, and loses noise and sharpening that they have not. A scene's own are in its photos/CAMERA. What differs no more than they do
-    among themselves stays."""
+    """Reference photos of the same place: a folder, one photo, or a video. The whole clip is matched to their exposure, white balance,
+    contrast and saturation, and loses noise and sharpening that they lack; differences as small as those among the photos stay. A scene's
+    own photos are in its photos/CAMERA."""
     rendered: Flag = False
-    """The video shows renders of splats: repair them. Without this, --instances and --like the built-in weights leave it as it is."""
+    """The video shows renders of splats: repair their artefacts. Without any of this, --instances and --like, the built-in weights change
+    nothing."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to enhance."""
     overwrite: Overwrite = False

@@ -38,7 +38,7 @@ class Drift:
 def drift(enhancer: Steps, pictures: Sequence[Frame | torch.Tensor], frames: int = FRAMES) -> Drift:
     """Of a rollout over `frames` frames: as `of_video` has them, or told their objects. ValueError where there are fewer than two."""
     if len(pictures) < 2:
-        raise ValueError(f"a rollout takes two frames at least, got {len(pictures)}; give a longer video")
+        raise ValueError(f"a rollout needs at least two frames, got {len(pictures)}; give a longer video")
     part = min(PART, frames // 2)
     pictures = pictures[: (frames - part) // 2 + 1]  # there and back again, or no two frames that are compared would show the same
     found, memory = [], None

@@ -25,14 +25,14 @@ LONGEST = 4
 
 @dataclass(frozen=True)
 class Memory:
-    """What is remembered between the frames of a clip.
+    """The state between the frames of a clip.
 
-    past   of the last frame that was worked on; None where that is too long ago
+    past   the network's state of the last frame that it processed; None where that is too long ago
     size   height and width of the frames in pixels
     flow   whether they had flow
-    since  `[1, 2, H, W]` each: flows of the frames since then, that needed nothing and cost nothing
-    objects  by told object the correction of its colours so far
-    look   `[1, 3, h, w]`: the last frame that was told objects, as it came, thinned; None where none was
+    since  `[1, 2, H, W]` each: flows of the frames since then, which were skipped
+    objects  colour corrections so far, by instance id
+    look   `[1, 3, h, w]`: the last input frame that had instances, downsampled, to detect cuts; None where none had
     """
 
     past: Past | None
@@ -57,9 +57,9 @@ class Enhancer:
         history: int | None = None,
         repair: bool | None = None,
     ):
-        """bfloat16: whether to compute in it; where that is fast, if None. history: how many frames are looked back to, at most the
-        network's own number, if None. repair: whether the network repairs what is rendered; where its training found that worth it, alone
-        and beside photos, if None. Without, told objects are corrected all the same, and references laid in."""
+        """bfloat16: whether to compute in it; None: where that is fast. history: past frames that are used; None: as many as the network
+        was trained with. repair: whether the network repairs artefacts of rendering; None: where its training measured a gain, without
+        and with photos. Without it, instances are still corrected, and references blended in."""
         self.device = torch.device(device)
         self.net = channels_last(net.eval().requires_grad_(False).to(self.device))
         self.about = about or {}
@@ -73,7 +73,7 @@ class Enhancer:
             self.reads = ("instance", "reference")
 
     def for_photos(self) -> Enhancer:
-        """The same for frames that are photos but for what was put in: objects are corrected, and nothing else is repaired."""
+        """The same for photos with inserted objects: these are corrected, and nothing else is repaired."""
         return Enhancer(self.net, self.about, self.device, self.bfloat16, self.history, repair=False)
 
     @classmethod
@@ -95,13 +95,13 @@ class Enhancer:
         """One frame enhanced: float32 `[H, W, 3]` in 0..1, and the memory to pass with the next frame.
 
         frame   rgb `[H, W, 3]` display-referred, of any size (beyond 1280 pixels a side it is worked on in parts), or a rendered
-                Frame: its flow_prev then moves the memory exactly, its instance says where objects were put, its need where there is
-                anything to do at all, and its reference what photos show there (`render/references.py`), all optional. Without flow the
-                memory stays in place.
+                Frame, of which these are used, all optional: flow_prev to warp the memory, instance for inserted objects, need for where
+                to repair at all, and reference for what photos show there (`render/references.py`). Without flow the memory stays in
+                place.
         memory  of the frame before; None at the start of a clip. It is dropped where the size changed, where a frame lacks
                 the flow that the frames before it had, and after a cut or a jump, where the pictures do not look alike.
 
-        Where repairing was not found worth it (`repair`), nothing is done beside told objects and references. Tiles of 32 x 32 that need
+        With repairs off (`repair`), only instances are corrected and references blended in. Tiles of 32 x 32 that need
         nothing come back exactly as they went in (clamped to 0..1); a frame that needs nothing costs nothing. Raises ValueError for values
         that are not finite.
         """

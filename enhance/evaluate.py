@@ -252,7 +252,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--limit", type=_count, default=None, help="most clips of a kind")
     parser.add_argument("--split", default="held out", choices=("held out", "train"))
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="where to enhance")
-    parser.add_argument("--rollout", type=Path, help="a video; it and told clean frames of the pairs, back and forth for 500: what drifts?")
+    parser.add_argument(
+        "--rollout", type=Path, help="a video on which, and on clean frames of the pairs, drift over 500 frames back and forth is measured"
+    )
     options = parser.parse_args(arguments)
     try:
         check_device(options.device)
@@ -262,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         beside = {f"{one.about.get('model', 'weights')} ({path})": one for path, one in others.items()}
         told = _told(pairs.of("clean", options.split)) if rollout else []
         if rollout and len(told) < 2:
-            raise ValueError(f'--rollout takes two frames at least of clean pairs of split "{options.split}" too, beside the video')
+            raise ValueError(f'--rollout needs at least two frames of clean pairs of split "{options.split}" too, beside the video')
         rows = evaluate(pairs, enhancer, options.split, options.limit, lambda line: print(line, file=sys.stderr), beside)
         print(table(rows))
         if rollout:

@@ -48,7 +48,7 @@ class ObjectIds:
             raise ValueError(f"{file} has ids of the shape {list(ids.shape)}, but its picture is {height} rows of {width}; {fix}")
         if (count := len(np.unique(ids[ids > 0]))) > MOST:
             fix = "give every object one value, without soft edges"
-            raise ValueError(f"{file} tells of {count} objects, and {MOST} are the most of one picture; {fix}")
+            raise ValueError(f"{file} has {count} objects, and a picture may have {MOST} at most; {fix}")
         return torch.from_numpy(ids.astype(np.int32))
 
 

@@ -43,22 +43,21 @@ class Recon:
     cameras: FrontNames = None
     """Cameras to use."""
     start: Time = 0
-    """Where in the drive to begin."""
+    """Start time in the drive."""
     duration: TimeOrAll = None
-    """How much of the drive to use."""
+    """Duration of the part of the drive to use."""
     size: FitSize = None
-    """Size of the first camera's pictures that are fitted; others of other proportions get as many pixels."""
+    """Size at which the first camera's pictures are fitted; cameras of another aspect ratio get as many pixels."""
     camera_height: LengthOrNone = None
-    """Of a COLMAP folder, photos or a video: how high the cameras stood above the ground, as 1.5m; makes the scene metric."""
+    """For a COLMAP folder, photos or a video: height of the cameras above the ground, as 1.5m, which makes the scene metric."""
     metres_per_unit: Ratio = None
-    """The same by number: metres that one unit of the model has."""
+    """The scale of such a model instead: metres per unit."""
     angle_of_view: AngleOrNone = None
-    """Of photos or a video: how wide their camera sees, from the left side to the right, as 58deg; else it is found, which a straight road
-    does not allow."""
+    """For photos or a video: horizontal field of view of the camera, as 58deg; estimated by default, which fails on a straight road."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     resume: Flag = False
-    """Go on from where an interrupted run of the same command stopped."""
+    """Resume an interrupted run of the same command."""
     overwrite: Overwrite = False
     """Replace an existing scene."""
 
@@ -90,7 +89,7 @@ class Recon:
 
 @dataclass
 class Extract:
-    """Cut what moves and parked vehicles out of a scene into the databank, with the scene's photos of them."""
+    """Extract the moving actors and parked vehicles of a scene into the databank, with the scene's photos of them."""
 
     scene: ScenePath
     """Scene folder."""
@@ -169,18 +168,18 @@ class Add:
     label: Label
     """What it is: car, pickup, van, truck, bus, motorcycle, bicycle, pedestrian, cone, sign, tree, or a name of its own."""
     scale: Ratio = None
-    """Metres a unit of the file."""
+    """Metres per unit of the file."""
     up: Axis = None
-    """The axis that points up: x, -x, y, ...; a mesh's is y, as in glTF; of splats y in .glb and .spz, what a USD file says, else -y, as
-    cameras have it."""
+    """Up axis of the file: x, -x, y, ...; by default y for a mesh, as in glTF; for splats y in .glb and .spz, what a USD file says, else
+    -y, as cameras have it."""
     forward: Axis = None
-    """The axis that points forward: a mesh's is z, as in glTF; of splats -z in .spz, x in USD with z up, and else z."""
+    """Forward axis of the file: by default z for a mesh, as in glTF; for splats -z in .spz, x in USD with z up, else z."""
     licence: str = ""
     """Its licence, as "CC BY 3.0"."""
     attribution: str = ""
-    """Whom the licence wants named."""
+    """Credit that its licence requires."""
     force: Flag = False
-    """Add it though its size is not that of its class."""
+    """Add it even if its size is not plausible for its class."""
     databank: Path = Path("databank")
     """Folder of the databank."""
 

@@ -47,7 +47,7 @@ class Captured:
         self.outputs = check_outputs(outputs)
         for name in self.outputs:
             if name not in OUTPUTS:
-                raise ValueError(f'output "{name}" cannot be recorded, only {", ".join(OUTPUTS)}; ask rasterize for it')
+                raise ValueError(f'output "{name}" cannot be captured, only {", ".join(OUTPUTS)}; use rasterize')
         self.placed, self.camera = as_placed(splats), camera
         self._device = self.placed[0].gaussians.device
         self.background = None if background is None else torch.as_tensor(background).to(self._device)
@@ -68,7 +68,7 @@ class Captured:
             room=self.room,
         )
         if self._settings.by_rays:
-            raise ValueError('response "ray" and order "pixel" cannot be recorded; ask rasterize for them')
+            raise ValueError('response "ray" and order "pixel" cannot be captured; use rasterize')
         fields = [t for p in self.placed for t in p.gaussians.tensors().values()]
         self._lens = camera.lens.params()
         self._todo, self._told, rows = prepare(self._settings, None, poses(camera, self.placed), self._lens, fields)
@@ -83,7 +83,7 @@ class Captured:
 
     def _draw(self, camera: Camera) -> Frame:
         if self._shared(camera) != self._shared(self.camera):
-            raise ValueError("all cameras of a recording must share lens, size and shutter; record another for this one")
+            raise ValueError("all cameras of a CUDA graph must share lens, size and shutter; make another Captured for this one")
         check_poses([], camera)
         check_projection(camera, self.placed, self._settings.model)
         with torch.no_grad():

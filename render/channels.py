@@ -54,7 +54,7 @@ def unit(sums: torch.Tensor) -> torch.Tensor:
 
 def _features(placed: Sequence[Placed], features: Features | None) -> torch.Tensor:
     if features is None:
-        raise ValueError('output "features" needs features=, a tensor [N, C] of the splats or one for each of the placed')
+        raise ValueError('output "features" needs features=, a tensor [N, C] of the splats or a list with one for each Placed')
     parts = [features] if isinstance(features, torch.Tensor) else list(features)
     sizes = [len(p.gaussians) for p in placed]
     if len(parts) == 1:

@@ -53,7 +53,7 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class Frame:
-    """The view of one camera. What was not asked for is None and was not computed.
+    """The view of one camera. What was not requested is None and was not computed.
 
     rgb `[H, W, 3]` display-referred, premultiplied over black where no background was given, not clamped above 1;
     alpha `[H, W]`; depth `[H, W]` in metres, inf where alpha is 0: z, and for fisheye and equirectangular lenses the distance;

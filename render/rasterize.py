@@ -79,13 +79,13 @@ def rasterize(
     """Draw Gaussian splats (Kerbl et al. 2023) as `camera` sees them; one Frame a camera.
 
     splats: in the world, or placed in it; quaternions of any length; nothing is changed. outputs: names of the fields of `Frame`; what is
-    not asked for is None and costs nothing. background: `[3]` or `[H, W, 3]`; black otherwise, with rgb premultiplied. flow_to: the
+    not requested is None and costs nothing. background: `[3]` or `[H, W, 3]`; black otherwise, with rgb premultiplied. flow_to: the
     placed splats and camera at the other time for "prev" and "next"; an instance that is missing there keeps its pose, and what moves
     needs an instance id of its own. features: a further
     field of the splats, `[N, C]` with C to 128, or one for each of the placed. crop: x, y, width, height in pixels, when only that part of
-    the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; in the others
-    nothing stands. room: what earlier frames needed, so that the host does not wait for this one, without gradients; the frame may
-    lack splats until `room.held` has said otherwise, as `one_ahead` asks (`render/room.py`).
+    the image is wanted: bit for bit what the whole shows there. mask: bool `[H, W]`, when only those pixels are wanted; the others
+    are empty. room: buffer sizes that earlier frames needed (`render/room.py`), so that the host does not wait for this one; without
+    gradients. The frame may lack splats until `room.held` confirms it, as `one_ahead` does.
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
     instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. What is found out about
@@ -114,9 +114,7 @@ def _draw(
     seen, traced = None, differentiated(placed, camera, features)
     if traced:
         if room is not None:
-            raise ValueError(
-                "a room is for frames without gradients, which may lack splats; leave room= out, or draw under torch.no_grad()"
-            )
+            raise ValueError("room= takes no gradients, since its frames may lack splats; leave it out, or draw under torch.no_grad()")
     else:
         lean = [without_zero_bands(p.gaussians) for p in placed]
         placed = [p if g is p.gaussians else replace(p, gaussians=g) for p, g in zip(placed, lean, strict=True)]
@@ -275,4 +273,4 @@ def _check_shared(placed: list[Placed], there: list[Placed]) -> None:
         now, then = ([p.world_from_local for p in some if p.instance == id] for some in (placed, there))
         ways = [b @ inverse(a) for a, b in zip(now, then or now, strict=False)]
         if len(then) not in (0, len(now)) or any((way - ways[0]).abs().max() > 1e-9 * (1 + ways[0].abs().max()) for way in ways):
-            raise ValueError(f"{len(now)} of the placed have the instance id {id} and move differently; flow needs an id for each")
+            raise ValueError(f"{len(now)} of the Placed have the instance id {id} and move differently; flow needs an id for each")

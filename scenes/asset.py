@@ -55,10 +55,10 @@ class Actor:
 
     @property
     def recorded(self) -> bool:
-        """Whether its splats were seen on this drive: those of a databank have an id there."""
+        """Whether its splats were reconstructed from this drive, and not taken from a databank (which gives them an id)."""
         return not self.asset.meta.get("inserted") and "id" not in self.asset.meta
 
     @property
     def anew(self) -> bool:
-        """Whether it was put in or edited, so that no photo shows it as it stands, in its light and with its shadow."""
+        """Whether it was inserted or edited, so that no photo shows it in its place, light and shadow."""
         return bool(self.asset.meta.get("inserted") or self.asset.meta.get("edited"))

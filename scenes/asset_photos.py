@@ -76,7 +76,7 @@ def load_photos(file: Path) -> tuple[AssetPhoto, ...]:
         return tuple(_photo(index.parent, record) for record in json.loads(index.read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         told = f"{type(error).__name__} {error}"
-        raise ValueError(f"{index} is corrupt ({told}); remove {index.parent}, and the asset is done without photos") from error
+        raise ValueError(f"{index} is corrupt ({told}); remove {index.parent}, and the asset loads without photos") from error
 
 
 def _photo(folder: Path, record: dict) -> AssetPhoto:
@@ -95,7 +95,7 @@ def _photo(folder: Path, record: dict) -> AssetPhoto:
 def _read(file: Path, width: int, height: int) -> np.ndarray:
     from scenes.pictures import opened
 
-    fix = f"remove {file.parent}, and the asset is done without photos"
+    fix = f"remove {file.parent}, and the asset loads without photos"
     with opened(file, str(file), fix) as picture:
         size = picture.size
         pixels = np.array(picture.convert("RGBA")) if size == (width, height) else None  # a header may claim any size

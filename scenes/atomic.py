@@ -148,7 +148,7 @@ def _need_no_file(folder: Path, path: Path) -> None:
 
 def _need_access(folder: Path, path: Path) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"cannot write {path}: {folder.resolve()} takes no files of yours; give a folder of your own")
+        raise PermissionError(f"cannot write {path}: {folder.resolve()} is not writable; give a folder of your own")
 
 
 def _umask() -> int:

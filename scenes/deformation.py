@@ -52,7 +52,7 @@ class Lattice:
 
     @torch.no_grad()
     def origin(self, points: torch.Tensor) -> torch.Tensor:
-        """Where points `[N, 3]` stood before they were moved: `x + at(x) = points`, found by going back again and again."""
+        """Where points `[N, 3]` stood before they were moved: `x + at(x) = points`, by fixed-point iteration."""
         before = points
         for _ in range(RETURNS):
             before = points - self.at(before)

@@ -56,8 +56,8 @@ class SplatModel:
         return self.widening if self.antialias else self.smoothing
 
     def at_scale(self, scale: float) -> SplatModel:
-        """The model for pictures that are `scale` times as large as those that were trained on: what these added to a splat is as large a
-        part of it there, and what a pixel of a smaller picture averages is made up for."""
+        """The model for pictures that are `scale` times as large as the training pictures: the dilation scales along, and in smaller ones
+        splats are smoothed by what their wider pixels average."""
         if self.antialias or scale == 1:
             return self
         return replace(self, dilation=self.dilation * scale**2, smoothing=self.smoothing + AVERAGED * max(0.0, 1 - scale**2))

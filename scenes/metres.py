@@ -16,4 +16,5 @@ def require_metres(scene: Scene, what: str) -> None:
     """ValueError with the fix where `what` asks for metres of a scene that has none."""
     if not is_metric(scene):
         name = scene.meta.get("path", scene.meta.get("name", "the scene"))
-        raise ValueError(f"{what} is in metres, but {name} has none: its poses come from pictures alone; reconstruct it again with {FIX}")
+        why = f"{what} is in metres, but {name} has no metric scale: its poses come from pictures alone"
+        raise ValueError(f"{why}; reconstruct it again with {FIX}")

@@ -31,7 +31,7 @@ def unknown(kind: str, name: str, where: str, options: Iterable[str], each: str 
     have = ", ".join(options) or "nothing"
     if len(options) > MANY:
         likest = sorted(options, key=lambda option: -_likeness(name, option))[:FEW]
-        have = f"{len(options)}, the likest of which are {', '.join(likest)}"
+        have = f"{len(options)}, the closest of which are {', '.join(likest)}"
     return f'{kind} "{name}" is not in {where}; it has {have}.{nearest(name, options)}'
 
 

@@ -64,13 +64,13 @@ def _ratio(text: str) -> float:
 def _of_track(text: str, parse: Callable[[str], Any], example: str) -> tuple[str, Any]:
     track, equals, value = text.partition("=")
     if not (track and equals and value):
-        raise ValueError(f'"{text}" does not say which actor gets what; write ACTOR=VALUE, as {example}')
+        raise ValueError(f'"{text}" is not of the form ACTOR=VALUE; write it as {example}')
     return track, parse(value)
 
 
 def _label(text: str) -> str:
     if not text.strip():
-        raise ValueError("a label names what the thing is; write car, cone, or a name of its own")
+        raise ValueError("the label is empty; write car, cone, or a name of your own")
     return text
 
 

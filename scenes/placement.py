@@ -46,7 +46,7 @@ def parse_at(text: str) -> tuple[float, float]:
     """ "20m,-3.5m" as metres forward and left. ValueError with the fix otherwise."""
     parts = text.split(",")
     if len(parts) != 2:
-        raise ValueError(f'"{text}" is not a place; write metres forward and left of the body, as 20m,-3.5m')
+        raise ValueError(f'"{text}" is not a place; write metres forward and left of the recording car, as 20m,-3.5m')
     return length(parts[0]), length(parts[1])
 
 
@@ -54,7 +54,7 @@ def parse_placement(text: str) -> Placement:
     """ "ID@X,Y[,yaw=5deg][,speed=8m/s][,path=lane]" or "ID@trajectory=t.csv". ValueError with the fix otherwise."""
     asset, at, rest = text.partition("@")
     if not at or not asset:
-        raise ValueError(f'"{text}" does not say what goes where; write ID@X,Y as car/0003@12m,3.5m (metres forward, left)')
+        raise ValueError(f'"{text}" is not an insertion; write ID@X,Y, as car/0003@12m,3.5m (metres forward, left)')
     if rest.startswith("trajectory="):
         return Placement(asset, trajectory=Path(rest.removeprefix("trajectory=")))  # a path may hold any character
     parts = rest.split(",")
@@ -67,7 +67,7 @@ def parse_placement(text: str) -> Placement:
             raise ValueError(f'"{text}" says {key} twice; say it once')
         given[key] = value
     if "trajectory" in given:
-        raise ValueError(f'"{text}" gives a place and a trajectory; a trajectory says it all: {asset}@trajectory={given["trajectory"]}')
+        raise ValueError(f'"{text}" gives a place and a trajectory; leave out the place: {asset}@trajectory={given["trajectory"]}')
     x, y = parse_at(",".join(place))
     turn, fast = angle(given.get("yaw", "0deg")), speed(given.get("speed", "0m/s"))
     return Placement(asset, x, y, turn, fast, parse_path(given.get("path", "straight")))

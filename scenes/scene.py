@@ -65,9 +65,9 @@ class Scene:
         return self.rig_camera(name).along(ego or self.ego, time_us)
 
     def model_for(self, camera: Camera) -> SplatModel:
-        """The scene's model for pictures of a camera, larger or smaller ones than the splats were fitted to: those of the rig's camera that
-        sees most nearly as wide an angle. As it is without perspective, and for larger ones of another angle: what they show was fitted to
-        from elsewhere, nearer by."""
+        """The splat model for a camera's pictures, scaled (`SplatModel.at_scale`) by its focal length in pixels over that of the rig's
+        camera with the most similar field of view. Not scaled for orthographic cameras, nor up for those of another field of view, whose
+        splats other cameras were fitted to from nearer by."""
         fitted = [c for c in self.rig.values() if c.fitted and not isinstance(c.lens, Orthographic)]
         if not fitted or isinstance(camera.lens, Orthographic):
             return self.model
@@ -82,11 +82,11 @@ class Scene:
         return times if len(times) else self.ego.times_us
 
     def followed(self, time_us: int) -> torch.Tensor | None:
-        """How much more the cameras were exposed at a time than in the mean, `[3]`; None where that does not vary."""
+        """Exposure gain `[3]` of the cameras at a time, relative to their mean; None where it does not vary."""
         return followed([(c.times_us, c.gains) for c in self.rig.values()], time_us)
 
     def anew(self) -> list[int]:
-        """Instance ids of the actors that were put in or edited."""
+        """Instance ids of the inserted and edited actors."""
         return [i + 1 for i, actor in enumerate(self.actors) if actor.anew]
 
     def placed(self, time_us: int, readout_us: int = 0) -> list[Placed]:

@@ -50,7 +50,7 @@ def absence_warning(actor: Actor, cameras: Sequence[Camera], witnesses: Sequence
         return [f"{id} is never in view: X is metres forward, Y metres to the left"]
     sees = [any(camera is witness for witness in witnesses) for camera in cameras]
     before_eyes = any(a != b and (s or t) for a, b, s, t in zip(there, there[1:], sees, sees[1:], strict=False))
-    return [f"{id} {said}: it comes or goes before the camera's eyes; let its trajectory begin earlier or end later"] if before_eyes else []
+    return [f"{id} {said}: it appears or disappears in view; let its trajectory begin earlier or end later"] if before_eyes else []
 
 
 def sector(ahead: float, beside: float) -> str:

@@ -161,7 +161,8 @@ def test_undoing_and_changing_at_once_is_all_or_nothing(door, tmp_path):
     door(["edit", street, "--undo", "aside", "--shift", "veh_1=0m,2m", "--name", "aside"])
     door(["edit", street, "--retime", "veh_1=+0.1s", "--name", "late"])
     out, _ = door(["edit", street, "--undo", "aside"])
-    assert "as it was without aside; but late still moves veh_1 from where aside had put it: undo that too, and give it anew" in out
+    told = "but late still goes on from where aside had put veh_1, and as what: undo that too, and give it anew"
+    assert f"as it was without aside; {told}" in out
 
 
 @pytest.mark.parametrize(
@@ -232,19 +233,27 @@ USAGE = [
     ([*SHOOT, "--insert", "car/0001"], "--insert", "write ID@X,Y"),
     ([*SHOOT, "--size", "100000x9"], "--size", "at most 16384 pixels a side"),
     ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, above 0 and below 1000, as 10"),
-    (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a street", "a scene that sidestep recon"),
+    (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a scene", "usdc holds splats only"),
     ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
     (["render", "street"], "--output", "required"),
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
     ([*INSERT, "--at", "20m"], "--at", "as 20m,-3.5m"),
     ([*INSERT, "--at", "20m,0m", "--trajectory", "t.csv"], "--at 20m,-3.5m", "one of the two"),
-    ([*INSERT, "--trajectory", "t.csv", "--speed", "5m/s"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
-    ([*INSERT, "--trajectory", "t.csv", "--path", "lane"], "--trajectory says it all", "leave --yaw, --speed and --path out"),
+    (
+        [*INSERT, "--trajectory", "t.csv", "--speed", "5m/s"],
+        "--trajectory also gives heading and speed",
+        "leave out --yaw",
+    ),
+    (
+        [*INSERT, "--trajectory", "t.csv", "--path", "lane"],
+        "--trajectory also gives heading and speed",
+        "leave out --yaw",
+    ),
     (["assets", "lst"], "lst", "list"),
-    (["edit", "street"], "say what to change", "--remove veh_12"),
+    (["edit", "street"], "nothing to do: give --remove", "--remove veh_12"),
     (["edit", "street", "--shift", "veh_1"], "--shift", "as veh_3=0m,1.5m"),
     (["edit", "street", "--retime", "veh_1=2"], "--retime", "write 2s (seconds) or 2000ms"),
-    ([*SHOOT, "--weights", "mine.safetensors"], "--weights mine.safetensors would do nothing without --enhance", "add it"),
+    ([*SHOOT, "--weights", "mine.safetensors"], "--weights mine.safetensors have no effect without --enhance", "add it"),
     ([*SHOOT, "--outputs", "colour"], 'output "colour" does not exist', "normal, flow_prev"),
 ]
 
@@ -272,7 +281,7 @@ DATA = [
     (["assets", "extract", "street", "--databank", "clip.mp4"], "clip.mp4 is a file; a databank is a folder"),
     (["assets", "extract", "street", "--databank", "clip.mp4/bank"], "clip.mp4 is a file; a databank is a folder"),
     (["assets", "list"], "sidestep assets extract SCENE --databank databank, or assets add, makes one"),
-    (["edit", "street", "--shift", "veh_1=0m,0m"], "by nought, which changes nothing"),
+    (["edit", "street", "--shift", "veh_1=0m,0m"], "by zero, which changes nothing"),
     ([*SHOOT, "--insert", "car/0001@trajectory=t.csv", "--databank", "bank"], "t.csv"),
     ([*INSERT, "--at", "5m,0m", "--start", "60s", "--databank", "bank"], "the drive lasts"),
     (["edit", "street", "--remove", "veh_2"], 'actor "veh_2" is not in street; it has veh_1. Did you mean veh_1?'),
@@ -374,7 +383,7 @@ def test_a_usage_error_names_the_help_of_its_own_command(door):
     for words in (["--label", ""], ["--label", "car", "--scale", "x"], ["--label", "car", "--up", "q"]):
         errors = door(["assets", "add", "car.glb", *words], 2)[1]
         assert "sidestep assets add --help" in errors and words[-2] in errors
-    assert "names what the thing is" in door(["assets", "add", "car.glb", "--label", " "], 2)[1]
+    assert "the label is empty" in door(["assets", "add", "car.glb", "--label", " "], 2)[1]
     assert "Did you mean add?" in door(["assets", "ad"], 2)[1]
     assert "extract" in door(["assets"], 2)[1] + door(["assets", "--help"])[0]
 

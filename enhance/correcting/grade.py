@@ -97,8 +97,8 @@ class Grade:
         return *self._mean(best.tolist()), float(likeness.mean())
 
     def usual(self, likeness: float) -> float:
-        """Mean square by which photos are changed that are given the colours of others which are as little like them as that, the median:
-        those beside one in a drive are the same picture once more, and tell nothing of a clip that was taken further on. 0 of one photo."""
+        """Median mean-square change of a photo that is graded like other photos of a likeness: what differences between photos of one place
+        come to. By likeness, since neighbours in a drive are near-duplicates. 0 where there is one photo only."""
         return float(np.median([_expected(1 - likeness, *one) for one in self.apart])) if self.apart else 0.0
 
     def _apart(self, i: int, order: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -135,8 +135,8 @@ class Settled:
 
 
 class Graded:
-    """An enhancer that is given each frame in the colours of photos: `better, memory = graded.step(frame, memory)`. What is told to have
-    been put in does not count; it is graded along, and then the enhancer's."""
+    """An enhancer whose input is graded like photos first: `better, memory = graded.step(frame, memory)`. The grade is estimated from the
+    frame without its instances; these are graded along with it, and then corrected by the enhancer."""
 
     def __init__(self, enhancer: Steps, grade: Grade):
         self.enhancer, self.grade = enhancer, grade

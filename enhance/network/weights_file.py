@@ -64,7 +64,7 @@ def load_net(path: str | Path) -> tuple[Net, dict]:
             header = file.metadata() or {}
             state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - not a dict
     except SafetensorError as error:
-        raise ValueError(f"{path} is not a whole safetensors file ({error}); fetch or train it again") from error
+        raise ValueError(f"{path} is not a valid safetensors file ({error}); fetch or train it again") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"{path} is not a Sidestep enhancer: its format is {header.get('format')!r}, not {FORMAT!r}")
     try:

@@ -139,7 +139,7 @@ class Shard:
                     raise ValueError(f"{self.path} holds {shape} frames, rows and columns, not what its description says; {fix}")
                 yield file
         except SafetensorError as error:
-            raise ValueError(f"{self.path} is not a whole clip ({error}); {fix}") from error
+            raise ValueError(f"{self.path} is not a complete clip ({error}); {fix}") from error
 
 
 def write_shard(path: Path, tensors: dict[str, torch.Tensor], meta: dict) -> None:

@@ -31,7 +31,7 @@ def tokens(folder: Path, prompt: str, length: int) -> torch.Tensor:
         ids = [vocabulary[piece] for piece in (first, *words, last)]
         return torch.tensor([ids + [vocabulary[fill]] * (length - len(ids))])
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{folder} is no whole tokenizer of Difix ({error}); fetch the folder again") from error
+        raise ValueError(f"{folder} is not a complete tokenizer of Difix ({error}); fetch the folder again") from error
 
 
 def _token(named: str | Mapping[str, str]) -> str:

@@ -111,7 +111,7 @@ def read_fixer(path: Path, transformer: Mapping[str, object], vae: Mapping[str, 
         try:
             module = torch.jit.load(io.BytesIO(kept[half]), map_location="cpu").float().eval()
         except (RuntimeError, TypeError) as error:
-            raise ValueError(f"{tokenizer}: its {half} is no whole TorchScript; fetch {TOKENIZER} again") from error
+            raise ValueError(f"{tokenizer}: its {half} is not a valid TorchScript; fetch {TOKENIZER} again") from error
         fill(path, f"the {half} of {TOKENIZER}", module, part(vae, f"{half}."), assign=False)
         halves.append(module)
     others = [name for name in vae if not name.startswith(("encoder.", "decoder."))]

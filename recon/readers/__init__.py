@@ -60,7 +60,7 @@ def open_log(
 
 def _knows_its_lenses(path: Path, angle_of_view: float | None) -> None:
     if angle_of_view is not None:
-        raise ValueError(f"{path} tells its lenses itself; leave out --angle-of-view, which is for photos and videos")
+        raise ValueError(f"{path} has a calibration of its own; leave out --angle-of-view, which is for photos and videos")
 
 
 READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Log]]] = {

@@ -63,7 +63,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     if len(steps) and (step := float(steps.median())) > APART:
         fix = "check the scale that was given" if metres_per_unit else "take pictures closer together, of more that stands still"
         fix += f", and delete {path} to begin again" if path.suffix == ".sfm" else ""
-        raise ValueError(f"{where} has its pictures {step:.3g} m from one to the next, which is astray; {fix}")
+        raise ValueError(f"{where} has its pictures {step:.3g} m from one to the next, which is implausible; {fix}")
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
     for key in sorted(names, key=lambda k: (k != lead, names[k])):
@@ -130,7 +130,7 @@ def colmap_lens(lens: Lens, where: Path) -> tuple[str, tuple[float, ...]]:
         params = params[:12]
     elif model in (None, "FULL_OPENCV"):
         what = f"lens {lens.kind}" + " with thin prisms" * (model is not None)
-        raise ValueError(f"{where} has no lidar, and COLMAP, which finds depths in pictures, has no {what} as its cameras have; add lidar")
+        raise ValueError(f"{where} has no lidar, and COLMAP, which would find depths in its pictures, knows no {what}; add lidar")
     return model, params
 
 

@@ -50,7 +50,7 @@ def check_enough(path: Path) -> None:
         raise ValueError(f"{path} {'holds' if path.is_dir() else 'is'} {unread}, which are not read; export them as .jpg")
     if 0 < count < FEWEST:
         what = f"{'holds' if path.is_dir() else 'is'} {count} photo{'s' * (count > 1)}"
-        raise ValueError(f"{path} {what}, and a world is made of at least {FEWEST} of one place; give a folder of as many")
+        raise ValueError(f"{path} {what}, and a reconstruction needs at least {FEWEST} of one place; give a folder of as many")
 
 
 def _photos(path: Path) -> list[Path]:
@@ -191,5 +191,5 @@ def _frames(path: Path, folder: Path) -> dict[str, int]:
             write_image(folder / f"{i:06d}.jpg", frame)
             times[f"{i:06d}.jpg"] = last = time_us
     if len(times) < FEWEST:
-        raise ValueError(f"{path} has {count} frames; a world needs at least {FEWEST}")
+        raise ValueError(f"{path} has {count} frames; a reconstruction needs at least {FEWEST}")
     return times

@@ -96,7 +96,7 @@ def read_model(folder: Path) -> Model:
     except (RuntimeError, ValueError, IndexError, MemoryError) as problem:
         if FIX in str(problem):
             raise
-        raise ValueError(f"{folder} is not a whole COLMAP model ({_first_line(problem)}); export it again") from None
+        raise ValueError(f"{folder} is not a valid COLMAP model ({_first_line(problem)}); export it again") from None
     if is_one_a_picture(found):
         found = share_lenses(colmap, found, folder)
     place = {key: i for i, key in enumerate(sorted(found.points3D))}

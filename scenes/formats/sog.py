@@ -55,7 +55,7 @@ def load_sog(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussian
                     return clean(_read(path, lambda name: _unzipped(path, bundle, inside + name)), str(path))
             # zipfile seeks where the file says, reads what it has no name for, and asks for passwords
             except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as error:
-                raise ValueError(f"{path} is not a whole SOG file: {error}") from error
+                raise ValueError(f"{path} is not a valid SOG file: {error}") from error
     folder = path if path.is_dir() else path.parent
     return clean(_read(path, lambda name: (folder / name).read_bytes()), str(path))
 

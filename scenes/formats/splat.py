@@ -24,7 +24,7 @@ def load_splat(path: str | os.PathLike, clean: Callable[[Gaussians, str], Gaussi
     path = Path(path)
     size = path.stat().st_size
     if size % _RECORD.itemsize:
-        raise ValueError(f"{path} is not a whole .splat file: its {size} bytes are not a multiple of {_RECORD.itemsize}")
+        raise ValueError(f"{path} is not a valid .splat file: its {size} bytes are not a multiple of {_RECORD.itemsize}")
     records = np.memmap(path, _RECORD, "r") if size else np.zeros(0, _RECORD)
     log_scales = log_scales_from(records["scales"])
     rgba = records["rgba"]

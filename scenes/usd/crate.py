@@ -34,9 +34,9 @@ def check_crate(path: Path) -> None:
     try:
         _check(data)
     except (struct.error, IndexError, OverflowError) as error:
-        raise ValueError(f"{path} is not a whole USD file: it ends before what it claims to hold") from error
+        raise ValueError(f"{path} is not a valid USD file: it ends before what it claims to hold") from error
     except ValueError as error:
-        raise ValueError(f"{path} is not a whole USD file: {error}") from error
+        raise ValueError(f"{path} is not a valid USD file: {error}") from error
 
 
 def _mapped(path: Path) -> memoryview:

@@ -63,7 +63,7 @@ def open_stage(path: Path) -> Iterator[Usd.Stage]:
                     stale.Reload()
             yield stage
         except Tf.ErrorException as error:
-            raise ValueError(f"{path} is not a whole USD file: {first_line(error)}") from error
+            raise ValueError(f"{path} is not a valid USD file: {first_line(error)}") from error
         except ValueError as error:  # of a prim, which may stand in one of many files
             if str(path) in str(error):
                 raise

@@ -132,7 +132,7 @@ class Marking:
 
 def test_a_folder_of_pictures_becomes_one(tmp_path, pictures, capsys):
     assert enhance_video(pictures, tmp_path / "out", Marking()) == (3, 0)
-    assert "say where by --instances" in capsys.readouterr().err
+    assert "--instances where objects were inserted" in capsys.readouterr().err
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["f10.png", "f8.png", "f9.png"]
     assert torch.equal(read_image(tmp_path / "out" / "f9.png"), read_image(pictures / "f9.png"))
     with pytest.raises(ValueError, match=r"out.mp4 would be a video; pictures become pictures: name a folder, as -o .*/out"):
@@ -243,13 +243,13 @@ def test_ids_that_do_not_fit_are_refused(tmp_path, pictures, capsys):
     for i in range(3):
         np.save(folder / f"{i}.npy", np.zeros((34, 50), np.int32))
     enhance_video(pictures, tmp_path / "same", Marking(), instances=folder)
-    assert f"{folder} tells of no object" in capsys.readouterr().err
+    assert f"{folder} has no object" in capsys.readouterr().err
     np.save(folder / "1.npy", np.zeros((30, 50), np.int32))
     refused(r"1.npy has ids of the shape \[30, 50\], but its picture is 34 rows of 50; resize them to 50x34 by nearest neighbour")
     np.save(folder / "1.npy", np.zeros((34, 50)))
     refused("1.npy holds float64; ids are whole numbers")
     np.save(folder / "1.npy", np.arange(34 * 50, dtype=np.int32).reshape(34, 50))
-    refused("1.npy tells of 1699 objects.*without soft edges")
+    refused("1.npy has 1699 objects.*without soft edges")
     (folder / "1.npy").write_bytes(b"none")
     refused("1.npy is not an array")
     with (folder / "1.npy").open("wb") as file:
@@ -313,7 +313,7 @@ def test_ids_are_counted_against_frames_that_came_and_not_those_that_a_video_cla
 def test_a_model_that_cannot_be_told_says_so(tmp_path, pictures):
     deaf = Marking()
     deaf.reads, deaf.about = (), {"model": "NVIDIA Fixer"}
-    with pytest.raises(ValueError, match="NVIDIA Fixer cannot be told where objects are; leave --instances out"):
+    with pytest.raises(ValueError, match="NVIDIA Fixer takes no instance masks; leave out --instances"):
         enhance_video(pictures, tmp_path / "out", deaf, instances=pictures)
 
 
@@ -347,11 +347,11 @@ def test_rendered_frames_are_given_what_photos_show(street, tmp_path):
 def test_it_is_said_where_no_frame_was_changed(tmp_path, enhancer, capsys):
     write(tmp_path / "in.mp4")
     enhance_video(tmp_path / "in.mp4", tmp_path / "same.mp4", Enhancer(Net(SMALL)))
-    assert "in.mp4 was changed: if it shows renders, say --rendered" in capsys.readouterr().err
+    assert "in.mp4 was changed: give --rendered if it shows renders" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "photos.mp4", Enhancer(stirred()))
     assert "was changed" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "rested.mp4", Enhancer(stirred(), repair=False), rendered=True)
-    assert "network rests" in capsys.readouterr().err
+    assert "network of these weights is switched off" in capsys.readouterr().err
     enhance_video(tmp_path / "in.mp4", tmp_path / "other.mp4", Enhancer(stirred()), rendered=True)
     assert "was changed" not in capsys.readouterr().err
 

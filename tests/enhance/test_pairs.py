@@ -403,7 +403,7 @@ def test_a_broken_sky_or_asset_is_refused_before_anything_is_reconstructed(stree
 
 def test_pairs_in_a_folder_that_takes_no_files_are_refused_before_anything_is_made(tmp_path, street, recording, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)  # root may write anywhere
-    with pytest.raises(PermissionError, match="cannot write .*/new/pairs: .* takes no files of yours; give a folder of your own"):
+    with pytest.raises(PermissionError, match="cannot write .*/new/pairs: .* is not writable; give a folder of your own"):
         claim_pairs(tmp_path / "new" / "pairs", street, recording, 0, CONFIG)
 
 

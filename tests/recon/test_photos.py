@@ -122,9 +122,9 @@ def test_what_a_mac_leaves_among_photos_is_none(walk, solved, tmp_path):
 
 def test_photos_that_nothing_ties_together_are_refused(walk, solved, tmp_path):
     shutil.copytree(walk / "images", tmp_path / "walk")
-    with pytest.raises(ValueError, match=r"m from one to the next, which is astray; check the scale"):
+    with pytest.raises(ValueError, match=r"m from one to the next, which is implausible; check the scale"):
         open_log(tmp_path / "walk", metres_per_unit=1e5)
-    with pytest.raises(ValueError, match=r"astray; take pictures closer together.*delete .*walk.sfm to begin again"):
+    with pytest.raises(ValueError, match=r"implausible; take pictures closer together.*delete .*walk.sfm to begin again"):
         open_log(tmp_path / "walk", camera_height=2000.0)  # as where the ground seems to lie right beneath
 
 
@@ -213,9 +213,9 @@ def test_too_few_photos_are_told_from_no_drive_at_all(walk, tmp_path):
         open_log(folder)
     for i, said in enumerate(("holds 1 photo,", "holds 2 photos,")):
         shutil.copy(walk / "images" / f"{i:03d}.png", folder)
-        with pytest.raises(ValueError, match=f"few {said} and a world is made of at least 3 of one place; give a folder of as many"):
+        with pytest.raises(ValueError, match=f"few {said} and a reconstruction needs at least 3 of one place; give a folder of as many"):
             open_log(folder)
-    with pytest.raises(ValueError, match="001.png is 1 photo, and a world is made of at least 3"):
+    with pytest.raises(ValueError, match="001.png is 1 photo, and a reconstruction needs at least 3"):
         open_log(folder / "001.png")
 
 

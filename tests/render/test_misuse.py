@@ -150,7 +150,7 @@ def test_what_torch_makes_by_default_changes_nothing(order, request):
         (lambda: SplatModel(dilation=float("inf")), "dilation must be at least 0 px.2 and finite"),
         (
             lambda: rasterize(ahead().map(lambda t: t.clone().requires_grad_()), CAMERA, room=Room()),
-            "a room is for frames without gradients",
+            "room= takes no gradients",
         ),
     ],
 )

@@ -81,9 +81,9 @@ def test_recorded_frames_are_the_bits_of_frames_drawn_one_by_one():
 
 def test_what_cannot_be_recorded_is_refused():
     placed = two_instances(1)
-    with pytest.raises(ValueError, match='"normal" cannot be recorded'):
+    with pytest.raises(ValueError, match='"normal" cannot be captured'):
         Captured(placed, CAMERA, ("normal",))
-    with pytest.raises(ValueError, match='order "pixel" cannot be recorded'):
+    with pytest.raises(ValueError, match='order "pixel" cannot be captured'):
         Captured(placed, CAMERA, model=SplatModel(), config=RenderConfig(max_error=1 / 255))
     with pytest.raises(ValueError, match="must share lens, size"):
         list(Captured(placed, CAMERA).frames([CAMERA.resized(32, 24)]))

@@ -104,7 +104,7 @@ def test_a_corrupt_index_names_the_file_and_the_fix(pictured, tmp_path, change):
     told = json.loads(index.read_text())
     change(told)
     index.write_text(json.dumps(told))
-    with pytest.raises(ValueError, match=r"photos.json is corrupt.*done without photos"):
+    with pytest.raises(ValueError, match=r"photos.json is corrupt.*loads without photos"):
         load_photos(tmp_path / "car.usdc")
 
 

@@ -151,6 +151,6 @@ def test_a_folder_is_made_with_those_above_it_and_refused_where_none_takes_files
     assert made_folder(tmp_path / "a" / "b").is_dir() and made_folder(tmp_path / "a") == tmp_path / "a"
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path / "a")  # root may write anywhere
     for folder in (tmp_path / "a", tmp_path / "a" / "c" / "d"):
-        with pytest.raises(PermissionError, match=rf"cannot write {folder}: .*/a takes no files of yours; give a folder of your own"):
+        with pytest.raises(PermissionError, match=rf"cannot write {folder}: .*/a is not writable; give a folder of your own"):
             made_folder(folder)
     assert listing(tmp_path / "a") == ["b"]

@@ -8,7 +8,7 @@ from scenes.names import FEW, MANY, unknown
 def test_of_many_names_only_the_likest_are_told():
     have = [f"veh_{i}" for i in range(MANY + 80)]
     said = unknown("actor", "veh_130", "s1", have)
-    assert said.startswith('actor "veh_130" is not in s1; it has 100, the likest of which are ')
+    assert said.startswith('actor "veh_130" is not in s1; it has 100, the closest of which are ')
     told = said.split(" are ")[1].split(".")[0].split(", ")
     assert len(told) == FEW and {"veh_13", "veh_30"} <= set(told)
     assert said.endswith("Did you mean veh_10?")

@@ -12,6 +12,6 @@ def test_a_folder_that_takes_no_files_is_told_before_work_begins(tmp_path, monke
     folder.mkdir()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != folder)  # root may write anywhere
     for refuse in (lambda: fresh(folder / "x.mp4", True), lambda: check_free(folder / "scene")):
-        with pytest.raises(PermissionError, match="cannot write .*theirs/.*: .*theirs takes no files of yours; give a folder of your own"):
+        with pytest.raises(PermissionError, match="cannot write .*theirs/.*: .*theirs is not writable; give a folder of your own"):
             refuse()
     assert fresh(tmp_path / "x.mp4", False) == tmp_path / "x.mp4"

@@ -28,7 +28,7 @@ def test_a_placement_says_asset_place_heading_and_speed():
         ("car/0003@12m,3m,yaw=5", '"5" has no unit; write 5deg'),
         ("car/0003@12m,3m,yow=5deg", "Did you mean yaw?"),
         ("car/0003@12m,3m,speed=5m", "a length, not a speed"),
-        ("car/0003@1m,2m,trajectory=t.csv", "a trajectory says it all"),
+        ("car/0003@1m,2m,trajectory=t.csv", "leave out the place"),
         ("car/0003@12m,3m,yaw=5deg,yaw=6deg", "says yaw twice; say it once"),
     ],
 )

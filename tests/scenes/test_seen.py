@@ -46,8 +46,8 @@ def test_each_lens_sees_as_far_as_it_goes(street, lens, place, seen):
     ("rows", "said"),
     [
         ("0,12,0 1,14,0", None),
-        ("0,12,0 0.3,12.5,0", "from 0s to 0.3s after the clip's first frame, and the clip lasts 0.7s: it comes or goes"),
-        ("0.4,12,0 2,14,0", "from 0.4s to 2s after the clip's first frame, and the clip lasts 0.7s: it comes or goes"),
+        ("0,12,0 0.3,12.5,0", "from 0s to 0.3s after the clip's first frame, and the clip lasts 0.7s: it appears or disappears in view"),
+        ("0.4,12,0 2,14,0", "from 0.4s to 2s after the clip's first frame, and the clip lasts 0.7s: it appears or disappears in view"),
         ("0,5,0 0.3,5,30", None),  # it is out of view when it goes
         ("2,12,0 3,14,0", "none of its frames shows it"),
         ("0,-12,0 1,-14,0", "never in view: X is metres forward"),

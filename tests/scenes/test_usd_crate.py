@@ -31,7 +31,7 @@ def test_an_array_that_claims_more_than_the_file_is_refused(crate, claim):
     assert int.from_bytes(data[at : at + 8], "little") == 50
     data[at : at + 8] = claim.to_bytes(8, "little")
     crate.write_bytes(data)
-    with pytest.raises(ValueError, match=rf"a.usdc is not a whole USD file: an array claims {claim} values of 12 bytes"):
+    with pytest.raises(ValueError, match=rf"a.usdc is not a valid USD file: an array claims {claim} values of 12 bytes"):
         load(crate)
 
 
@@ -43,7 +43,7 @@ def test_every_section_is_held_to_its_size(crate):
         start = int.from_bytes(whole[entry + 16 : entry + 24], "little")
         for at in (start, entry + 16, entry + 24):
             crate.write_bytes(whole[:at] + (2**61).to_bytes(8, "little") + whole[at + 8 :])
-            with pytest.raises(ValueError, match="a.usdc is not a whole USD file: it"):
+            with pytest.raises(ValueError, match="a.usdc is not a valid USD file: it"):
                 load(crate)
 
 

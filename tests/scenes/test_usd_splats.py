@@ -248,7 +248,7 @@ def test_cut_and_damaged_usd_files_are_refused(tmp_path):
         with pytest.raises(ValueError, match=f"cut{i}.usdc"):
             load(path)
     (tmp_path / "text.usda").write_text("hello")
-    with pytest.raises(ValueError, match="text.usda is not a whole USD file"):
+    with pytest.raises(ValueError, match="text.usda is not a valid USD file"):
         load(tmp_path / "text.usda")
 
 
