@@ -10,45 +10,42 @@ from __future__ import annotations
 import hashlib
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch.nn import functional as F
 
 from enhance.batch import Batch
-from enhance.correcting.objects import Objects, changed
 from enhance.correcting.seam import usual_changes
-from enhance.correcting.shade import optical_depth, shaded
-from enhance.network.net import Net, NetConfig, photos_of
-from enhance.network.past import Past
-from enhance.network.precision import autocast
+from enhance.network.net import Net, NetConfig
 from enhance.network.weights_file import BUILTIN, REPAIR_GAIN, WORTH, load_net, save_net
 from enhance.pairs.shards import RENDERED, PairSet
 from enhance.photos import Photos
 from enhance.training.ahead import drawn, workers
 from enhance.training.gain import repair_gain
-from enhance.training.losses import PatchPerceptual, flicker, pixel_loss
-from enhance.training.prior import flow_matching_loss
+from enhance.training.losses import PatchPerceptual
 from enhance.training.run import FROZEN, FURTHER, STAGES, Run, TrainConfig, opened
-from enhance.training.samples import Images, Sample, Sampler
-from enhance.training.shade_samples import Grounds
+from enhance.training.samples import Sampler
+from enhance.training.stages import (
+    autoencoder_step,
+    draw_clips,
+    draw_images,
+    draw_right,
+    enhancer_step,
+    objects_step,
+    prior_step,
+    shade_step,
+)
 from scenes.atomic import made_folder
 from scenes.names import unknown
 from scenes.stops import Stops
 
-NEAR_ENOUGH = 3e-4
-"""Squared error of an object's colours below which getting nearer counts for little: 35 dB."""
 USUAL = 1000
 """Objects by which it is told what changes are usual."""
 TAKES = {"objects": "isp or clean pairs, or --photos", "shade": "shadow pairs", "enhancer": f"pairs of {', '.join(RENDERED)}"}
 """What a stage is trained on; all others take any right pictures."""
-SHADE_NEAR_ENOUGH = 1e-3
-"""The same of the ground by an object: about what a missing shadow costs. With less, the fear to shade what is right drowns all else."""
 
 
 def train(
@@ -77,9 +74,9 @@ def train(
               step end and save first.
     photos    folders of images and videos, for the autoencoder, objects' colours and clean frames
     about     written into the weights' header, beside the data's attribution
-    progress  called with the share done, 0..1, and a line of words
+    progress  called with the share done, 0..1, and a status line
     start     weights to train further, "builtin" or a file; their autoencoder is kept
-    only      of STAGES those to train, which takes weights to start from; the others' parts stay as they are
+    only      those of STAGES to train, which needs `start`; the parts of the others stay as they are
     device    where to train; a run may be resumed on another
     vgg       torchvision's vgg16 as a local file, whose features the perceptual loss compares; the autoencoder's own where None
     config    that of the checkpoint, or else `TrainConfig.of` the device, where None
@@ -87,31 +84,18 @@ def train(
     Raises FileExistsError where `out` holds a checkpoint and `resume` is off, or weights alone; ValueError where there is nothing to train
     a stage of `only` on (others are left out then), and where the checkpoint is of a training of something else.
     """
-    budget = steps if minutes is None else minutes
-    if budget is None or (minutes is not None and steps is not None):
-        raise ValueError("give the training budget either as minutes or as steps")
-    if not budget > 0:
-        raise ValueError(f"the training budget must be positive, got {budget}")
-    for stage in only or ():
-        if stage not in STAGES[1:]:
-            raise ValueError(unknown("stage", stage, "what can be trained further", STAGES[1:]))
-    if only and start is None:
-        raise ValueError("a stage alone takes weights to start from; pass start, as builtin")
     out = Path(out)
     checkpoint, weights = out / "checkpoint.pt", out / "enhancer.safetensors"
-    if checkpoint.exists() and not resume:
-        raise FileExistsError(f"{out} holds a training already; go on with it by --resume, or choose another folder")
-    if weights.exists() and not checkpoint.exists():
-        raise FileExistsError(f"{weights} exists already, and no checkpoint of its training to go on from; choose another folder")
-    if resume and not checkpoint.exists():
-        raise FileNotFoundError(f"nothing to resume: {checkpoint} does not exist; run without --resume")
+    _check_budget(minutes, steps)
+    _check_stages(only, start)
+    _check_free(checkpoint, weights, resume)
     pair_set = PairSet(pairs) if isinstance(pairs, str | Path) else pairs
     if config is None:
         config = TrainConfig(**opened(checkpoint)["config"]) if checkpoint.exists() else TrainConfig.of(torch.device(device))
     sampler = Sampler(pair_set, Photos(tuple(photos)) if photos else None, seed, config.kinds)
     if sampler.rendered and sampler.longest < config.frames:
         print(
-            f"the longest training clip has {sampler.longest} of {config.frames} frames: that is as far as is looked back", file=sys.stderr
+            f"the longest training clip has {sampler.longest} of {config.frames} frames, so no more past frames are used", file=sys.stderr
         )
     first = BUILTIN if start == "builtin" else start
     begun, origin = load_net(first) if first is not None else (None, None)
@@ -135,30 +119,67 @@ def train(
     report = _Reporter(run, progress)
     with Stops() as stops:
         go = partial(_stage, run, checkpoint, save_every, report, stops)
-        go("autoencoder", partial(_images, run, sampler), partial(_autoencoder_step, run))
+        go("autoencoder", partial(draw_images, run, sampler), partial(autoencoder_step, run))
         if "autoencoder" in run.stages:
             run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
-        go("prior", partial(_right, run, sampler), partial(_prior_step, run))
-        go("objects", lambda step: sampler.objects(4 * step + 3, config.looked_at), partial(_objects_step, run))
+        go("prior", partial(draw_right, run, sampler), partial(prior_step, run))
+        go("objects", lambda step: sampler.objects(4 * step + 3, config.looked_at), partial(objects_step, run))
         if "objects" in run.stages and not run.passed("objects"):  # else the checkpoint has it
             run.save(checkpoint)  # what follows takes long, and a training that is killed in it must not have been in vain
             _learn_usual(run, sampler, report, stops)
         # its objects are read once and then cheap to draw: further processes would each have to read them
-        go("shade", lambda step: sampler.grounds(step, 2 * config.looked_at), partial(_shade_step, run), processes=0)
+        go("shade", lambda step: sampler.grounds(step, 2 * config.looked_at), partial(shade_step, run), processes=0)
         now = run.net.state_dict()
         frozen = {k: v for k, v in now.items() if k.startswith(FROZEN)}
         run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
         for name, parameter in run.net.named_parameters():
             parameter.requires_grad_(not name.startswith(FROZEN))
-        go("enhancer", partial(_clips, run, sampler), partial(_enhancer_step, run, perceptual))
+        go("enhancer", partial(draw_clips, run, sampler), partial(enhancer_step, run, perceptual))
     run.save(checkpoint)
-    shards = pair_set.of(split="train") if pair_set else []
+    header = {**(about or {}), **_made_of(pair_set, photos, origin), **_made_by(run)}
+    save_net(run.average, weights, {**header, **_gain(run, pair_set, origin, report)})
+    return weights
+
+
+def _made_of(pairs: PairSet | None, photos: Sequence[str | Path], origin: dict | None) -> dict[str, object]:
+    """What the weights' header says of the data they were trained on, and of the weights they go on from."""
+    shards = pairs.of(split="train") if pairs else []
     data: dict[str, object] = {"attribution": sorted({str(s.meta["attribution"]) for s in shards if "attribution" in s.meta})}
     data |= {"clips": len(shards), "photos": [Path(p).name for p in photos]}
-    data |= {"further": origin} if origin is not None else {}
-    made = {**data, "seed": seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
-    save_net(run.average, weights, {**(about or {}), **made, **_gain(run, pair_set, origin, report)})
-    return weights
+    return data if origin is None else data | {"further": origin}
+
+
+def _made_by(run: Run) -> dict[str, object]:
+    """What the weights' header says of the training."""
+    return {"seed": run.seed, "steps": run.step, "minutes": {k: round(v / 60, 1) for k, v in run.seconds.items()}}
+
+
+def _check_budget(minutes: float | None, steps: int | None) -> None:
+    """ValueError where not just one of them is given, and positive."""
+    budget = steps if minutes is None else minutes
+    if budget is None or (minutes is not None and steps is not None):
+        raise ValueError("give the training budget either as minutes or as steps")
+    if not budget > 0:
+        raise ValueError(f"the training budget must be positive, got {budget}")
+
+
+def _check_stages(only: Sequence[str] | None, start: str | Path | None) -> None:
+    """ValueError where `only` names no stage that can be trained alone, or there are no weights to start from."""
+    for stage in only or ():
+        if stage not in STAGES[1:]:
+            raise ValueError(unknown("stage", stage, "what can be trained further", STAGES[1:]))
+    if only and start is None:
+        raise ValueError("training single stages needs weights to fine-tune; pass start, as builtin")
+
+
+def _check_free(checkpoint: Path, weights: Path, resume: bool) -> None:
+    """FileExistsError where a training is there and not resumed, or its weights alone; FileNotFoundError where there is none to resume."""
+    if checkpoint.exists() and not resume:
+        raise FileExistsError(f"{checkpoint.parent} holds a training already; go on with it by --resume, or choose another folder")
+    if weights.exists() and not checkpoint.exists():
+        raise FileExistsError(f"{weights} exists already, and no checkpoint of its training to go on from; choose another folder")
+    if resume and not checkpoint.exists():
+        raise FileNotFoundError(f"nothing to resume: {checkpoint} does not exist; run without --resume")
 
 
 def _stages(only: Sequence[str] | None, usual: Sequence[str], sampler: Sampler) -> list[str]:
@@ -188,25 +209,23 @@ def _gain(run: Run, pairs: PairSet | None, origin: dict | None, report: _Reporte
     trained = "enhancer" in run.stages
     if origin is not None and not (trained and held_out):
         if trained and REPAIR_GAIN in origin:
-            print(
-                f"nothing of these pairs is held out to judge the repairing by: {_works(origin[REPAIR_GAIN])}, as before", file=sys.stderr
-            )
+            print(f"no pairs are held out to measure repairs on; the network: {_works(origin[REPAIR_GAIN])}, as before", file=sys.stderr)
         return {REPAIR_GAIN: origin[REPAIR_GAIN]} if REPAIR_GAIN in origin else {}
 
     def looked_at(count: int, of: int) -> None:
-        report("enhancer", f"looked at {count} of {of} clips for what the repairing gains")
+        report("enhancer", f"measured the gain of repairs on {count} of {of} clips")
 
     gains = repair_gain(run.average, held_out or rendered, looked_at)
     if trained:
         where = "clips that are held out" if held_out else "the clips it was trained on, since none is held out"
-        print(f"on {where} the repairing gains {gains[0]:.2f} dB, and {gains[1]:.2f} beside photos: {_works(gains)}", file=sys.stderr)
+        print(f"on {where} repairs gain {gains[0]:.2f} dB, and {gains[1]:.2f} beside photos; the network: {_works(gains)}", file=sys.stderr)
     return {REPAIR_GAIN: gains}
 
 
 def _works(gains: Sequence[float]) -> str:
     """Where an enhancer of such weights repairs (`Enhancer`), for messages."""
     where = [name for name, gain in zip(("frames without photos", "frames with photos"), gains, strict=True) if gain >= WORTH]
-    return f"it works on {' and '.join(where)}" if where else f"it rests, as less than {WORTH} dB are not worth its time"
+    return f"it works on {' and '.join(where)}" if where else f"it stays off, as less than {WORTH} dB is not worth its time"
 
 
 def _stage(
@@ -240,125 +259,11 @@ def _learn_usual(run: Run, sampler: Sampler, report: _Reporter, stops: Stops) ->
     is kept where it is broken off."""
 
     def drawn(count: int) -> None:
-        report("objects", f"looked at {count} of {USUAL} objects for what changes are usual")
+        report("objects", f"measured the usual changes on {count} of {USUAL} objects")
         stops.end()
 
     run.net.objects.usual.copy_(usual_changes(sampler.objects(3, USUAL, drawn)))
     report("objects")
-
-
-def _images(run: Run, sampler: Sampler, step: int) -> Images:
-    return sampler.images(2 * step, 2 * run.config.images, max(32, run.config.crop * 2 // 3 // 16 * 16))
-
-
-def _autoencoder_step(run: Run, batch: Images, step: int) -> torch.Tensor:
-    x = batch.rgb.contiguous(memory_format=torch.channels_last)
-    torch.manual_seed(run.seed * 1_000_003 + step)
-    with autocast(x.device):
-        y, latent = run.autoencoder(x, noise=0.05)
-    loss = autoencoder_loss(y.float(), x, latent.float())
-    return _update(run, "autoencoder", [loss])
-
-
-def autoencoder_loss(y: torch.Tensor, x: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
-    """Absolute error of the image, of its 4 x 4 means and of its gradients, and latents pulled to zero mean and unit variance."""
-    d = y - x
-    slopes = (d[..., 1:] - d[..., :-1]).abs().mean() + (d[..., 1:, :] - d[..., :-1, :]).abs().mean()
-    spread = latent.mean((0, 2, 3)).square().mean() + (latent.var((0, 2, 3)) - 1).square().mean()
-    return d.abs().mean() + 0.5 * F.avg_pool2d(d, 4).abs().mean() + 0.5 * slopes + 1e-3 * spread
-
-
-def _right(run: Run, sampler: Sampler, step: int) -> Images:
-    return sampler.right(5 * step + 4, run.config.images, run.config.crop)
-
-
-def _prior_step(run: Run, batch: Images, step: int) -> torch.Tensor:
-    right = batch.rgb
-    with torch.no_grad(), autocast(right.device):
-        latents = run.net.encoder(right.contiguous(memory_format=torch.channels_last))
-    generator = torch.Generator(right.device).manual_seed(run.seed * 1_000_003 + step)
-    with autocast(right.device):
-        loss = flow_matching_loss(run.net, run.time, latents.float(), generator)
-    return _update(run, "prior", [loss])
-
-
-def _objects_step(run: Run, batch: Objects, step: int) -> torch.Tensor:
-    with autocast(batch.given.device):
-        coefficients = run.net.objects(batch.evidence)
-    error = (batch.given + changed(batch.given, batch.height, coefficients) - batch.target).square().mean((1, 2))
-    return _update(run, "objects", [torch.log(error + NEAR_ENOUGH).mean()])
-
-
-def _shade_step(run: Run, batch: Grounds, step: int) -> torch.Tensor:
-    dark = shaded(batch.given, optical_depth(batch.places, run.net.objects.shade(batch.read)))
-    error = (dark - batch.target).square().mean((1, 2))
-    return _update(run, "shade", [torch.log(error + SHADE_NEAR_ENOUGH).mean()])
-
-
-CROPS = (1.0, 1.0, 1.5, 2.0)
-"""Sides of the crops that batches are made of, against the smallest: attention must work on small pictures and on large ones."""
-
-
-def _crops(run: Run, step: int) -> tuple[np.random.Generator, float]:
-    """What is drawn for a step beside its sample, and first of it how large its crops are."""
-    rng = np.random.default_rng([run.seed, 7, step])
-    return rng, float(rng.choice(CROPS))
-
-
-def _clips(run: Run, sampler: Sampler, step: int) -> Sample:
-    c = run.config
-    temporal = step % c.temporal_every == 1 and c.frames > 1
-    _, scale = _crops(run, step)
-    count = max(1, round((c.clips if temporal else c.images) / scale**2))
-    return sampler.batch(2 * step + 1, count, min(c.frames, sampler.longest) if temporal else 1, round(c.crop * scale / 16) * 16)
-
-
-def _enhancer_step(run: Run, perceptual: PatchPerceptual, sample: Sample, step: int) -> torch.Tensor:
-    rng, _ = _crops(run, step)
-    total = _update(run, "enhancer", rollout_losses(run.net, sample, perceptual, run.config, rng))
-    decay = min(0.999, (1 + step) / (10 + step))
-    with torch.no_grad():
-        torch._foreach_lerp_(list(run.average.parameters()), list(run.net.parameters()), 1 - decay)
-    return total
-
-
-def rollout_losses(net: Net, sample: Sample, perceptual: PatchPerceptual, c: TrainConfig, rng: np.random.Generator):
-    """Walk through the clips; yields each frame's loss when that frame is done, so that its graph can be freed at once.
-
-    The past has a random number of latents and is, in one clip of four, left unmoved, as in a plain video without flow.
-    """
-    frames = sample.input.shape[1]
-    longest = int(rng.integers(0, net.config.history + 1)) if frames > 1 else 0
-    moved = rng.random() < 0.75
-    past: Past | None = None
-    for t in range(frames):
-        given, target = sample.input[:, t], sample.target[:, t]
-        previous = past.rgb if past is not None else None
-        if past is not None:
-            past = replace(past, latents=past.latents[:, :longest], valid=past.valid[:, :longest])
-            past = past.moved(sample.flow[:, t]) if moved else past
-        with autocast(given.device):
-            out = net(given, sample.mask[:, t], past, photos_of(sample.reference[:, t], sample.trust[:, t]))
-            with torch.no_grad():
-                wanted = net.encoder(target.contiguous(memory_format=torch.channels_last))
-            seen = perceptual(out.rgb, target, rng) if c.perceptual else 0.0
-        loss = pixel_loss(out.rgb, target, c.logarithm) + c.perceptual * seen + c.latent * (out.latent - wanted.float()).abs().mean()
-        if previous is not None:
-            before = sample.target[:, t - 1]
-            loss = loss + c.temporal * flicker(out.rgb, previous, target, before, sample.flow[:, t], sample.visible[:, t])
-        past = out.past
-        yield loss / frames
-
-
-def _update(run: Run, stage: str, losses: Iterable[torch.Tensor]) -> torch.Tensor:
-    optimiser, total = run.optimiser[stage], torch.zeros((), device=run.device)
-    optimiser.zero_grad()
-    for loss in losses:
-        loss.backward()
-        total += loss.detach()
-    torch.nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], 1.0)
-    optimiser.step()
-    return total
 
 
 class _Reporter:

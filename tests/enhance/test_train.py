@@ -60,7 +60,7 @@ def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch
     whole = train(pairs, tmp_path / "whole", steps=12, seed=3, config=QUICK, net=SMALL)
 
     module, steps = sys.modules["enhance.training.train"], []
-    step = module._enhancer_step
+    step = module.enhancer_step
 
     def stop(*arguments):
         steps.append(1)
@@ -68,7 +68,7 @@ def test_a_run_in_two_halves_equals_an_unbroken_one(pairs, tmp_path, monkeypatch
             os.kill(os.getpid(), stopped)
         return step(*arguments)
 
-    monkeypatch.setattr(module, "_enhancer_step", stop)
+    monkeypatch.setattr(module, "enhancer_step", stop)
     with pytest.raises(ends):
         train(pairs, tmp_path / "halves", steps=12, seed=3, config=QUICK, net=SMALL)
     monkeypatch.undo()
@@ -162,7 +162,7 @@ def test_told_objects_are_corrected_alike_on_a_gpu():
 
 def test_a_loss_that_is_not_finite_ends_a_training_before_it_is_saved(pairs, trained, monkeypatch):
     kept = (trained / "checkpoint.pt").read_bytes()
-    monkeypatch.setattr(sys.modules["enhance.training.train"], "pixel_loss", lambda *_: torch.tensor(torch.nan, requires_grad=True))
+    monkeypatch.setattr(sys.modules["enhance.training.stages"], "pixel_loss", lambda *_: torch.tensor(torch.nan, requires_grad=True))
     with pytest.raises(ValueError, match="enhancer's loss is nan"):
         train(pairs, trained, steps=4, config=QUICK, net=SMALL, resume=True)
     assert (trained / "checkpoint.pt").read_bytes() == kept
@@ -287,13 +287,13 @@ def test_what_is_learnt_of_objects_is_kept_before_it_is_asked_what_changes_are_u
 
     def stop(share, line):
         lines.append(line)
-        if "looked at 3" in line:
+        if "changes on 3" in line:
             assert opened(tmp_path / "halves" / "checkpoint.pt")["step"]["objects"] == 4
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         train(pairs, tmp_path / "halves", **only, progress=stop, save_every=10**6)
-    assert "of 60 objects for what changes are usual" in lines[-1]
+    assert "measured the usual changes on" in lines[-1]
     monkeypatch.undo()
     monkeypatch.setattr(sys.modules["enhance.training.train"], "USUAL", 60)
     halves = train(pairs, tmp_path / "halves", **only, resume=True)
@@ -305,7 +305,7 @@ def test_a_longer_budget_begins_no_stage_anew_that_a_later_one_stands_on(pairs, 
     """What the autoencoder and the prior learn is lost on a network that was trained on theirs."""
     first = train(pairs, tmp_path, steps=20, net=SMALL, config=QUICK)
     shorter = opened(tmp_path / "checkpoint.pt")["step"]
-    assert "clips that are held out the repairing gains" in capsys.readouterr().err
+    assert "clips that are held out repairs gain" in capsys.readouterr().err
     train(pairs, tmp_path, steps=60, net=SMALL, config=QUICK, resume=True)
     longer = opened(tmp_path / "checkpoint.pt")["step"]
     assert first.is_file() and longer["enhancer"] > shorter["enhancer"] > 0
