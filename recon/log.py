@@ -62,6 +62,10 @@ class LogCamera:
         """The camera with these of its frames only."""
         return replace(self, files=self.files[frames], times_us=self.times_us[frames], world_from_cam=self.world_from_cam[frames])
 
+    def late_us(self, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+        """Microseconds after a frame's time at which it is read, so many parts of its width and height from its upper left corner."""
+        return ({"rows": down, "columns": across}.get(self.shutter, np.full_like(down, 0.5)) - 0.5) * self.readout_us
+
     def image(self, index: int, width: int | None = None, height: int | None = None) -> np.ndarray:
         """Frame `index` as uint8 sRGB `[H, W, 3]`, area-averaged to `width` x `height`. ValueError naming a file that does not decode."""
         from PIL import Image

@@ -107,7 +107,7 @@ def mounts_by_road(
     """The log with those of the cameras `names` moved up or down and tilted whose pictures of the road, in a span, show that they are
     elsewhere than recorded, as `meta` then says; as it is where none do, or where `sweeps` do not tell the ground. All pictures of the span
     count, also those that a fit holds out, as for the path. `report` is called for each camera."""
-    pairs = {name: _pairs(log.camera(name), span_us) for name in names}
+    pairs = {name: far_pairs(log.camera(name), span_us) for name in names}
     times = [log.camera(name).times_us[k] for name in names for pair in pairs[name] for k in pair]
     street = Street.of(log, sweeps, np.array(times, dtype=np.int64), span_us)
     if street is None:
@@ -123,8 +123,8 @@ def mounts_by_road(
     return as_corrected(log, {REMOUNTED: found}) if found else log
 
 
-def _pairs(camera: LogCamera, span_us: tuple[int, int]) -> list[tuple[int, int]]:
-    """Indices of pictures of the span, and of the first taken `WAY` further on; `PAIRS` of them at most."""
+def far_pairs(camera: LogCamera, span_us: tuple[int, int], most: int = PAIRS) -> list[tuple[int, int]]:
+    """Indices of pictures of the span, and of the first taken `WAY` further on; `most` of them, spread over it."""
     times, places = camera.times_us.numpy(), camera.world_from_cam[:, :2, 3].numpy()
     chosen = np.flatnonzero((times >= span_us[0]) & (times <= span_us[1]))
     pairs = []
@@ -133,7 +133,7 @@ def _pairs(camera: LogCamera, span_us: tuple[int, int]) -> list[tuple[int, int]]
         far = later[np.linalg.norm(places[later] - places[i], axis=1) >= WAY]
         if len(far):
             pairs.append((int(i), int(far[0])))
-    return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, PAIRS).round().astype(int))] if pairs else []
+    return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, most).round().astype(int))] if pairs else []
 
 
 def _off(log: Log, camera: LogCamera, pairs: Sequence[tuple[int, int]], street: Street) -> tuple[float, float] | None:
@@ -209,8 +209,7 @@ def _laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.
         column, row = camera.lens.project(local).numpy().reshape(*spots.shape[:2], 2).transpose(2, 0, 1)
         if row.min() < 0 or column.min() < 0 or row.max() > camera.height or column.max() > camera.width:
             return None
-        part = {"rows": row / camera.height, "columns": column / camera.width}.get(camera.shutter, np.full_like(row, 0.5))
-        late = ((part - 0.5) * camera.readout_us)[..., None]
+        late = camera.late_us(column / camera.width, row / camera.height)[..., None]
     return ndimage.map_coordinates(grey(index).astype(np.float32), [row - 0.5, column - 0.5], order=1, mode="nearest")
 
 

@@ -15,6 +15,7 @@ from recon.log import Log, Sweep, Track
 from recon.mounts import mounts_by_road
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps
+from recon.turned import turned_by_surfaces
 from render.progress import Progress
 
 
@@ -52,6 +53,9 @@ def _corrected(
     if "path" in config.refine:
         with Progress("sweeps") as steps:
             log = aligned(log, sweeps, steps.step)
+    if "surfaces" in config.refine:
+        with Progress("surfaces", total=len(names)) as steps:
+            log = turned_by_surfaces(log, names, _as_in(log, sweeps), span, steps.step)
     if "road" in config.refine:
         with Progress("mounts", total=len(names)) as steps:
             log = mounts_by_road(log, names, _as_in(log, sweeps), span, steps.step)

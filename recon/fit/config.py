@@ -23,10 +23,11 @@ class FitConfig:
     """Steps between densifications."""
     grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
-    refine: tuple[str, ...] = ("path", "road", "gains", *REFINED, "exposures", "limbs")
+    refine: tuple[str, ...] = ("path", "surfaces", "road", "gains", *REFINED, "exposures", "limbs")
     """What is corrected besides the splats and the sky: before the fit the body's path by lidar (`recon/align.py`), where cameras are fixed
-    to it by what they show of the road (`recon/mounts.py`) and how frames were exposed, by what several show (`recon/gains.py`); in it
-    poses and clocks by kind, the cameras' exposures against the first's, and how the limbs of people and animals stand."""
+    to it by what they show of lidar's surfaces (`recon/turned.py`) and of the road (`recon/mounts.py`) and how frames were exposed, by what
+    several show (`recon/gains.py`); in it poses and clocks by kind, the cameras' exposures against the first's, and how the limbs of people
+    and animals stand."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
     dissimilarity: float = 0.2

@@ -17,7 +17,7 @@ from recon.actors import split_points
 from recon.build import _span, assemble, begin, choose
 from recon.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from recon.commands import Recon
-from recon.corrected import REMOUNTED, as_corrected, moved
+from recon.corrected import REMOUNTED, TURNED, as_corrected, moved
 from recon.fit.config import FitConfig
 from recon.fit.fit import BLAME_EVERY, Fit
 from recon.fit.model import Knots, Splats, small_poses
@@ -159,21 +159,30 @@ def test_mounts_that_were_found_are_not_sought_again(drive, tmp_path, monkeypatc
     config, log, out, step = replace(CONFIG, steps=4), open_log(drive), tmp_path / "scene", Fit.step
     name, asked = next(iter(log.cameras)), []
 
+    turned = {name: [0.0, 0.0, 0.0, 0.0, -0.1, 0.0, 0.01]}
+
     def raised(log, names, sweeps, span_us, report):
         asked.append((names, [s.index for s in sweeps]))
         return as_corrected(log, {REMOUNTED: {name: [0.5, 0.0]}})
 
+    def looked_for(log, names, sweeps, span_us, report):
+        asked.append((names, [s.index for s in sweeps]))
+        return as_corrected(log, {TURNED: turned})
+
     monkeypatch.setattr("recon.ready.mounts_by_road", raised)
+    monkeypatch.setattr("recon.ready.turned_by_surfaces", looked_for)
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
         stopped.setattr(Fit, "step", lambda self: os.kill(os.getpid(), signal.SIGINT) if self.step_count == 2 else step(self))
         reconstruct(log, out, size=SIZE, held_out=4, config=config)
     resumed = reconstruct(log, out, size=SIZE, held_out=4, config=config, resume=True)
-    assert asked == [([name], [s.index for s in log.sweeps if s.index not in (2, 6)])], "once, and not by sweeps held out"
-    assert resumed.meta[REMOUNTED] == {name: [0.5, 0.0]}
+    assert asked == [([name], [s.index for s in log.sweeps if s.index not in (2, 6)])] * 2, "once each, and not by sweeps held out"
+    assert resumed.meta[REMOUNTED] == {name: [0.5, 0.0]} and resumed.meta[TURNED] == turned
     off = resumed.rig[name].body_from_cam[:3, 3] - log.rig({name: SIZE})[name].body_from_cam[:3, 3]
-    torch.testing.assert_close(off, torch.tensor([0, 0, 0.5], dtype=torch.float64), atol=0.01, rtol=0)
-    plain = reconstruct(log, tmp_path / "other", size=SIZE, held_out=4, config=config.without("road"))
-    assert REMOUNTED not in plain.meta and len(asked) == 1
+    torch.testing.assert_close(off, torch.tensor([0, 0, 0.6], dtype=torch.float64), atol=0.01, rtol=0)
+    plain = reconstruct(log, tmp_path / "other", size=SIZE, held_out=4, config=config.without("road", "surfaces"))
+    assert REMOUNTED not in plain.meta and TURNED not in plain.meta and len(asked) == 2
+    late = resumed.frame_times(name) - plain.frame_times(name)
+    assert bool((late == 10_000).all()), "its pictures were taken so much later"
 
 
 def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, tmp_path, monkeypatch):
