@@ -49,8 +49,13 @@ device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no CUDA
 print(f"{version}, {torch.get_num_threads()} threads; {device}")
 """
 WARP = """
+import tempfile
 warp.config.quiet = True
-warp.init()
+try:
+    warp.init()
+    tempfile.TemporaryFile(dir=warp.config.kernel_cache_dir)
+except (PermissionError, NotADirectoryError):
+    raise OSError(f"compiled kernels cannot be kept in {warp.config.kernel_cache_dir}") from None
 devices = ", ".join(str(device) for device in warp.get_devices())
 print(f"{version}, kernels run on {devices}; compiled ones are kept in {warp.config.kernel_cache_dir}")
 """
@@ -132,7 +137,7 @@ def report(findings: Iterator[Finding]) -> Iterator[str]:
         need = finding.need
         yield f"{finding.state:<8} {need.name:<{WIDTH}} {finding.said}" + ("" if finding.state == "ok" else f"; for {need.reason}")
         if finding.state != "ok":
-            lacking.append(replace(need, fix=_library(finding.said) or need.fix))
+            lacking.append(replace(need, fix=_cure(finding.said) or need.fix))
     for need in lacking:
         yield f"{'optional' if need.optional else 'needed'}: {need.fix}   # {need.reason}"
     yield UNVERIFIED
@@ -157,8 +162,10 @@ def _found(need: Need) -> Finding:
     return Finding(need, "broken", (why or last)[:200])
 
 
-def _library(said: str) -> str:
-    """How to get the shared library that an import did not find, '' where that is not what is wrong."""
+def _cure(said: str) -> str:
+    """How to get the shared library that an import did not find, or a folder for kernels; '' where that is not what is wrong."""
+    if "kernels cannot be kept" in said:
+        return "export WARP_CACHE_PATH=/tmp/kernels"
     lost = re.match(r"(lib[\w.+-]+\.so)[\w.]*: cannot open shared object file", said)
     if not lost:
         return ""

@@ -20,16 +20,31 @@ import warp as wp
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 
 
+@contextmanager
+def _keeping():
+    """What makes Warp write down compiled kernels: OSError that says how to have another folder, where theirs takes none. Of a full disk
+    Python names no file, and the clip's own would be blamed."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:  # a library that does not load
+            raise
+        told = f"compiled kernels cannot be kept in {wp.config.kernel_cache_dir}: {error.strerror}"
+        raise OSError(f"{told}; name another folder, as WARP_CACHE_PATH=/tmp/kernels sidestep ...") from error
+
+
 def _start() -> None:
     """Start Warp. Where there is no CUDA driver its native code says so on stderr, past every log level; that is no news here."""
     if torch.cuda.is_available():
-        wp.init()
+        with _keeping():
+            wp.init()
         return
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        wp.init()
+        with _keeping():
+            wp.init()
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -115,7 +130,8 @@ def _ready(kernel: wp.Kernel, device: str) -> None:
     said.start()
     try:
         # the block size belongs to what is compiled: with another one, the launch would compile everything once more
-        kernel.module.load(device, block_dim=1 if device == "cpu" else None)
+        with _keeping():
+            kernel.module.load(device, block_dim=1 if device == "cpu" else None)
     finally:
         said.cancel()
 

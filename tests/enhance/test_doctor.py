@@ -45,6 +45,13 @@ def test_a_lost_library_is_named_also_where_its_package_is_not_known():
     assert "libodd.so" in line
 
 
+def test_a_home_that_takes_no_compiled_kernels_asks_for_another_folder_not_for_another_package(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "file"))
+    lines = list(report(examine(tuple(n for n in NEEDS if n.name == "warp-lang"))))
+    assert any(line.startswith("needed: export WARP_CACHE_PATH=") for line in lines), lines
+
+
 def test_nothing_lacking_says_so():
     ok = Finding(need(""), "ok", "1.0")
     assert list(report(iter([ok])))[-1] == "every command has what it needs"

@@ -1,5 +1,9 @@
 """Launching: compiling is said aloud once, and only where it takes a while."""
 
+import errno
+import os
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -9,6 +13,7 @@ import pytest
 import torch
 
 from render import launch
+from scenes.atomic import atomic_file
 
 CPU = torch.device("cpu")
 
@@ -34,6 +39,24 @@ def test_a_kernel_that_is_compiled_is_loaded_silently(capsys):
     launch._ready(Kernel(0.0), "cpu")
     time.sleep(0.1)
     assert capsys.readouterr().err == ""
+
+
+def test_where_compiled_kernels_cannot_be_kept_another_folder_is_asked_for_and_no_clip_is_blamed(tmp_path):
+    def load(device: str, block_dim: int):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    full = Kernel(0.0)
+    full.module.load = load
+    with pytest.raises(OSError, match="kept in .*: No space left on device; .*WARP_CACHE_PATH") as said, atomic_file(tmp_path / "a.mp4"):
+        launch._ready(full, "cpu")
+    assert "a.mp4" not in str(said.value)
+
+
+def test_a_home_that_takes_no_files_is_told_with_what_to_do(tmp_path):
+    (tmp_path / "file").touch()
+    call = [sys.executable, "-c", "import render.launch"]
+    run = subprocess.run(call, env=os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file")}, capture_output=True, text=True)
+    assert f"compiled kernels cannot be kept in {tmp_path / 'file'}" in run.stderr.splitlines()[-1] and "WARP_CACHE_PATH=" in run.stderr
 
 
 def test_a_kernel_is_compiled_once():
