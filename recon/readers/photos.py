@@ -116,6 +116,7 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
             names = _of_one_size(path)
+            _check_whole(path, names)
             pictures = _upright(path, names, partial / "images")
             placed = solve(pictures, names, partial, False, angle_of_view, str(path))
             times = dict.fromkeys(names, 0)
@@ -130,6 +131,14 @@ def _turned(file: Path | Packed) -> bool:
         return False
     with opened(file, str(file), FETCH) as picture:
         return is_turned(picture)
+
+
+def _check_whole(path: Path, names: list[str]) -> None:
+    """ValueError for a photo of which a part is missing, as of a copy that broke off: COLMAP takes what is left of it, and the fit, which
+    does not, begins when all poses are found."""
+    for name in names:
+        with opened(path / name, str(path / name), f"{FETCH}, or take it away") as picture:
+            picture.load()
 
 
 def _upright(path: Path, names: list[str], folder: Path) -> Path:

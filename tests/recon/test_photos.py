@@ -113,6 +113,17 @@ def test_photos_of_a_kind_that_is_not_read_are_said(walk, solved, tmp_path, caps
     assert len(solved[0][0]) == 6 and "left out 1 .HEIC picture, which are not read" in capsys.readouterr().err
 
 
+def test_a_photo_of_which_a_part_is_missing_is_named_before_poses_are_sought(walk, solved, tmp_path):
+    (tmp_path / "walk").mkdir()
+    for file in (walk / "images").iterdir():
+        Image.open(file).save(tmp_path / "walk" / f"{file.stem}.jpg")
+    cut = tmp_path / "walk/002.jpg"
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2 + 300])  # its header, of 600 bytes, is whole
+    with pytest.raises(ValueError, match=r"002\.jpg does not decode as an image .*; fetch the file again, or take it away"):
+        open_log(tmp_path / "walk")
+    assert not solved and not (tmp_path / "walk.sfm").exists()
+
+
 def test_what_a_mac_leaves_among_photos_is_none(walk, solved, tmp_path):
     shutil.copytree(walk / "images", tmp_path / "walk")
     (tmp_path / "walk/._000.png").write_bytes(b"\x00\x05\x16\x07")
