@@ -153,14 +153,17 @@ class Render:
     """Replace existing files."""
 
     def run(self) -> None:
-        for path in (self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
+        fresh(self.output, self.overwrite)
+        from render.video import check_container, odd_warning
+
+        check_container(self.output)  # now: to open a scene, what is put in and its photos takes long
+        for path in (self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
         if self.weights != "builtin" and not self.enhance:
             raise UsageError(f"--weights {self.weights} have no effect without --enhance; add it, or leave out --weights")
         from render.aside import shift_warning
         from render.clip import clip_cameras, clip_times, cut_warning
         from render.record import record, stale_warning
-        from render.video import odd_warning
         from scenes import Databank
         from scenes.files import kind_of
         from scenes.insert import insert

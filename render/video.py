@@ -174,6 +174,12 @@ def read_video(path: str | os.PathLike) -> Video:
     return Video(path)
 
 
+def check_container(path: Path) -> None:
+    """ValueError where no video can have a path's name."""
+    if path.suffix.lower() not in CONTAINERS:
+        raise ValueError(f"{path} must end in {', '.join(CONTAINERS)} to be written as video")
+
+
 def odd_warning(path: str | os.PathLike, width: int, height: int) -> list[str]:
     """What to tell of a video whose sides in pixels are not even: a sentence, or none."""
     if width % 2 == height % 2 == 0:
@@ -193,8 +199,7 @@ class VideoWriter:
     """
 
     def __init__(self, path: str | os.PathLike, fps: float, width: int, height: int, crf: int = 18, pixel_aspect: Fraction = Fraction(1)):
-        if Path(path).suffix.lower() not in CONTAINERS:
-            raise ValueError(f"{path} must end in {', '.join(CONTAINERS)} to be written as video")
+        check_container(Path(path))
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
         self.path, self.fps, self.width, self.height, self.crf, self.count = Path(path), fps, width, height, crf, 0
