@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import shutil
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +30,14 @@ SEED = 0
 WIDEST = math.radians(118)
 """Along the longer side, of a lens that nobody told. A street ahead can be squeezed into a wider one that it was not taken with:
 nine small photos of `lund` had 124 to 133 degrees by four draws of six, and a pixel of error where their own 70 have half of one."""
+
+USUAL, MORE = math.radians(60), 1.25
+"""Angle of view, along the longer side, of a lens that pictures do not tell, between those of phones, dash cameras and cars' own; and
+how many times as many pictures it must place as one that is found. A world begins with two or three pictures of a straight way, one behind
+the other, which any lens fits, and of a highway half of the pictures fit no more to that one."""
+
+MOST_BENT = 0.5
+"""Of a lens, COLMAP's k of a simple radial one: those of dash cameras have some -0.3."""
 
 FEWEST_PLACED = 3
 FIX = "COLMAP models, photos and drives without lidar need pycolmap, which is not installed; get it with: pip install 'sidestep[colmap]'"
@@ -121,8 +132,8 @@ def read_model(folder: Path) -> Model:
 def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None, source: str) -> int:
     """Find the poses of the named pictures and their common lens; writes `workspace`/sparse/0. Returns how many were placed.
 
-    angle_of_view: radians from the left to the right side, where the focal length need not be found; else up to `WIDEST`. source: where the
-    pictures come from, for messages.
+    angle_of_view: radians from the left to the right side, where the focal length need not be found; else up to `WIDEST`, and where that
+    loses too many pictures, `USUAL` (said). source: where the pictures come from, for messages.
     SIFT features, matched between all pictures, or where they are `ordered` (a video) or many between near ones, then incremental mapping
     (Schönberger and Frahm 2016), all on the CPU. The largest of the models is kept. ValueError where it holds too few pictures.
     """
@@ -147,28 +158,78 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
         if angle_of_view is None:
             options.min_focal_length_ratio = 0.5 / math.tan(WIDEST / 2)
         options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = angle_of_view is None
-        made.mkdir()
-        placed = 0
 
-        def tell(count: int) -> None:
-            nonlocal placed
-            placed = count
+        def tell(placed: int) -> None:
             steps.step(0, note=f"poses: {placed} of {len(names)} pictures placed")
 
-        models = colmap.incremental_mapping(
-            database, pictures, made, options,
-            initial_image_pair_callback=lambda: tell(2), next_image_callback=lambda: tell(placed + 1),
-        )  # fmt: skip
-    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    count = 0 if best is None else best.num_reg_images()
+        best, count = _largest(colmap, database, pictures, made, options, tell)
+        said = ""
+        if angle_of_view is None and MORE * count <= len(names):
+            angle = f"{math.degrees(_hold_lens(colmap, database, options)):.0f}deg"
+            steps.step(0, note=f"poses once more, with a lens of {angle}")
+            held, of_held = _largest(colmap, database, pictures, made, options, tell)
+            if held is not None and of_held >= max(MORE * count, FEWEST_PLACED):
+                which = f"a lens of {angle} places {of_held} of {len(names)}, one that is found {count}"
+                fix = f"lengths along its way are right as far as {angle} are: give --angle-of-view where it is known"
+                said = f"{source}: its pictures do not tell how wide its camera sees: {which}; {fix}"
+                best, count = _bent(colmap, held), of_held
+    if said:
+        print(said, file=sys.stderr)
     if best is None or count < max(FEWEST_PLACED, len(names) // 4):
         fix = "take them closer together, with more overlap and things that stand still"
         raise ValueError(f"only {count} of {len(names)} pictures of {source} could be placed; {fix}")
     (workspace / "sparse" / "0").mkdir(parents=True)
     best.write(workspace / "sparse" / "0")
-    shutil.rmtree(made)
     database.unlink()
     return count
+
+
+def _largest(colmap, database: Path, pictures: Path, made: Path, options, tell: Callable[[int], None]) -> tuple[Any, int]:
+    """The model that places the most pictures, None for none, and how many those are; `tell` is told meanwhile."""
+    made.mkdir()
+    placed = 0
+
+    def more(count: int) -> None:
+        nonlocal placed
+        placed = count
+        tell(placed)
+
+    models = colmap.incremental_mapping(
+        database, pictures, made, options,
+        initial_image_pair_callback=lambda: more(2), next_image_callback=lambda: more(placed + 1),
+    )  # fmt: skip
+    shutil.rmtree(made)
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    return best, 0 if best is None else best.num_reg_images()
+
+
+def _hold_lens(colmap, database: Path, options) -> float:
+    """Have the pictures' one lens bend nothing and stay so while they are placed, `USUAL` where they do not say their own in EXIF. Returns
+    its angle of view, from the left to the right side."""
+    with colmap.Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+        focal = camera.params[0] if camera.has_prior_focal_length else max(camera.width, camera.height) / 2 / math.tan(USUAL / 2)
+        camera.params = [focal, camera.width / 2, camera.height / 2, 0.0]
+        opened.update_camera(camera)
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    return 2 * math.atan(camera.width / 2 / focal)
+
+
+def _bent(colmap, model) -> Any:
+    """The model, with how its lens bends found by all pictures together, which two do not tell, its focal length held; as it is where that
+    is more than lenses do (`MOST_BENT`)."""
+    bent, options, config = colmap.Reconstruction(model), colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
+    options.refine_focal_length = options.refine_principal_point = options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    for image in bent.images.values():
+        if image.has_pose:
+            config.add_image(image.image_id)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, config, bent).solve()
+    bent.update_point_3d_errors()
+    return bent if all(abs(camera.params[3]) < MOST_BENT for camera in bent.cameras.values()) else model
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from made_colmap import pictures_along, write_colmap
+from painted import drive as painted_drive
 from PIL import Image
 
 from recon import open_log
@@ -291,6 +292,49 @@ def test_the_same_photos_have_the_same_poses_each_time(shared, tmp_path):
     assert torch.equal(first.camera("camera").world_from_cam, second.camera("camera").world_from_cam)
     assert torch.equal(first.camera("camera").lens.params(), second.camera("camera").lens.params())
     assert np.array_equal(first.points.xyz, second.points.xyz)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    """The folder and names of pictures of a painted street, of a camera that sees 90 degrees."""
+    folder = tmp_path_factory.mktemp("straight")
+    camera = painted_drive([0.0] + [0.6] * 7, ("front",)).cameras["front"]
+    for i in range(len(camera.files)):
+        Image.fromarray(np.asarray(camera.image(i))).save(folder / f"{i:02d}.png")
+    return folder, sorted(p.name for p in folder.iterdir())
+
+
+def test_pictures_that_do_not_tell_their_lens_are_placed_by_a_usual_one(straight, tmp_path, monkeypatch, capsys):
+    """A lens that was found by two pictures that lie one behind the other fits no more of them."""
+    folder, names = straight
+    really, tried = sfm._largest, []
+
+    def largest(colmap, database, pictures, made, options, tell):
+        tried.append(options.ba_refine_focal_length)
+        return (None, 0) if options.ba_refine_focal_length else really(colmap, database, pictures, made, options, tell)
+
+    monkeypatch.setattr(sfm, "_largest", largest)
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names) and tried == [True, False]
+    camera = next(iter(read_model(tmp_path / "sparse/0").cameras.values()))
+    assert camera.params[0] == pytest.approx(160 / math.tan(math.radians(30))) and 0 < abs(camera.params[3]) < sfm.MOST_BENT
+    said = capsys.readouterr().err
+    assert "a lens of 60deg places 8 of 8, one that is found 0;" in said and "give --angle-of-view" in said
+
+
+def test_a_lens_is_not_bent_more_than_lenses_are(straight, tmp_path, monkeypatch):
+    folder, names = straight
+    really = sfm._largest
+    monkeypatch.setattr(sfm, "_largest", lambda *given: (None, 0) if given[4].ba_refine_focal_length else really(*given))
+    monkeypatch.setattr(sfm, "MOST_BENT", 0.0)
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
+    assert next(iter(read_model(tmp_path / "sparse/0").cameras.values())).params[3] == 0
+
+
+def test_pictures_that_tell_their_lens_are_placed_once(straight, tmp_path, monkeypatch, capsys):
+    folder, names = straight
+    monkeypatch.setattr(sfm, "_hold_lens", lambda *_: pytest.fail("placed once more"))
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
+    assert "--angle-of-view" not in capsys.readouterr().err
 
 
 def test_the_folder_one_is_in_is_read_too(walk, solved, tmp_path, monkeypatch):
