@@ -58,8 +58,9 @@ LIKELY = (0.005, 0.005, 0.005, 0.05, 0.05, 0.05, 0.01)
 FEWEST, ROUNDS = 150, 4
 """Pieces that have to be found again for a camera's mount to be told, and how often they are looked for at most."""
 
-LEAST, SURE = 0.004, 8.0
-"""Radians by which pieces have to lie beside where the recorded mount shows them for it to be corrected, and standard errors of that."""
+LEAST, SURE = 0.009, 8.0
+"""Radians by which pieces have to lie beside where the recorded mount shows them for it to be corrected, and standard errors of that. With
+less a fit copes by itself, and what is found depends on the span."""
 
 DONE = 0.0003
 """Radians of the same below which a correction changes no more."""

@@ -111,7 +111,7 @@ def few(monkeypatch):
 
 @pytest.mark.parametrize(
     ("off", "late_us"),
-    [((0, 0.0087, 0, 0, 0, 0), 0), ((0, 0, 0.0175, 0, 0, 0), 0), ((-0.005, 0.004, 0, 0.05, 0.05, 0), 0), (STILL, -40_000)],
+    [((0, 0.0131, 0, 0, 0, 0), 0), ((0, 0, 0.0175, 0, 0, 0), 0), ((-0.008, 0.006, 0, 0.05, 0.05, 0), 0), (STILL, -40_000)],
     ids=["aside", "rolled", "of all a little", "early"],
 )
 def test_a_camera_that_looks_elsewhere_is_turned_back(off, late_us, capsys):
@@ -127,6 +127,11 @@ def test_a_camera_that_looks_elsewhere_is_turned_back(off, late_us, capsys):
     assert torch.equal(again.camera("front").world_from_cam, better.camera("front").world_from_cam)
     assert torch.equal(again.camera("front").times_us, better.camera("front").times_us)
     assert again.meta[TURNED] == better.meta[TURNED]
+
+
+def test_what_a_fit_copes_with_is_left_to_it():
+    log = drive((0.0, 0.004, 0.0, 0.0, 0.0, 0.0))
+    assert turned_by_surfaces(log, ["front"], log.sweeps, ALL) is log
 
 
 @pytest.mark.parametrize("readout_us", [0, 60_000])
