@@ -1,5 +1,9 @@
 """What is done to told objects, frame by frame: their colours and missing shadows, as `ObjectNet` finds them, and what they have of noise
-and sharpening beyond what is around them; held steady over a clip."""
+and sharpening beyond what is around them; held steady over a clip.
+
+A camera's noise comes first, then its colours' gains, sharpening, and the curves that make a picture of light. So the colours are put right
+first, curves and gains in one, then sharpening is undone in linear light, and then there is the noise as the sensor had it.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
-from enhance.correcting.grain import Excess, Grain, of_object, usual_of, without
+from enhance.correcting.grain import Grain, of_object, sharpening, unsharpened
+from enhance.correcting.noise import denoised, variances
 from enhance.correcting.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, reaching_over, spots, whole_of
 from enhance.correcting.seam import fitted
 from enhance.correcting.shade import NONE, optical_depths, read_ground, shaded
@@ -21,22 +27,32 @@ SLIGHT = 4 / 255
 one half as large again four fifths are made (`_surely`)."""
 FILLS = 0.8
 """Share of the frame from which an object keeps its colours: what little is around one that large tells nothing for sure on new places."""
+USUAL_NOISE, LEAST_NOISE = 2.0, 2e-5
+"""Noise variance that a right object may have: to that of what is around it, and beside, about a level of 255 in middle grey."""
+BESIDE = 8
+"""Pixels beside an object's box that are looked at to take noise and sharpening from it."""
 DEEP = 0.25
 """Optical depth up to which an object that lacks no more anywhere has its shadow; of one half as deep again four fifths are drawn."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Of one object, the mean over the last frames: coefficients `[15]` of its colours, optical depths of its missing shadow, its grain and
-    what that should be (None where too little tells); and in how many frames it was seen."""
+    """Of one object, the mean over the last frames, each None where too little tells; and in how many frames it was seen.
+
+    colours  coefficients `[15]` (`changed`)
+    depths   optical depths of its missing shadow
+    grain    its own, and what that should be
+    noise    `[2]`: the noise variance of it and of what is around it, once its colours are right (`variances`)
+    """
 
     colours: torch.Tensor
     depths: torch.Tensor
     grain: tuple[Grain, Grain] | None
+    noise: torch.Tensor | None
     count: int
 
     def followed(self, new: Correction | None) -> Correction:
-        """After one more frame, in which it was looked at anew, or not."""
+        """After one more frame, in which it was looked at anew, or not; its noise is looked at afterwards (`with_noise`)."""
         if new is None:
             return replace(self, count=self.count + 1)
         share = 1 / min(self.count + 1, STEADY)
@@ -44,15 +60,20 @@ class Correction:
         grain = self.grain or new.grain
         if self.grain is not None and new.grain is not None:
             grain = self.grain[0].toward(new.grain[0], share), self.grain[1].toward(new.grain[1], share)
-        return Correction(colours, depths, grain, self.count + 1)
+        return Correction(colours, depths, grain, self.noise, self.count + 1)
 
-    def excess(self) -> Excess | None:
-        """What it has of noise and sharpening that is no texture; None where nothing."""
-        if self.grain is None:
-            return None
-        given, wanted = self.grain
-        excess = Excess.of(given, wanted).beyond(usual_of(given.power))
-        return excess if excess.any() else None
+    def with_noise(self, found: tuple[float, ...] | None) -> Correction:
+        """After its noise was looked at in the frame that it followed last."""
+        if found is None:
+            return self
+        noise = torch.tensor(found, dtype=torch.float64)
+        return replace(self, noise=noise if self.noise is None else torch.lerp(self.noise, noise, 1 / min(self.count, STEADY)))
+
+    def excess(self) -> tuple[float, float]:
+        """How much it was sharpened (`sharpening`), and the noise variance that it has beyond what is usual once that is undone."""
+        sharpened = 0.0 if self.grain is None else sharpening(*self.grain)
+        own, around = (0.0, 0.0) if self.noise is None else self.noise.tolist()
+        return sharpened, max(0.0, own - USUAL_NOISE * around - LEAST_NOISE) / (1 + sharpened) ** 2
 
 
 Corrections = Mapping[int, Correction]
@@ -67,11 +88,16 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     found = {i: box for i, box in boxes(instance).items() if not _fills(instance, i, box)}
     if not found:
         return rgb, {}
-    after = _looked_at(net, rgb, instance, found, before)
+    counts = {i: before[i].count if i in before else 0 for i in found}
+    due = {i: found[i] for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0}  # not all in the same frame
+    over = reaching_over(instance) if due else instance
+    new = _looked_at(net, rgb, instance, over, due)
+    after = {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
     out = rgb.clone()
-    _calm(out, instance, found, after)
     _shade(out, instance, found, after)
     _recolour(out, instance, found, after)
+    after |= _with_noise(out, over, due, after)
+    _calm(out, instance, found, after)
     return out, after
 
 
@@ -81,41 +107,53 @@ def _fills(instance: torch.Tensor, i: int, box: Box) -> bool:
     return part.numel() > FILLS * instance.numel() and int((part == i).sum()) > FILLS * instance.numel()
 
 
-def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], before: Corrections) -> Corrections:
-    """Objects' corrections after this frame: those that are due are looked at anew."""
-    counts = {i: before[i].count if i in before else 0 for i in found}
-    due = [i for i, count in counts.items() if count < STEADY or (count + i) % STEADY == 0]  # not all in the same frame
-    new: dict[int, Correction] = {}
-    if due:
-        whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
-        over = reaching_over(instance)
-        for i in due:
-            box = found[i]
-            part, edge, beyond = (x[..., box.outer_rows, box.outer_columns] for x in (rgb, instance, over))
-            for ids in (edge, beyond):
-                mask = ids == i
-                at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
-                y, x = at.yx.unbind(1)
-                read.append(evidence(part[:, y, x].T, at, whole))
-                seams.append((part, ids, i, at.edges, box))
-            places, (y, x) = box.ground(edge <= 0)
-            around.append(read_ground(rgb[:, y, x].T, places))
-            grains.append(of_object(part.permute(1, 2, 0), beyond == i, beyond <= 0))
-        fits = [fitted(*seam, guess, net.usual) for seam, guess in zip(seams, net(Evidence.stacked(read)), strict=True)]
-        shades = net.shade(torch.stack(around))
-        for i, at_edge, further, shade, grain in zip(due, fits[::2], fits[1::2], shades, grains, strict=True):
-            colours, ends = at_edge.with_beyond(further)
-            new[i] = Correction(colours, ends * shade, grain, 1)
-    return {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
+def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, over: torch.Tensor, due: dict[int, Box]) -> Corrections:
+    """Corrections by this frame alone of the objects that are due, without noise; `over` is `reaching_over` of the ids."""
+    if not due:
+        return {}
+    whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
+    for i, box in due.items():
+        part, edge, beyond = (x[..., box.outer_rows, box.outer_columns] for x in (rgb, instance, over))
+        for ids in (edge, beyond):
+            mask = ids == i
+            at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
+            y, x = at.yx.unbind(1)
+            read.append(evidence(part[:, y, x].T, at, whole))
+            seams.append((part, ids, i, at.edges, box))
+        places, (y, x) = box.ground(edge <= 0)
+        around.append(read_ground(rgb[:, y, x].T, places))
+        grains.append(of_object(part.permute(1, 2, 0), beyond == i, beyond <= 0))
+    fits = [fitted(*seam, guess, net.usual) for seam, guess in zip(seams, net(Evidence.stacked(read)), strict=True)]
+    new = {}
+    for i, at_edge, further, shade, grain in zip(due, fits[::2], fits[1::2], net.shade(torch.stack(around)), grains, strict=True):
+        colours, ends = at_edge.with_beyond(further)
+        new[i] = Correction(colours, ends * shade, grain, None, 1)
+    return new
+
+
+def _with_noise(out: torch.Tensor, over: torch.Tensor, due: dict[int, Box], after: Corrections) -> Corrections:
+    """Corrections of the objects that are due after their noise was looked at in `out` `[3, H, W]`, where their colours are right."""
+    new = {}
+    for i, box in due.items():
+        part, ids = (x[..., box.outer_rows, box.outer_columns] for x in (out, over))
+        new[i] = after[i].with_noise(variances(part, (ids == i, ids <= 0)))
+    return new
 
 
 def _calm(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
     """Take from all objects, in the picture `out` `[3, H, W]`, what they have of noise and sharpening beyond what is around them."""
     for i, box in found.items():
-        excess = after[i].excess()
-        if excess is not None:
-            part, mask = out[:, box.outer_rows, box.outer_columns], instance[box.outer_rows, box.outer_columns] == i
-            part.copy_(torch.where(mask, without(part.permute(1, 2, 0), excess).permute(2, 0, 1), part))
+        sharpened, variance = after[i].excess()
+        if sharpened == 0 and variance == 0:
+            continue
+        rows, columns = (slice(max(0, side.start - BESIDE), side.stop + BESIDE) for side in (box.rows, box.columns))
+        part, mask = out[:, rows, columns], instance[rows, columns] == i
+        light = rgb_to_linear_rgb(part)
+        if sharpened > 0:
+            light = unsharpened(light.permute(1, 2, 0), light.new_full((3,), sharpened)).permute(2, 0, 1)
+        if variance > 0:
+            light = denoised(light, variance)
+        part.copy_(torch.where(mask, linear_rgb_to_rgb(light.clamp(0, 1)), part))
 
 
 def _shade(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:

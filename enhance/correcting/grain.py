@@ -2,7 +2,8 @@
 
 Both show in its finest detail, what a Gaussian of one pixel takes away: sharpening makes it all larger, noise its many small values most.
 So from the mean of its squares and the square of their median, of a picture that has too much of either and of one that has not, both
-follow from two linear equations. Noise then goes by Lee's filter (1980), sharpening by what it was multiplied with. What was blurred stays.
+follow from two linear equations. Noise then goes by Lee's filter (1980), sharpening by its inverse. What was blurred stays. Of objects only
+sharpening is told so: their noise is measured by itself (`enhance.correcting.noise`).
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ MOST = 9.0
 STEPS = 6
 """In which sharpening is undone: of the strongest 0.6 to this power is left where it did least."""
 
-USUAL_GAIN, USUAL_NOISE = 1.2, 0.2
-"""Excess that right objects seem to have beside what is around them, nine of ten up to there: of noise, to their power."""
+USUAL_GAIN = 1.25
+"""Gain that right objects seem to have beside what is around them, nine of ten up to there."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +106,24 @@ def of_object(rgb: torch.Tensor, mask: torch.Tensor, around: torch.Tensor) -> tu
     return given, Grain(power, torch.minimum(floor, ALL * NORMAL * power))
 
 
-def usual_of(power: torch.Tensor) -> Excess:
-    """What right objects of such power seem to have in excess."""
-    return Excess(torch.full_like(power, USUAL_GAIN), USUAL_NOISE * power)
+def sharpening(given: Grain, wanted: Grain) -> float:
+    """How much of what a Gaussian of one pixel takes from an object was added to it beyond what is usual (`Isp.sharpen`): the mean of its
+    channels, which cameras sharpen alike."""
+    usual = Excess(torch.full_like(given.power, USUAL_GAIN), torch.zeros_like(given.power))
+    return (float(Excess.of(given, wanted).beyond(usual).gain.sqrt().mean()) - 1) / KEPT_FINE
 
 
 def without(rgb: torch.Tensor, excess: Excess) -> torch.Tensor:
     """The picture `[H, W, 3]` without what it has in excess, cut to 0..1."""
     gain, noise = (x.to(rgb) for x in (excess.gain, excess.noise))
-    soft = _unsharpened(rgb, (gain.sqrt() - 1) / KEPT_FINE)
+    soft = unsharpened(rgb, (gain.sqrt() - 1) / KEPT_FINE)
     detail, half = _detail(soft), AROUND // 2
     power = F.avg_pool2d(F.pad(detail.square()[None], (half, half, half, half), mode="replicate"), AROUND, 1)[0]
     kept = (power - (noise / gain)[:, None, None]).clamp_min(0) / power.clamp_min(1e-12)
     return (soft + ((kept - 1) * detail).permute(1, 2, 0)).clamp(0, 1)
 
 
-def _unsharpened(rgb: torch.Tensor, amount: torch.Tensor) -> torch.Tensor:
+def unsharpened(rgb: torch.Tensor, amount: torch.Tensor) -> torch.Tensor:
     """The picture `[H, W, 3]` that with `amount` `[3]` of what a Gaussian of one pixel takes from it is this one, by Richardson's steps."""
     if not (amount > 0).any():
         return rgb

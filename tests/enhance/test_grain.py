@@ -6,7 +6,7 @@ import torch
 from torch.nn import functional as F
 
 from enhance.correcting.corrections import correct
-from enhance.correcting.grain import Excess, Grain, of_object, usual_of, without
+from enhance.correcting.grain import Excess, Grain, of_object, sharpening, without
 from enhance.correcting.objects import ObjectNet
 from enhance.metrics import sharpness
 from enhance.pairs.isp import Isp
@@ -111,9 +111,9 @@ def test_small_objects_and_flat_pictures_tell_nothing():
     mask = torch.zeros(60, 80, dtype=torch.bool)
     mask[10:50, 10:60] = True
     grain = of_object(flat, mask, ~mask)
-    assert grain is not None and not Excess.of(*grain).beyond(usual_of(grain[0].power)).any()
+    assert grain is not None and sharpening(*grain) == 0 and not Excess.of(*grain).any()
     noisy = torch.where(mask[..., None], altered(flat, noise=0.04), flat)  # a grey object on a grey wall
     grain = of_object(noisy, mask, ~mask)
     assert grain is not None
-    better = without(noisy, Excess.of(*grain).beyond(usual_of(grain[0].power)))
+    better = without(noisy, Excess.of(*grain))
     assert torch.isfinite(better).all() and psnr(better, flat, mask) > psnr(noisy, flat, mask)

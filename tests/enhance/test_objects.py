@@ -124,7 +124,7 @@ def test_an_object_s_corrections_are_averaged_over_frames():
 
 def test_an_object_long_known_is_looked_at_rarely():
     net, (rgb, instance) = stirred(), scene()
-    known = {5: Correction(torch.zeros(COEFFICIENTS), torch.zeros(KNOTS), None, STEADY)}
+    known = {5: Correction(torch.zeros(COEFFICIENTS), torch.zeros(KNOTS), None, None, STEADY)}
     looks = []
     for _ in range(2 * STEADY):
         _, after = correct(net, rgb, instance, known)
@@ -177,7 +177,7 @@ def added(colours=0.0, depth=0.0):
     _, instance = scene()
     rgb, coefficients = torch.full((3, 64, 96), 0.5), torch.zeros(COEFFICIENTS)
     coefficients[:3] = colours
-    known = {5: Correction(coefficients, torch.full((KNOTS,), depth), None, STEADY + 1)}  # of which none is due in this frame
+    known = {5: Correction(coefficients, torch.full((KNOTS,), depth), None, None, STEADY + 1)}  # of which none is due in this frame
     difference = (correct(ObjectNet(), rgb, instance, known)[0] - rgb).abs()
     return float(difference[:, instance == 5].max()), float(difference[:, instance != 5].max())
 
