@@ -329,7 +329,8 @@ def test_nothing_is_left_standing_where_something_drove(drive, monkeypatch):
     stays = ~(fit.population.swept.holds(fit.splats) | fit.population.clear.holds(fit.splats))
     assert not stays[:20].any() and stays[20:].float().mean() > 0.9
     monkeypatch.setattr("recon.fit.population.halves", lambda *told: ([], []))  # which would change the cars
-    monkeypatch.setattr("recon.fit.population.pennants", lambda splats, *told: torch.zeros(len(splats), dtype=torch.bool))
+    for hanging in ("curtains", "pennants"):  # which beyond the pictures' borders there are
+        monkeypatch.setattr(f"recon.fit.population.{hanging}", lambda splats, *told: torch.zeros(len(splats), dtype=torch.bool))
     fit.population.guess(fit._shown)
     tensors = fit.population.descent.tensors()
     assert torch.equal(tensors["moments"][:, 1], squares[stays]) and torch.equal(tensors["last"], last[stays])

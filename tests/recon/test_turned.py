@@ -111,8 +111,8 @@ def few(monkeypatch):
 
 @pytest.mark.parametrize(
     ("off", "late_us"),
-    [((0, 0.0131, 0, 0, 0, 0), 0), ((0, 0, 0.0175, 0, 0, 0), 0), ((-0.008, 0.006, 0, 0.05, 0.05, 0), 0), (STILL, -40_000)],
-    ids=["aside", "rolled", "of all a little", "early"],
+    [((0, 0.0131, 0, 0, 0, 0), 0), ((-0.008, 0.006, 0.008, 0.05, 0.05, 0), 0), (STILL, -40_000)],
+    ids=["aside", "of all a little", "early"],
 )
 def test_a_camera_that_looks_elsewhere_is_turned_back(off, late_us, capsys):
     log, reports = drive(off, late_us), []
