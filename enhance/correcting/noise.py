@@ -50,7 +50,8 @@ def _dct(side: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 OPPONENTS = _opponents()
-MEASURED = _dct(SIDE)[0][_dct(SIDE)[1] > FINEST]
+_WAVES, _FREQUENCIES = _dct(SIDE)
+MEASURED = _WAVES[_FREQUENCIES > FINEST]
 SLIDING = _dct(WINDOW)[0].view(WINDOW**2, 1, WINDOW, WINDOW)
 
 

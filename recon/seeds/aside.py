@@ -16,7 +16,7 @@ from recon.frames import Frames
 from recon.log import Log
 from recon.project import project
 from recon.seeds.carpet import NEAR_GROUND
-from recon.seeds.points import Cloud
+from recon.seeds.points import Cloud, middle_colours, one_a_voxel
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
@@ -38,14 +38,11 @@ CELL = 0.1
 VIEWS = 24
 """Of a camera, spread over the drive, from beside which it is asked."""
 
-ALIKE = 9
-"""Known points nearest to one, whose middle colour, channel by channel, it takes."""
-
 
 def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, ground: Ground) -> Cloud:
     """Those of world points `[N, 3]` that stand off the ground and the path and lie in no training view's frustum, but in that of one moved
     aside, with the colours of what is `known` around them; at most one a cell."""
-    points = points[_first_of_cells(points)]
+    points = points[one_a_voxel(points, CELL)]
     path = cKDTree(log.ego.world_from_body[:, :2, 3].numpy())
     off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy() > NEAR_GROUND
     points = points[off & (path.query(points[:, :2], workers=2)[0] > CLEAR)]
@@ -61,15 +58,7 @@ def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, 
         points = points[~_in_view(points, frames.camera(log, view), np.inf)]
     if not len(points):
         return Cloud.cat([])
-    nearest = cKDTree(known.xyz).query(points, range(1, min(ALIKE, len(known.xyz)) + 1), workers=2)[1]
-    return Cloud(points, np.median(known.rgb[nearest], axis=1))
-
-
-def _first_of_cells(points: np.ndarray) -> np.ndarray:
-    """Indices of one point of each cell."""
-    cells = np.floor(points / CELL).astype(np.int64)
-    cells -= cells.min(0, initial=0)
-    return np.sort(np.unique(cells @ np.array([1, 1 << 21, 1 << 42]), return_index=True)[1])
+    return Cloud(points, middle_colours(known.xyz, known.rgb, points))
 
 
 def _moved(camera: Camera, by: torch.Tensor) -> Camera:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.seeds.points import Cloud, alike
+from recon.seeds.points import Cloud, alike, middle_colours
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
 from scenes.trajectory import Trajectory
@@ -29,9 +29,6 @@ NEAR_GROUND = 0.25
 LYING = 0.08
 """Metres from the ground's height within which a point is surely the ground's: above lie tyres and the sills of parked cars."""
 
-ALIKE = 9
-"""Points beside a splat whose middle colour, channel by channel, it takes."""
-
 LOGIT = 2.0
 """Of the opacity."""
 
@@ -50,8 +47,7 @@ def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: i
         spacing *= max(WIDER, (len(xy) / most) ** 0.5)
     if not len(xy):
         return Gaussians.empty(sh_count)
-    _, nearest = cKDTree(cloud.xyz[lying, :2]).query(xy, range(1, min(ALIKE, int(lying.sum())) + 1), workers=2)
-    rgb = np.median(cloud.rgb[lying][nearest], axis=1)
+    rgb = middle_colours(cloud.xyz[lying, :2], cloud.rgb[lying], xy)
     means = np.column_stack([xy, ground.height(torch.from_numpy(xy)).numpy()])
     return alike(means, rgb, (WIDE * spacing, WIDE * spacing, 0.1 * spacing), LOGIT, sh_count)
 

@@ -23,6 +23,9 @@ OPACITY = 0.7
 THICKNESS = 0.25
 """Of a seed across its surface, as a part of its width."""
 
+AROUND = 9
+"""Points of known colour nearest to one that no picture shows, whose middle colour it takes."""
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -154,12 +157,24 @@ def thin(cloud: Cloud, distance: np.ndarray, budget: int) -> tuple[Cloud, np.nda
 def _voxels(xyz: np.ndarray, distance: np.ndarray, k: float) -> tuple[np.ndarray, np.ndarray]:
     level = np.round(2 * np.log2(np.maximum(k * distance / 0.04, 1.0))).astype(np.int64)
     side = 0.04 * 2.0 ** (level / 2)
-    key = level
+    return one_a_voxel(xyz, side, level), side
+
+
+def one_a_voxel(xyz: np.ndarray, side: np.ndarray | float, level: np.ndarray | int = 0) -> np.ndarray:
+    """Indices, in their order, of the first of points `[N, 3]` in each voxel of `side` metres, one or `[N]`; of other `level`s, one or
+    `[N]`, voxels are others."""
+    key = np.broadcast_to(np.int64(level), len(xyz))
     for places in xyz.T:  # a long drive's cells, of 4 cm, have too many bits to be packed blindly
         cell = np.floor(places / side).astype(np.int64)
         cell -= cell.min(initial=0)
         key = key * (int(cell.max(initial=0)) + 1) + cell
-    return np.sort(np.unique(key, return_index=True)[1]), side
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def middle_colours(places: np.ndarray, rgb: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Channel by channel the middle of the colours `[N, 3]` of the `AROUND` of `places` `[N, D]` nearest to each of `at` `[M, D]`."""
+    nearest = cKDTree(places).query(at, range(1, min(AROUND, len(places)) + 1), workers=2)[1]
+    return np.median(rgb[nearest], axis=1)
 
 
 def fewer(splats: Gaussians, count: float) -> Gaussians:
