@@ -15,7 +15,7 @@ from scenes.options import AnyPath, Axis, Flag, Name, Overwrite, Replacement, Re
 from scenes.warnings import warn
 
 if TYPE_CHECKING:
-    from scenes.usd.edit import Undone
+    from scenes.usd.undo import Undone
 
 Value = TypeVar("Value")
 
@@ -142,7 +142,7 @@ class Edit:
         if not asked and not self.undo:
             raise UsageError("nothing to do: give --remove, --shift, --replace or --retime, as --remove veh_12, or --undo an edit")
         from scenes.alone import alone
-        from scenes.usd.edit import undone
+        from scenes.usd.undo import undone
 
         with ExitStack() as stack:
             stack.enter_context(alone(self.scene))

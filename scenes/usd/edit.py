@@ -1,33 +1,32 @@
 """Edits of a scene folder: layers that add, change and remove actors, and leave the files of everything else as they were.
 
 edits/<name>.usda is the edit; edits/<name>/ holds the splats that it brings, and says which ones of the background it hides. Deleting
-the layer undoes it; `undo` tidies up too.
+the layer undoes it; scenes/usd/undo.py also deletes its files.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.alone import alone
 from scenes.asset import Actor
-from scenes.atomic import atomic_file, atomic_folder, need_folder
+from scenes.atomic import atomic_folder
 from scenes.deformation import Deformation
 from scenes.edit import Edit, bared, check_edit, ghosts
-from scenes.names import unknown
 from scenes.scene import Scene
+from scenes.usd.actors import all_actor_prims, author_actor, author_path, defines
 from scenes.usd.deformation import author_weights
+from scenes.usd.edit_layers import is_edit_name
 from scenes.usd.layers import new_stage, open_stage, own_data, set_own_data, valid_names
-from scenes.usd.root import RECORDED, add_sublayer, drop_sublayer
-from scenes.usd.scene import author_actor, author_path, defines, load_recorded, read_edits, read_metadata
+from scenes.usd.metadata import read_metadata
+from scenes.usd.root import add_sublayer
+from scenes.usd.scene import load_recorded
 from scenes.usd.splats import only_splats, save_asset, to_json
+from scenes.usd.undo import clear_aside
 
 BUILDERS = {
     Sdf.ValueTypeNames.FloatArray: Vt.FloatArrayEditBuilder,
@@ -36,9 +35,6 @@ BUILDERS = {
     Sdf.ValueTypeNames.Half3Array: Vt.Vec3hArrayEditBuilder,
 }
 """What edits an array of a type."""
-
-ASIDE = ".undone."
-"""How a folder's name begins in which the files of edits lie that are being undone."""
 
 
 def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict) -> None:
@@ -54,7 +50,7 @@ def add_edit(scene: str | Path, name: str, actors: Sequence[Actor], meta: dict) 
 
 def _add(scene: Path, name: str, actors: Sequence[Actor], meta: dict) -> None:
     origin = int(read_metadata(scene)["origin_us"])
-    _sweep(scene)
+    clear_aside(scene)
     standing, taken = _prims(scene)
     for actor in actors:
         if actor.track in standing:
@@ -128,75 +124,6 @@ def _in_step(actor: Actor, recorded: Scene) -> Deformation | None:
     return was.deformation and was.deformation.later(int(actor.trajectory.times_us[0] - was.trajectory.times_us[0]))
 
 
-@dataclass(frozen=True)
-class Undone:
-    """An edit that was taken out of a scene folder."""
-
-    name: str
-    idle: tuple[str, ...]
-    """Edits that changed only actors which it brought, and went with it."""
-    held: dict[str, list[str]]
-    """Later edits that moved an actor from where this one had put it, and still do, as what it made of it; and which actors."""
-
-
-def undo(scene: str | Path, name: str) -> list[str]:
-    """Take one edit out of a scene folder, as `undone` does; returns the names of those that went with it."""
-    with undone(scene, [name]) as (gone,):
-        return list(gone.idle)
-
-
-@contextmanager
-def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
-    """Take edits out of a scene folder, with all their files, for a block that changes it further; where that fails they are back.
-
-    Also one whose layer was deleted by hand. With each go the edits that changed only actors which it brought. ValueError for no such
-    edit, and where an edit changes such an actor and something else.
-    """
-    scene = Path(scene)
-    read_metadata(scene)
-    with alone(scene):
-        root, out = scene / "scene.usda", list[Undone]()
-        before = root.read_bytes()
-        need_folder(root)
-        _sweep(scene)
-        with TemporaryDirectory(prefix=ASIDE, dir=scene) as aside:
-            try:
-                gone: set[str] = set()
-                for name in names:
-                    if name not in gone:
-                        out.append(_taken_out(scene, name, Path(aside)))
-                        gone |= {name, *out[-1].idle}
-                yield [replace(u, held={edit: tracks for edit, tracks in u.held.items() if edit not in gone}) for u in out]
-            except BaseException:
-                for path in Path(aside).iterdir():
-                    path.rename(scene / "edits" / path.name)
-                with atomic_file(root) as partial:
-                    partial.write_bytes(before)
-                raise
-
-
-def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
-    """Move an edit's files, and those of the edits that go with it, from a scene to the folder `aside`."""
-    edits = scene / "edits"
-    with open_stage(scene / "scene.usda") as stage:
-        have = [e["name"] for e in read_edits(stage)]
-        if name not in have and not (_is_name(name) and ((edits / f"{name}.usda").exists() or (edits / name).exists())):
-            raise ValueError(unknown("edit", name, str(scene), have, "--undo {}"))
-        gone = Undone(name, tuple(_idle_without(stage, name)), _held(stage, name))
-    for each in (*gone.idle, name):
-        drop_sublayer(scene, f"./edits/{each}.usda")
-        for path in (p for p in (edits / f"{each}.usda", edits / each) if p.exists()):
-            need_folder(path)
-            path.rename(aside / path.name)
-    return gone
-
-
-def _sweep(scene: Path) -> None:
-    """Take away what an undoing that was killed had put aside: whatever the scene shows by then, it shows without these files."""
-    for aside in scene.glob(f"{ASIDE}*"):
-        shutil.rmtree(aside, ignore_errors=True)
-
-
 def free_name(scene: Path, wish: str) -> str:
     """The wish, or the wish and a number, that names no edit yet."""
     taken = {p.stem for p in (scene / "edits").glob("*")}
@@ -206,60 +133,17 @@ def free_name(scene: Path, wish: str) -> str:
     return name
 
 
-def _is_name(name: str) -> bool:
-    return re.fullmatch(r"[A-Za-z0-9][\w-]*", name, flags=re.ASCII) is not None
-
-
-def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
-    """Edits that change nothing but actors which the edit `name` alone defines, or defined before its layer was deleted."""
-    root, out = stage.GetRootLayer(), []
-    layers = {Path(sub).stem: Sdf.Layer.Find(root.ComputeAbsolutePath(sub)) for sub in root.subLayerPaths if sub != RECORDED}
-    own = layers.pop(name, None)
-    rest = [layer for layer in stage.GetLayerStack() if layer != own]
-    gone = {p.GetName() for p in _children(stage) if not defines(rest, p) and (own is None or defines([own], p))}
-    for edit, layer in layers.items():
-        actors = layer and layer.GetPrimAtPath("/World/Actors")
-        changed = set(actors.nameChildren.keys()) if actors else set()
-        if changed & gone and (changed - gone or layer.subLayerPaths):
-            lost = ", ".join(sorted(changed & gone))
-            raise ValueError(f"the edit {edit} changes more than {lost}, which {name} brought; undo both: --undo {edit} --undo {name}")
-        if changed & gone:
-            out.append(edit)
-    return out
-
-
-def _held(stage: Usd.Stage, name: str) -> dict[str, list[str]]:
-    """Tracks of the actors whose path the edit `name` tells and a later one tells anew, from there on; by the later edit's name."""
-    root = stage.GetRootLayer()
-    paths = {}  # the newest first, as the layers are
-    for sub in (s for s in root.subLayerPaths if s != RECORDED):
-        layer = Sdf.Layer.Find(root.ComputeAbsolutePath(sub))
-        actors = layer and layer.GetPrimAtPath("/World/Actors")
-        paths[Path(sub).stem] = {p.name for p in actors.nameChildren if "xformOp:translate" in p.attributes} if actors else set()
-    own, out = paths.get(name, set()), {}
-    for edit in list(paths)[: list(paths).index(name)] if name in paths else []:
-        if both := sorted(own & paths[edit]):
-            out[edit] = [own_data(stage.GetPrimAtPath(f"/World/Actors/{prim}")).get("track", prim) for prim in both]
-    return out
-
-
-def _children(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Every prim under /World/Actors: those too that are removed, or that only edits speak of."""
-    group = stage.GetPrimAtPath("/World/Actors")
-    return group.GetAllChildren() if group else []
-
-
 def _prims(scene: Path) -> tuple[dict[str, str], list[str]]:
     """Prim path of every actor of a scene folder, removed ones too, by track; and the names that prims have there."""
     with open_stage(scene / "scene.usda") as stage:
-        prims, layers = _children(stage), stage.GetLayerStack()
+        prims, layers = all_actor_prims(stage), stage.GetLayerStack()
         paths = {own_data(p).get("track", p.GetName()): str(p.GetPath()) for p in prims if defines(layers, p)}
         return paths, [p.GetName() for p in prims]
 
 
 def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], author: Callable[[Usd.Stage], None]) -> None:
     """The files of an edit, its layer, and last its place in the scene: all or nothing."""
-    if not _is_name(name):
+    if not is_edit_name(name):
         raise ValueError(f'"{name}" cannot name an edit; use letters, digits, - and _')
     layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
     if layer.exists():

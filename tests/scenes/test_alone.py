@@ -10,7 +10,8 @@ from street import car
 from scenes import Databank, load, save
 from scenes.alone import alone
 from scenes.edit import Edit
-from scenes.usd.edit import add_change, undone
+from scenes.usd.edit import add_change
+from scenes.usd.undo import undone
 
 fcntl = pytest.importorskip("fcntl")
 

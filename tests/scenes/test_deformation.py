@@ -10,8 +10,9 @@ from street import START_US, STEP_US, box, car, street
 from scenes import Actor, Deformation, Lattice, Scene, load, save
 from scenes.edit import Edit, edited
 from scenes.report import describe, summary
-from scenes.usd.edit import add_change, undo
+from scenes.usd.edit import add_change
 from scenes.usd.layers import usd_problems
+from scenes.usd.undo import undo
 
 CORNERS = torch.tensor([[-3.0, -1.0, 0.0], [3.0, 1.0, 2.0]])
 

@@ -1,19 +1,16 @@
 """Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
 
 import math
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from edited_street import ALL, VAN, busy, parking, same, shown
 from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
-from street import START_US, STEP_US, box, car, street
+from street import START_US, car, street
 
-from scenes import Actor, Gaussians, Ground, Scene, Trajectory, load, save, validate
+from scenes import Actor, Ground, Trajectory, load, save, validate
 from scenes.astray import astray, meeting
 from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
@@ -22,42 +19,16 @@ from scenes.placement import Placement
 from scenes.poses import translation
 from scenes.seen import SECTORS
 from scenes.standing import standing_pose
-from scenes.usd.edit import add_change, add_edit, undo, undone
+from scenes.usd.edit import add_change, add_edit
 from scenes.usd.layers import new_stage, usd_problems
 from scenes.usd.root import RECORDED, add_sublayer
-
-
-def busy() -> Scene:
-    """The street with three more cars: one goes along x, one stands, and one has left a ghost in the background."""
-    times = START_US + STEP_US * torch.arange(9)
-    along = Trajectory(times, torch.stack([translation(8 + 0.5 * i, -3.0, 0.0) for i in range(9)]))
-    still = Trajectory(times[:1], translation(15.0, 5.0, 0.0)[None])
-    scene = street()
-    ghost = box((3.0, 1.0, 1.0), (0.9, 0.9, 0.9))
-    ghost = replace(ghost, means=ghost.means + torch.tensor([10.0, -3.0, 0.25]))
-    background = replace(scene.background, gaussians=Gaussians.cat([scene.background.gaussians, ghost]))
-    more = (Actor(car(), along, "veh_2"), Actor(car("van"), still, "veh_3"))
-    return replace(scene, actors=(*scene.actors, *more), background=background)
-
-
-VAN = car("van", (0.9, 0.9, 0.1))
-ALL = Edit(remove=("veh_1",), shift={"veh_2": (1.0, 1.5)}, replace={"veh_3": VAN}, retime={"veh_2": 300_000})
+from scenes.usd.undo import undo
 
 
 @pytest.fixture
 def saved(tmp_path):
     save(busy(), tmp_path / "s1")
     return tmp_path / "s1"
-
-
-def same(a: Scene, b: Scene) -> None:
-    assert [x.track for x in a.actors] == [x.track for x in b.actors]
-    for x, y in zip(a.actors, b.actors, strict=True):
-        assert torch.equal(x.trajectory.times_us, y.trajectory.times_us)
-        torch.testing.assert_close(x.trajectory.world_from_body, y.trajectory.world_from_body, atol=1e-12, rtol=0)
-        assert x.asset.label == y.asset.label and torch.equal(x.asset.gaussians.means, y.asset.gaussians.means)
-    before, after = (s.background.gaussians.logit_opacities for s in (a, b))
-    torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
 
 
 def test_an_edit_on_disk_does_what_it_does_in_memory(saved):
@@ -122,15 +93,6 @@ def test_where_an_actor_only_virtually_stood_nothing_is_hidden(edit):
     assert torch.equal(after, before)
 
 
-def parking() -> Scene:
-    """The street with a car of splats that the background holds, as a log's boxes tell."""
-    scene, place = busy(), translation(20.0, -7.0, 0.0)
-    splats = car().gaussians
-    background = Gaussians.cat([scene.background.gaussians, replace(splats, means=splats.means + place[:3, 3].float())])
-    entry = {"track": "veh_7", "label": "car", "size": car().size.tolist(), "world_from_box": place.tolist()}
-    return replace(scene, background=replace(scene.background, gaussians=background), meta={**scene.meta, "parked": [entry]})
-
-
 def test_a_parked_vehicle_is_removed_from_the_background_and_comes_back(tmp_path):
     scene = parking()
     save(scene, tmp_path / "s1")
@@ -188,17 +150,6 @@ def test_a_parked_vehicle_can_only_be_removed():
     assert edited(parking(), Edit(remove=("veh_7",))).meta["parked"] == []
 
 
-def test_the_last_of_two_edits_counts_and_both_can_be_undone_alone(saved):
-    add_change(saved, "first", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
-    add_change(saved, "second", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
-    place = lambda: float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3])  # noqa: E731
-    assert place() == pytest.approx(-1.0)
-    undo(saved, "second")
-    assert place() == pytest.approx(-2.0)
-    undo(saved, "first")
-    assert place() == pytest.approx(-3.0)
-
-
 def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(saved):
     dark = replace(VAN, meta={**VAN.meta, "id": "van/0001", "ground_linear": [0.03, 0.04, 0.05]})
     add_change(saved, "mine", load(saved), Edit(replace={"veh_3": dark}), {})
@@ -239,94 +190,6 @@ def test_an_inserted_or_replacing_asset_takes_on_the_light_of_where_it_is_shifte
     assert torch.equal(next(a for a in load(tmp_path / "s1").actors if not a.recorded).asset.gaussians.sh, was.asset.gaussians.sh)
 
 
-def test_undoing_says_which_later_edits_go_on_from_where_it_put_an_actor(saved):
-    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0), "veh_3": (1.0, 0.0)}), {})
-    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
-    add_change(saved, "gone", load(saved), Edit(remove=("veh_3",)), {})
-    with undone(saved, ["shift"]) as (edit,):
-        assert edit.held == {"retime": ["veh_2"]}
-    assert float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3]) == pytest.approx(-2.0)
-    with undone(saved, ["gone", "retime"]) as edits:
-        assert [e.held for e in edits] == [{}, {}]
-    same(load(saved), busy())
-
-
-def test_an_edit_that_goes_with_a_later_one_leaves_nothing_of_it(saved):
-    add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0)}), {})
-    add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
-    with undone(saved, ["shift", "retime"]) as edits:
-        assert [e.held for e in edits] == [{}, {}]
-    same(load(saved), busy())
-
-
-def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
-    put_in(saved)
-    add_change(saved, "aside", load(saved), Edit(shift={"new": (1.0, 0.0)}), {})
-    add_change(saved, "mine", load(saved), ALL, {})
-    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    with pytest.raises(ValueError, match='"veh_9" is not in'), undone(saved, ["new", "mine"]):
-        add_change(saved, "mine", load(saved), Edit(remove=("veh_9",)), {})
-    with pytest.raises(ValueError, match='edit "typo" is not in'), undone(saved, ["mine", "typo"]):
-        pass
-    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
-    assert {p.name for p in saved.iterdir()} == {p.relative_to(saved).parts[0] for p in before}
-
-
-def test_what_a_killed_undoing_put_aside_is_in_nobodys_way_and_goes_with_the_next_edit(saved):
-    add_change(saved, "mine", load(saved), ALL, {})
-    kill = "import os, sys; from scenes.usd.edit import undone\nwith undone(sys.argv[1], ['mine']): os.kill(os.getpid(), 9)"
-    for next_edit in (lambda: put_in(saved), lambda: undo(saved, "new")):
-        subprocess.run([sys.executable, "-c", kill, str(saved)], check=False)
-        (aside,) = saved.glob(".undone.*")
-        assert (aside / "mine.usda").exists() and validate(saved) == []
-        next_edit()
-        assert not aside.exists()
-        add_change(saved, "mine", load(saved), ALL, {})
-
-
-def test_undoing_in_a_folder_that_takes_no_files_says_so_and_leaves_all(saved, monkeypatch):
-    put_in(saved)
-    for folder in (saved, saved / "edits"):
-        with monkeypatch.context() as context, pytest.raises(PermissionError, match=f"{folder} is not writable"):
-            context.setattr(os, "access", lambda path, mode, folder=folder: Path(path) != folder)  # root may write anywhere
-            undo(saved, "new")
-    assert load(saved).actors[-1].track == "new"
-
-
-def shown(scene: Scene) -> torch.Tensor:
-    return scene.background.gaussians.logit_opacities > HIDDEN + 1e-3
-
-
-def test_an_edit_of_what_was_shifted_hides_what_the_recording_says(saved):
-    """And nothing of where the first edit put it, so that either can be undone alone."""
-    ghost_alone = shown(edited(busy(), Edit(remove=("veh_2",))))
-    onto_more = Edit(shift={"veh_2": (0.0, 5.5)}), Edit(remove=("veh_2",))  # veh_1 comes along there
-    for name, edit in zip(("shift", "gone"), onto_more, strict=True):
-        add_change(saved, name, load(saved), edit, {})
-    assert torch.equal(shown(load(saved)), ghost_alone)
-    undo(saved, "shift")
-    assert torch.equal(shown(load(saved)), ghost_alone)
-    undo(saved, "gone")
-    assert shown(load(saved)).all()
-
-
-@pytest.mark.parametrize("undone", [undo, lambda scene, name: (scene / "edits" / f"{name}.usda").unlink()], ids=["undo", "by hand"])
-@pytest.mark.parametrize("half", [False, True])
-def test_undoing_an_edit_shows_again_what_it_alone_hid(tmp_path, undone, half):
-    scene, edits = parking(), {"first": Edit(("veh_7",), shift={"veh_2": (0.0, 1.0)}), "second": Edit(remove=("veh_2",))}
-    alone = {name: shown(edited(scene, edit)) for name, edit in edits.items()}
-    save(scene, tmp_path / "s1", half=half)
-    for name, edit in edits.items():
-        add_change(tmp_path / "s1", name, load(tmp_path / "s1"), edit, {})
-    assert torch.equal(shown(load(tmp_path / "s1")), alone["first"] & alone["second"])
-    undone(tmp_path / "s1", "first")
-    assert torch.equal(shown(load(tmp_path / "s1")), alone["second"]) and not torch.equal(*alone.values())
-    stage = Usd.Stage.Open(str(tmp_path / "s1" / "scene.usda"))
-    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Background/Gaussians"))
-    seen = (splats.GetOpacitieshAttr() if half else splats.GetOpacitiesAttr()).Get()
-    assert [v > 0 for v in seen] == alone["second"].tolist()
-
-
 def test_a_scene_of_before_whose_edits_hold_all_opacities_still_loads(saved):
     """As Sidestep wrote them before an edit held only what it hides."""
     (saved / "edits" / "old").mkdir()
@@ -354,85 +217,6 @@ def test_what_was_inserted_can_be_shifted_and_keeps_its_instance(saved):
     after = load(saved)
     assert [a.track for a in after.actors][-2:] == ["a", "b"]
     assert float(after.actors[-2].trajectory.world_from_body[0, 0, 3]) == 11.0
-
-
-@pytest.mark.parametrize(
-    ("file", "left", "said"),
-    [
-        ("mine.usda", 300, "mine.usda is damaged"),
-        ("mine.usda", 0, "mine.usda is damaged"),
-        ("mine.usda", b"over", "mine.usda is damaged"),
-        ("mine/hidden.usda", b"over", "mine/hidden.usda is damaged"),
-        ("mine/hidden.usda", 300, "mine/hidden.usda is damaged"),
-        ("mine/hidden.usda", None, "mine/hidden.usda is missing"),
-        ("mine/veh_3.usdc", None, "mine/veh_3.usdc is missing"),
-        ("mine/veh_3.usdc", 300, "mine/veh_3.usdc is damaged"),
-    ],
-)
-def test_an_edit_that_is_not_whole_is_refused_until_it_is_undone(saved, file, left, said):
-    add_change(saved, "mine", load(saved), ALL, {})
-    if left is None:
-        (saved / "edits" / file).unlink()
-    else:  # bytes: cut right before the first of them, where what is left is a whole layer that says nothing
-        path = saved / "edits" / file
-        os.truncate(path, left if isinstance(left, int) else path.read_bytes().index(b"\n" + left) + 1)
-    with pytest.raises(ValueError, match=f"{said}.*restore it, or undo the edit: sidestep edit {saved} --undo mine"):
-        load(saved)
-    assert any(said in problem for problem in validate(saved)) and not any("deleted" in problem for problem in validate(saved))
-    undo(saved, "mine")
-    same(load(saved), busy())
-
-
-def put_in(scene, name="new"):
-    add_edit(scene, name, [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), name)], {"kind": "insert"})
-
-
-IDLE = {"gone": Edit(remove=("new",)), "other": Edit(replace={"new": car()}), "aside": Edit(shift={"new": (1.0, 0.0)})}
-
-
-@pytest.mark.parametrize("by_hand", [False, True])
-@pytest.mark.parametrize("name", IDLE)
-def test_undoing_what_brought_an_actor_takes_along_what_changed_only_that(saved, name, by_hand):
-    put_in(saved)
-    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file() and "new" not in p.name}
-    add_change(saved, name, load(saved), IDLE[name], {})
-    if by_hand:
-        (saved / "edits" / "new.usda").unlink()
-        same(load(saved), busy())
-    assert undo(saved, "new") == [name]
-    assert {p for p in saved.rglob("*") if p.is_file()} == {p for p in before if "new" not in p.parts}
-    same(load(saved), busy())
-    put_in(saved)
-    assert [a.track for a in load(saved).actors][-1] == "new"
-
-
-def test_an_edit_of_what_was_brought_and_of_more_is_undone_first(saved):
-    put_in(saved)
-    add_change(saved, "both", load(saved), Edit(remove=("new", "veh_1")), {})
-    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
-    with pytest.raises(ValueError, match="the edit both changes more than new, which new brought; undo both: --undo both --undo new"):
-        undo(saved, "new")
-    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
-    assert undo(saved, "both") == [] and undo(saved, "new") == []
-    same(load(saved), busy())
-
-
-@pytest.mark.parametrize("name", IDLE)
-def test_an_edit_of_an_actor_that_went_by_hand_does_not_meet_the_next_one_of_its_name(saved, name):
-    put_in(saved)
-    add_change(saved, name, load(saved), IDLE[name], {})
-    (saved / "edits" / "new.usda").unlink()
-    put_in(saved)
-    after = load(saved)
-    assert [a.track for a in after.actors] == ["veh_1", "veh_2", "veh_3", "new"] and after.actors[-1].asset.label == "van"
-    assert after.actors[-1].trajectory.world_from_body[0, 0, 3] == 9.0
-
-
-def test_the_track_of_a_removed_actor_stays_its_own(saved):
-    put_in(saved)
-    add_change(saved, "gone", load(saved), Edit(remove=("new",)), {})
-    with pytest.raises(ValueError, match='already has an actor "new"'):
-        add_edit(saved, "again", [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), "new")], {})
 
 
 def test_a_shifted_actor_stays_on_the_ground():

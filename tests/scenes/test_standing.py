@@ -10,7 +10,8 @@ from scenes import Ground, Trajectory, load, save
 from scenes.edit import Edit, edited
 from scenes.poses import translation, yaw, yaw_of
 from scenes.standing import EDGE, FAR, standing_pose, stood
-from scenes.usd.edit import add_change, undo
+from scenes.usd.edit import add_change
+from scenes.usd.undo import undo
 
 TIMES = START_US + STEP_US * torch.arange(9)
 BANK = Ground((0.05 * torch.arange(-20.0, 20.0))[:, None].expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)

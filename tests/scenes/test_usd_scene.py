@@ -149,7 +149,7 @@ def test_an_existing_target_is_refused_and_a_foreign_one_never_replaced(saved, t
     assert (tmp_path / "holiday" / "metadata.json").read_text() == "{}"
 
 
-@pytest.mark.parametrize("broken", ["save_hdr", "save_asset", "_save_ground", "_author_world"])
+@pytest.mark.parametrize("broken", ["save_hdr", "save_asset", "save_ground", "_author_world"])
 def test_a_write_that_breaks_off_leaves_the_old_scene(saved, monkeypatch, broken):
     def fail(*_, **__):
         raise OSError(28, "No space left on device")
