@@ -1,8 +1,8 @@
-"""A posed drive without lidar whose pictures do not meet by its recorded poses: the path is bent until they do.
+"""Corrects the path of a posed drive without lidar whose pictures do not agree by its recorded poses.
 
-Poses by GPS jitter by centimetres from picture to picture (KITTI), which is pixels of what is near, and splats of such pictures are
-blurred. Features are followed through the pictures of one camera, and poses and points are found together (bundle adjustment); far apart,
-where pictures share nothing, the recorded places hold.
+Poses by GPS jitter by centimetres from picture to picture (KITTI), which is pixels on near surfaces, and splats of such pictures are
+blurred. Features are matched between the pictures of one camera, and poses and points are optimised together (bundle adjustment), with the
+recorded positions as priors: far apart, where pictures share nothing, these hold.
 """
 
 from __future__ import annotations
@@ -16,21 +16,20 @@ import torch
 
 from recon.corrected import MOVED, as_corrected
 from recon.log import Log
-from recon.readers.sfm import adjust
-from recon.seeds.triangulate import AHEAD, picture_name, posed
+from recon.sfm.posed import AHEAD, Posed, adjust, picture_name
 from scenes.poses import inverse
 
 SPREAD = 0.1
-"""Metres by which recorded places are likely to be off."""
+"""Standard deviation in metres of recorded positions."""
 
 WORTH = 0.8
-"""Part of what points were seen off by the recorded poses that may be left for corrections to be made."""
+"""Reprojection error after the adjustment, as a part of that before, up to which corrections are made."""
 
 FARTHEST = 1.0
-"""Metres that a camera is moved at most: pictures of what moves, and little else, may meet anywhere."""
+"""Metres that a camera is moved at most: pictures of little but moving objects may fit anywhere."""
 
 FEWEST = 8
-"""Pictures that are corrected."""
+"""Pictures without which nothing is corrected."""
 
 
 def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int]) -> Log:
@@ -38,7 +37,7 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
     already, and where too few show the same. size: width and height at which they are looked at.
 
     All pictures of the span count, also those that a fit holds out, as where structure from motion has found the poses. Corrections are
-    interpolated between them. ValueError for a lens that COLMAP has not.
+    interpolated between them. ValueError for a lens that COLMAP does not have.
     """
     camera = log.camera(name)
     chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
@@ -49,7 +48,7 @@ def adjusted(log: Log, name: str, span_us: tuple[int, int], size: tuple[int, int
     pairs = [(names[k], names[k + ahead]) for ahead in AHEAD for k in range(len(names) - ahead)]
     with tempfile.TemporaryDirectory() as folder:
         pictures = ((name, i, camera.image(i, *size)) for i in chosen)
-        found, before, after = adjust(posed(Path(folder), log, pictures, pairs), SPREAD)
+        found, before, after = adjust(Posed.written(Path(folder), log, pictures, pairs), SPREAD)
     known = [k for k, file in enumerate(names) if file in found]
     if len(known) < FEWEST or after > WORTH * before:
         return log

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from recon.log import Log, LogCamera, SparsePoints, image_size
+from recon.readers.colmap_model import Model, ModelCamera, is_model, read_model
 from recon.readers.gauge import find_gauge
 from recon.readers.moments import moments_of
 from recon.readers.order import names_apart
-from recon.readers.sfm import Model, ModelCamera, is_model, read_model
 from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
@@ -120,18 +120,6 @@ LENSES: dict[str, Callable[..., Lens]] = {
     "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: Fisheye(f, f, cx, cy, k1, k2),
     "OPENCV_FISHEYE": Fisheye,
 }
-
-
-def colmap_lens(lens: Lens, where: Path) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's lens model for ours, the reverse of `lens_of`. ValueError for lenses that COLMAP has not."""
-    model = {Pinhole: "PINHOLE", OpenCV: "FULL_OPENCV", Fisheye: "OPENCV_FISHEYE"}.get(type(lens))
-    params = tuple(lens.params().tolist())
-    if model == "FULL_OPENCV" and not any(params[12:]):
-        params = params[:12]
-    elif model in (None, "FULL_OPENCV"):
-        what = f"lens {lens.kind}" + " with thin prisms" * (model is not None)
-        raise ValueError(f"{where} has no lidar, and COLMAP, which would find depths in its pictures, knows no {what}; add lidar")
-    return model, params
 
 
 def camera_names(model: Model) -> dict[int, str]:

@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from recon.readers.colmap_model import Model
 from recon.readers.order import NUMBER
-from recon.readers.sfm import Model
 
 STEP_US = 500_000
 """From one picture to the next, where nobody says."""

@@ -19,7 +19,7 @@ from PIL import ImageOps
 from recon.log import FETCH, Log, Packed
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.order import recorded
-from recon.readers.sfm import solve
+from recon.sfm.solve import solve
 from scenes.pictures import PICTURES, is_turned, opened, rgb_of, swaps_sides
 
 PHOTOS = tuple(suffix for suffix in PICTURES if suffix != ".webp")  # which COLMAP does not read

@@ -12,8 +12,9 @@ from PIL import Image
 
 from recon import open_log
 from recon.readers import photos as reader
-from recon.readers import sfm
-from recon.readers.sfm import read_model
+from recon.readers.colmap_model import read_model
+from recon.sfm import solve as sfm
+from recon.sfm.colmap import pycolmap
 from render.video import VideoWriter
 from scenes.pictures import ORIENTATION
 
@@ -190,7 +191,7 @@ def test_frames_of_a_video_that_are_unevenly_apart_keep_their_times(tmp_path):
 
 def test_many_photos_are_matched_in_the_order_of_their_numbers(tmp_path, monkeypatch):
     """COLMAP's matcher goes by the alphabet, in which a walk's second photo is its tenth."""
-    colmap = sfm.pycolmap()
+    colmap = pycolmap()
     names = [f"IMG ({i}).jpg" for i in range(1, 13)]
     for i, name in enumerate(names):
         Image.fromarray(np.random.default_rng(i).integers(0, 255, (64, 96, 3)).astype(np.uint8)).save(tmp_path / name)
@@ -199,7 +200,7 @@ def test_many_photos_are_matched_in_the_order_of_their_numbers(tmp_path, monkeyp
     colmap.extract_features(database, tmp_path, names, camera_mode=colmap.CameraMode.SINGLE, device=colmap.Device.cpu)
     before = {i.image_id: i.name for i in _images(colmap, database)}
     monkeypatch.setattr(colmap, "match_sequential", lambda path, **_: seen.extend(_images(colmap, path)))
-    sfm._match_following(colmap, database, names)
+    sfm._match_neighbours(colmap, database, names)
     assert [before[i.image_id] for i in sorted(seen, key=lambda i: i.name)] == names
     assert {i.image_id: i.name for i in _images(colmap, database)} == before
 
@@ -316,7 +317,7 @@ def test_pictures_that_do_not_tell_their_lens_are_placed_by_a_usual_one(straight
     monkeypatch.setattr(sfm, "_largest", largest)
     assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names) and tried == [True, False]
     camera = next(iter(read_model(tmp_path / "sparse/0").cameras.values()))
-    assert camera.params[0] == pytest.approx(160 / math.tan(math.radians(30))) and 0 < abs(camera.params[3]) < sfm.MOST_BENT
+    assert camera.params[0] == pytest.approx(160 / math.tan(math.radians(30))) and 0 < abs(camera.params[3]) < sfm.MOST_DISTORTION
     said = capsys.readouterr().err
     assert "a lens of 60deg places 8 of 8, one that is found 0;" in said and "give --angle-of-view" in said
 
@@ -325,14 +326,14 @@ def test_a_lens_is_not_bent_more_than_lenses_are(straight, tmp_path, monkeypatch
     folder, names = straight
     really = sfm._largest
     monkeypatch.setattr(sfm, "_largest", lambda *given: (None, 0) if given[4].ba_refine_focal_length else really(*given))
-    monkeypatch.setattr(sfm, "MOST_BENT", 0.0)
+    monkeypatch.setattr(sfm, "MOST_DISTORTION", 0.0)
     assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
     assert next(iter(read_model(tmp_path / "sparse/0").cameras.values())).params[3] == 0
 
 
 def test_pictures_that_tell_their_lens_are_placed_once(straight, tmp_path, monkeypatch, capsys):
     folder, names = straight
-    monkeypatch.setattr(sfm, "_hold_lens", lambda *_: pytest.fail("placed once more"))
+    monkeypatch.setattr(sfm, "_fix_lens", lambda *_: pytest.fail("placed once more"))
     assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
     assert "--angle-of-view" not in capsys.readouterr().err
 

@@ -5,9 +5,10 @@ from painted import SIZE, depth_of, drive
 
 from recon.frames import load_frames
 from recon.project import project
-from recon.readers.colmap import colmap_lens, lens_of
-from recon.readers.sfm import ModelCamera
+from recon.readers.colmap import lens_of
+from recon.readers.colmap_model import ModelCamera
 from recon.seeds.triangulate import matched, triangulated
+from recon.sfm.posed import colmap_lens
 from recon.view import View
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
 from scenes.poses import inverse
