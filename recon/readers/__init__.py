@@ -8,7 +8,8 @@ from pathlib import Path
 from recon.log import Log
 from recon.readers.argoverse2 import is_argoverse2, read_argoverse2
 from recon.readers.colmap import find_model, read_colmap
-from recon.readers.kitti import is_kitti_odometry, is_kitti_raw, lacks_oxts, read_kitti_odometry, read_kitti_raw
+from recon.readers.kitti_odometry import is_kitti_odometry, read_kitti_odometry
+from recon.readers.kitti_raw import is_kitti_raw, lacks_oxts, read_kitti_raw
 from recon.readers.ncore import is_ncore, read_ncore
 from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
