@@ -9,7 +9,8 @@ from shlex import quote
 import torch
 
 from recon.assets.extract import moved, thumbnail
-from recon.assets.meshes import MeshFit, asset_of_mesh, read_mesh, turn_to_asset
+from recon.assets.mesh_files import read_mesh, turn_to_asset
+from recon.assets.meshes import MeshFit, asset_of_mesh
 from recon.assets.overturned import overturned
 from render.progress import Progress
 from scenes.asset import Asset

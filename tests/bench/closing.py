@@ -18,7 +18,8 @@ import torch
 
 from recon.assets.closing import ENDS, hull_of_end
 from recon.assets.looking import looking_at
-from recon.assets.meshes import MODEL, read_mesh, splats_of_mesh
+from recon.assets.mesh_files import read_mesh
+from recon.assets.mesh_splats import MODEL, splats_of_mesh
 from render import Frame, rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians

@@ -11,7 +11,8 @@ import argparse
 import time
 from pathlib import Path
 
-from recon.assets.meshes import MeshFit, asset_of_mesh, read_mesh
+from recon.assets.mesh_files import read_mesh
+from recon.assets.meshes import MeshFit, asset_of_mesh
 
 NAMES = ("hatchback", "pickup", "prius_hybrid", "fire_hydrant", "construction_cone", "oak_tree")
 

@@ -10,7 +10,9 @@ import trimesh
 from made_glb import rewritten
 
 from recon.assets.looking import looking_at
-from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, read_mesh, splats_of_mesh, turn_to_asset, views_around
+from recon.assets.mesh_files import read_mesh, turn_to_asset
+from recon.assets.mesh_splats import splats_of_mesh
+from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, views_around
 from render.rays import camera_rays
 from render.tracer import Blockers, TracedMesh, fibonacci, lit
 from scenes.harmonics import rgb_from_sh
