@@ -47,17 +47,12 @@ class Pairs:
     """Random seed: the same gives the same pairs; another holds out other frames, and fits longer or shorter, with more or fewer splats."""
 
     def run(self) -> None:
+        from enhance.pairs.claims import claim_pairs
         from enhance.pairs.clips import PairConfig
-        from enhance.pairs.make import (
-            check_cameras,
-            check_kinds,
-            claim_pairs,
-            make_pairs,
-            open_reconstruction,
-            open_recording,
-            prepare_sources,
-        )
+        from enhance.pairs.inputs import check_cameras, check_kinds, open_reconstruction, open_recording
+        from enhance.pairs.make import make_pairs
         from enhance.pairs.of_photos import check_names, make_photo_pairs
+        from enhance.pairs.sources import prepare_sources
         from render.progress import Progress
 
         _some("--kinds", self.kinds)

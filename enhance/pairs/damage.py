@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,36 +15,10 @@ from enhance.pairs.degrade import random_underfit, unfinish
 from enhance.pairs.diffusion_renderer import Relit
 from enhance.pairs.isp import Isp, alter, random_isp, random_pipeline
 from enhance.pairs.lighting import Illumination, random_sky, relit, smoothed, under
-from enhance.pairs.refits import Refit
 from enhance.pairs.shards import to_bytes
-from render.references import READS, References, Shot
-from scenes.asset import Asset
+from enhance.pairs.sources import Sources
+from render.references import READS, References
 from scenes.scene import Scene
-from scenes.sky import Sky
-
-
-@dataclass(frozen=True)
-class Sources:
-    """What damage is made from beside the scene and its photos.
-
-    early   the scene stopped early, for underfit (without any, splats are spoilt by rule instead)
-    shots   the recording's photos, which underfit's and reinsert's views may be compared with
-    refits  by kind the reconstructions from less (`enhance.pairs.refits`)
-    skies   HDR skies, for relight and shadow, beside made-up ones
-    relit   the recording's photos under other skies, by which relight lights objects anew (without, by their splats' normals)
-    own     assets cut out of the scene with their photos, by track, for reinsert
-    assets  those that may be put anywhere, for shadow
-    kinds   for which this was prepared
-    """
-
-    early: Sequence[Refit] = ()
-    shots: Sequence[Shot] = ()
-    refits: Mapping[str, Sequence[Refit]] = field(default_factory=dict)
-    skies: Sequence[Sky] = ()
-    relit: Relit | None = None
-    own: Mapping[str, Asset] = field(default_factory=dict)
-    assets: Sequence[Asset] = ()
-    kinds: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

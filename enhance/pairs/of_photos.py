@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from enhance.pairs.claims import claim
 from enhance.pairs.clips import PairConfig, clip_label
 from enhance.pairs.isp import alter, random_pipeline
-from enhance.pairs.make import claim
 from enhance.pairs.masks import random_mask
 from enhance.pairs.shards import is_whole, to_bytes, write_shard
 from enhance.photos import photos_of

@@ -11,8 +11,9 @@ from PIL import Image
 from enhance.commands import Pairs
 from enhance.pairs.clips import PairConfig
 from enhance.pairs.diffusion_renderer import FRAMES, Relit
-from enhance.pairs.make import make_pairs, prepare_sources
+from enhance.pairs.make import make_pairs
 from enhance.pairs.shards import PairSet
+from enhance.pairs.sources import prepare_sources
 from scenes.opening import UsageError
 
 CONFIG = PairConfig(width=96, frames=3, every=4)

@@ -183,8 +183,8 @@ def test_photos_of_one_name_and_other_settings_are_refused(tmp_path):
 
 
 def test_what_is_wrongly_named_is_found_before_anything_is_reconstructed(street, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("enhance.pairs.make.open_recording", lambda *_: recording)
-    monkeypatch.setattr("enhance.pairs.make.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
+    monkeypatch.setattr("enhance.pairs.inputs.open_recording", lambda *_: recording)
+    monkeypatch.setattr("enhance.pairs.sources.prepare_sources", lambda *_: pytest.fail("it reconstructs"))
     save(street, tmp_path / "street")
     (tmp_path / "other").mkdir()
     one = Pairs((tmp_path / "street",), tmp_path / "out", (tmp_path,), cameras=("lefd_camera",))
