@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from recon.build import assemble, begin, choose
+from recon.assemble import assemble
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.log import Log
 from recon.ready import annotated
 from render.progress import Progress
 from scenes.files import save
-from scenes.usd.scene import is_scene
+from scenes.usd.metadata import is_scene
 
 SHARES = (0.25, 0.5, 0.75)
 SHORT = FitConfig(steps=2400, budget=100_000)

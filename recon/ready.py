@@ -1,4 +1,4 @@
-"""A log as a fit takes it: without what the scene is measured against, put right, and with boxes of what moves."""
+"""A log as a fit takes it: without the held-out sweeps, its path and mounts corrected, with boxes of what moves."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from recon.corrected import as_corrected
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
 from recon.mounts import mounts_by_road
+from recon.turned import turned_by_surfaces
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps
-from recon.turned import turned_by_surfaces
 from render.progress import Progress
 
 
@@ -35,19 +35,22 @@ def readied(
     known: dict | None = None,
     movers: Sequence[dict] | None = None,
 ) -> Log:
-    """The log with its path corrected where `sweeps`, or where there are none pictures, do not meet by it, and cameras put where their
-    pictures of the road meet, or as is `known` from before (`as_corrected`); and with the movers that sweeps show where it has no boxes, or
-    that were found before (`plain_tracks`)."""
+    """The log with its path and camera mounts corrected, and with the movers that its lidar shows where it has no boxes.
+
+    sweeps: those that the fit may use; without any, pictures correct the path. names, span, size: cameras, first and last microsecond, and
+    the size at which pictures are looked at. known: corrections that were found before (`as_corrected`), movers: the tracks that were
+    (`plain_tracks`); found anew where None.
+    """
     log = _corrected(log, sweeps, config, names, span, size) if known is None else as_corrected(log, known)
     if movers is not None:
         return _moved_by(log, tracks_of(movers))
-    return annotated(log, _as_in(log, sweeps))
+    return annotated(log, same_sweeps(log, sweeps))
 
 
 def _corrected(
     log: Log, sweeps: Sequence[Sweep], config: FitConfig, names: Sequence[str], span: tuple[int, int], size: tuple[int, int]
 ) -> Log:
-    """The log with what lidar and pictures show to be wrong with its path and its cameras' mounts put right."""
+    """The log with its path and its cameras' mounts corrected by what lidar and pictures show."""
     if not sweeps:  # poses that come from the pictures meet in them
         return adjusted(log, names[0], span, size) if "path" in config.refine and log.points is None else log
     if "path" in config.refine:
@@ -55,17 +58,17 @@ def _corrected(
             log = aligned(log, sweeps, steps.step)
     if "surfaces" in config.refine:
         with Progress("surfaces", total=len(names)) as steps:
-            log = turned_by_surfaces(log, names, _as_in(log, sweeps), span, steps.step)
+            log = turned_by_surfaces(log, names, same_sweeps(log, sweeps), span, steps.step)
     if "road" in config.refine:
         with Progress("mounts", total=len(names)) as steps:
-            log = mounts_by_road(log, names, _as_in(log, sweeps), span, steps.step)
+            log = mounts_by_road(log, names, same_sweeps(log, sweeps), span, steps.step)
     return log
 
 
-def _as_in(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
-    """Sweeps as a log has them whose path was corrected."""
-    places = {s.index for s in sweeps}
-    return [s for s in log.sweeps if s.index in places]
+def same_sweeps(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
+    """Sweeps as a log has them whose path was corrected since they were taken from it."""
+    indices = {s.index for s in sweeps}
+    return [s for s in log.sweeps if s.index in indices]
 
 
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
@@ -79,7 +82,7 @@ def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
 
 
 def moving_things(count: int) -> str:
-    """So many, in words."""
+    """A number of movers in words."""
     return f"{count} thing{'s that move' if count != 1 else ' that moves'}"
 
 

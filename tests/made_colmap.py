@@ -95,3 +95,8 @@ def in_model(world_from_cam: torch.Tensor) -> torch.Tensor:
     pose = TURN @ world_from_cam
     pose[:3, 3] = UNIT * (TURN[:3, :3] @ world_from_cam[:3, 3]) + TURN[:3, 3]
     return pose
+
+
+def relative(poses: torch.Tensor) -> torch.Tensor:
+    """Poses as the first one sees them: what no choice of world changes."""
+    return inverse(poses[:1]) @ poses

@@ -19,8 +19,10 @@ import torch
 
 from enhance.pairs.clips import scene_time
 from recon.album import at_once
-from recon.build import assemble, begin, choose
+from recon.assemble import assemble
+from recon.begin import begin
 from recon.corrected import as_corrected
+from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.frames import size_like
 from recon.log import Log, LogCamera, Track
@@ -30,7 +32,7 @@ from render.references import References, Shot
 from render.video import from_bytes, to_bytes, write_image
 from scenes.files import load, save
 from scenes.scene import Scene
-from scenes.usd.scene import is_scene
+from scenes.usd.metadata import is_scene
 
 REFITS = ("sparse", "cycle", "crossref")
 NEVER = 2.0

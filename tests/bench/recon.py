@@ -25,8 +25,10 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 
 from recon import open_log
-from recon.build import HELD_OUT, assemble, begin, choose, fit_config
+from recon.assemble import assemble
+from recon.begin import begin
 from recon.corrected import as_corrected
+from recon.defaults import HELD_OUT, choose, fit_config
 from recon.fit.config import FitConfig
 from recon.frames import Frames
 from recon.log import Log, Sweep, Track

@@ -18,7 +18,8 @@ import torch
 import recon.fit.fit
 import render.bridge
 from recon import open_log
-from recon.build import begin, choose, fit_config, fit_size
+from recon.begin import begin
+from recon.defaults import choose, fit_config, fit_size
 from recon.fit.descent import Descent
 from recon.fit.develop import Develop
 from recon.fit.fit import Fit

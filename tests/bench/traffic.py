@@ -17,7 +17,8 @@ import numpy as np
 import torch
 
 from recon import open_log
-from recon.build import begin, choose, fit_config
+from recon.begin import begin
+from recon.defaults import choose, fit_config
 from recon.log import Track
 from recon.ready import readied
 from scenes.camera import Camera

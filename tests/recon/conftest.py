@@ -1,4 +1,5 @@
 import pytest
+from made_colmap import pictures_along, write_colmap
 from made_drive import write_drive
 
 
@@ -14,3 +15,17 @@ def own_drive(drive, tmp_path):
     import shutil
 
     return shutil.copytree(drive, tmp_path / "drive")
+
+
+@pytest.fixture(scope="session")
+def workspace(street, tmp_path_factory):
+    """A COLMAP model of twelve pictures along the street; not to be changed."""
+    return write_colmap(tmp_path_factory.mktemp("colmap") / "walk", street, {"": pictures_along(street)})
+
+
+@pytest.fixture
+def own(workspace, tmp_path):
+    """A copy of it that a test may break."""
+    import shutil
+
+    return shutil.copytree(workspace, tmp_path / "walk")

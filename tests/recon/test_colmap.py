@@ -1,4 +1,3 @@
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -6,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_colmap import HEIGHT, UNIT, pictures_along, write_colmap
+from made_colmap import HEIGHT, UNIT, pictures_along, relative, write_colmap
 from PIL import Image
 
 from recon import open_log, reconstruct
-from recon.build import FEW, MOST, PER_PHOTO, fit_config, fit_size
 from recon.fit.config import FitConfig
 from recon.frames import load_frames
 from recon.gains import picture_gains
@@ -21,26 +19,10 @@ from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert
 from scenes.placement import Placement
-from scenes.poses import inverse
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+
 ALL = (0, 2**62)
-
-
-@pytest.fixture(scope="module")
-def workspace(street, tmp_path_factory):
-    """Twelve pictures along the street; not to be changed."""
-    return write_colmap(tmp_path_factory.mktemp("colmap") / "walk", street, {"": pictures_along(street)})
-
-
-@pytest.fixture
-def own(workspace, tmp_path):
-    return shutil.copytree(workspace, tmp_path / "walk")
-
-
-def relative(poses: torch.Tensor) -> torch.Tensor:
-    """Poses as the first one sees them: what no choice of world changes."""
-    return inverse(poses[:1]) @ poses
 
 
 def test_a_workspace_reads_as_its_pictures_were_taken(workspace, street):
@@ -134,68 +116,11 @@ def test_a_height_without_ground_is_refused_with_the_other_fix():
         find_gauge(poses, np.zeros((0, 3)), camera_height=1.5)
 
 
-def test_two_cameras_share_the_moments_of_equal_names(street, tmp_path):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
-    assert list(log.cameras) == ["front", "left"] == list(log.front)
-    assert log.cameras["front"].times_us.tolist() == log.cameras["left"].times_us.tolist()
-    rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
-    apart = inverse(rig["front"].body_from_cam) @ rig["left"].body_from_cam
-    truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
-    torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize(("registered", "lead"), [(5, "front"), (2, "left")])
 def test_the_front_camera_is_the_body_unless_it_lacks_most_pictures(street, tmp_path, registered, lead):
     pair = {"left": pictures_along(street, "left_camera", count=6), "front": pictures_along(street, count=6)[:registered]}
     log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
     assert next(iter(log.cameras)) == lead and log.meta["body"].startswith(f"camera {lead},")
-
-
-def renamed(folder, names):
-    """A workspace whose pictures, in the order in which they were taken, have other names."""
-    images = folder / "sparse/0/images.txt"
-    lines = images.read_text()
-    old = sorted(p.relative_to(folder / "images") for p in (folder / "images").rglob("*.png"))
-    for before, name in zip(old, names, strict=True):
-        lines = lines.replace(f" {before}\n", f" ={name}\n")
-        (folder / "new" / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / "images" / before).rename(folder / "new" / name)
-    images.write_text(lines.replace(" =", " "))
-    shutil.rmtree(folder / "images")
-    (folder / "new").rename(folder / "images")
-    return folder
-
-
-@pytest.mark.parametrize(
-    "names",
-    [[f"frame{i}.png" for i in range(12)], [f"{'ab'[i // 6]}/{i % 6:03d}.png" for i in range(12)],
-     [f"{1533151603 + i / 4}.png" for i in range(12)],
-     [str(1533151603547590 + 99_999 * i) + ".png" for i in range(12)], [str(315966253572412942 + 10**9 * i) + ".png" for i in range(12)]],
-    ids=["unpadded", "two folders", "seconds", "microseconds", "nanoseconds"],
-)  # fmt: skip
-def test_pictures_follow_each_other_as_the_numbers_in_their_names_do(own, workspace, names):
-    ours, truth = open_log(renamed(own, names)).camera("camera"), open_log(workspace).camera("camera")
-    assert [str(f.relative_to(own / "images")) for f in ours.files] == names
-    torch.testing.assert_close(ours.world_from_cam, truth.world_from_cam, atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize("layout", ["{camera}/{part}/{i:03d}.png", "{part}/{camera}/{i:03d}.png"])
-def test_two_cameras_in_two_parts_of_a_drive_share_moments_part_by_part(street, tmp_path, layout):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    names = [layout.format(camera=c, part="ab"[i // 2], i=i % 2) for c in pair for i in range(4)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert {name: len(camera) for name, camera in log.cameras.items()} == {"front": 4, "left": 4}
-    for camera in log.cameras.values():
-        assert camera.times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
-        assert [f.parts[-3:] for f in camera.files] == sorted(f.parts[-3:] for f in camera.files)
-
-
-def test_a_camera_with_two_pictures_at_a_moment_is_named_with_the_fix(own):
-    names = sorted(p.name for p in (own / "images").iterdir())
-    (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * max(1, i) for i, n in enumerate(names)}))
-    with pytest.raises(ValueError, match="one camera take 000.png and 001.png at one moment; give them different times in .*times.json"):
-        open_log(own)
 
 
 def test_names_with_a_space_in_a_text_model_are_refused_with_the_fix(own):
@@ -212,16 +137,6 @@ def test_pictures_of_another_size_than_the_models_are_named_with_the_fix(own):
         with Image.open(file) as picture:
             picture.resize((48, 27)).save(file)
     with pytest.raises(ValueError, match="000.png is 48x27, but the model in .* has a camera of 96x54; put the pictures that the model"):
-        open_log(own)
-
-
-def test_a_clock_beside_the_model_is_read(own):
-    names = sorted(p.name for p in (own / "images").iterdir())
-    (own / "sparse/0/times.json").write_text(json.dumps({n: 40_000 * i for i, n in enumerate(names)}))
-    log = open_log(own)
-    assert log.camera("camera").times_us.diff().unique().tolist() == [40_000] and log.meta["clock"] == "times.json"
-    (own / "sparse/0/times.json").write_text(json.dumps({names[0]: 0}))
-    with pytest.raises(ValueError, match="times.json must give whole microseconds"):
         open_log(own)
 
 
@@ -267,52 +182,6 @@ def test_a_lens_that_is_not_read_is_named_with_the_fix(own):
         open_log(own)
 
 
-def lens_each(folder, focals):
-    """A text model of one lens, given lenses with these focal lengths in its place, which its pictures have by turns."""
-    model = folder / "sparse/0"
-    _, kind, width, height, _, _, cx, cy = (model / "cameras.txt").read_text().splitlines()[0].split()
-    (model / "cameras.txt").write_text("".join(f"{k} {kind} {width} {height} {f} {f} {cx} {cy}\n" for k, f in enumerate(focals, 1)))
-    lines = (model / "images.txt").read_text().splitlines()
-    for k in range(len(lines) // 2):
-        words = lines[2 * k].split()
-        lines[2 * k] = " ".join([*words[:8], str(k % len(focals) + 1), words[9]])
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-
-
-def test_photos_that_have_a_lens_each_share_one(own, workspace):
-    """As COLMAP's feature_extractor makes them by itself: one camera took them, and what it found of each picture is a little off."""
-    as_one = open_log(workspace, metres_per_unit=1 / UNIT).camera("camera")
-    lens_each(own, as_one.lens.fx * (1 + 0.01 * np.random.default_rng(0).standard_normal(12)))
-    log = open_log(own, metres_per_unit=1 / UNIT)
-    assert list(log.cameras) == ["camera"] and len(log.camera("camera").files) == 12
-    camera = log.camera("camera")
-    assert camera.lens.fx == pytest.approx(as_one.lens.fx, rel=2e-3)
-    torch.testing.assert_close(relative(camera.world_from_cam)[:, :3, :3], relative(as_one.world_from_cam)[:, :3, :3], atol=2e-3, rtol=0)
-    before, after = (sum(map(len, one.points.seen["camera"])) for one in (open_log(workspace), log))
-    assert 0.95 * before < after <= before  # points that one picture shows are held by nothing
-
-
-def test_photos_of_which_a_few_have_a_lens_each_are_no_rig(own):
-    lens_each(own, [57.6] * 4)
-    log = open_log(own, metres_per_unit=1.0)
-    assert list(log.cameras) == ["camera"] and len(log.camera("camera")) == 12
-    (own / "sparse/0/images.txt").write_text(re.sub(r"([1-4]) (\d+.png)", r"\1 c\1_\2", (own / "sparse/0/images.txt").read_text()))
-    for file in (own / "images").iterdir():
-        file.rename(file.with_name(f"c{int(file.stem) % 4 + 1}_{file.name}"))
-    assert list(open_log(own, metres_per_unit=1.0).cameras) == ["c1", "c2", "c3", "c4"], "by their names they are one"
-
-
-def test_lenses_that_are_alike_are_one_without_points_too(own):
-    lens_each(own, [57.6] * 12)
-    (own / "sparse/0/points3D.txt").write_text("")
-    lines = (own / "sparse/0/images.txt").read_text().splitlines()
-    (own / "sparse/0/images.txt").write_text("".join(f"{line}\n\n" for line in lines[::2]))
-    assert list(open_log(own, metres_per_unit=1.0).cameras) == ["camera"]
-    lens_each(own, [57.6] * 11 + [58.0])
-    with pytest.raises(ValueError, match=r"no points by which they could share one.*single_camera_per_folder 1"):
-        open_log(own, metres_per_unit=1.0)
-
-
 def test_poses_without_points_are_a_drive(own, workspace):
     """As those have who know their poses and write them for COLMAP: pictures are asked for points then."""
     (own / "sparse/0/points3D.txt").write_text("")
@@ -348,46 +217,12 @@ def test_a_model_is_read_whatever_lies_beside_it(own, workspace):
         open_log(own)
 
 
-def test_photos_through_several_lenses_are_refused(own):
-    lens_each(own, [57.6, 115.2] * 6)
-    images = own / "sparse/0/images.txt"
-    lines = images.read_text().splitlines()
-    for k in range(3, len(lines), 4):  # what every second one shows is twice as large
-        seen = np.array(lines[k].split(), dtype=float).reshape(-1, 3)
-        lines[k] = " ".join(f"{2 * u - 48} {2 * v - 27} {int(p)}" for u, v, p in seen)
-    images.write_text("\n".join(lines) + "\n")
-    with pytest.raises(ValueError, match=r"a lens for each picture or few, its points are .* pixels off.*zoomed"):
-        open_log(own)
-
-
 def test_without_pycolmap_the_fix_is_named(workspace, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(ValueError, match=r"pip install 'sidestep\[colmap\]'"):
         open_log(workspace)
-
-
-def test_photos_that_stand_apart_are_not_learnt_by_heart(street, drive, tmp_path):
-    log = open_log(write_colmap(tmp_path / "far", street, {"": pictures_along(street, count=6, step=4.0)}))
-    config = fit_config(log, ["camera"])
-    assert (config.steps, config.budget) == tuple(base + 6 * n for base, n in zip(FEW, PER_PHOTO, strict=True))
-    assert config.steps < FitConfig().steps
-    drive_config = fit_config(open_log(drive), ["front_camera"])
-    assert drive_config.steps > config.steps and drive_config.sh_degree > 0 and drive_config.drop == 0 < config.drop
-    assert fit_size(log, ["camera"]) == (96, 54)  # never larger than the pictures are
-
-
-def test_pictures_as_near_as_a_videos_are_fitted_as_a_drives(workspace, drive):
-    near = fit_config(open_log(workspace), ["camera"])
-    assert near.drop == 0 and near.steps > fit_config(open_log(drive), ["front_camera"]).steps  # of eight pictures, and these are twelve
-
-
-def test_a_fit_is_longer_and_finer_the_more_pictures_it_has(drive):
-    log = open_log(drive)
-    one, (first, last) = fit_config(log, ["front_camera"]), (int(t) for t in log.camera("front_camera").times_us[[0, -1]])
-    both, half = fit_config(log, ["front_camera", "front_camera"]), fit_config(log, ["front_camera"], (first, (first + last) // 2))
-    assert half.steps < one.steps < both.steps <= MOST[0] and half.budget < one.budget < both.budget <= MOST[1]
 
 
 @pytest.fixture(scope="module")
@@ -425,67 +260,6 @@ def test_lund_reads_with_all_its_pictures(shared):
     assert 60 < float(walked.norm(dim=1).sum()) < 180 and float(walked[:, 2].abs().sum()) < 0.05 * float(walked.norm(dim=1).sum())
     bodies = log.ego.world_from_body
     assert (bodies[:, 2, 2] > 0.97).all() and (bodies[:, 0, 0] > 0.8).all()
-
-
-@pytest.mark.parametrize(
-    "layout", ["{camera}_{i:03d}.png", "{i:03d}_{camera}.png", "cam{number}_{i}.png", "{i:03d}/{camera}.png", "run2/{camera}{i}.png"]
-)
-def test_pictures_of_one_moment_are_known_by_what_differs_in_a_cameras_names(street, tmp_path, layout):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    names = [layout.format(camera=c, number=k + 1, i=i) for k, c in enumerate(pair) for i in range(4)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names), metres_per_unit=1 / UNIT)
-    assert [c.times_us.tolist() for c in log.cameras.values()] == [[0, 500_000, 1_000_000, 1_500_000]] * 2
-    assert list(log.cameras) == (["cam1", "cam2"] if "{number}" in layout else ["front", "left"])
-    front, left = log.cameras
-    rig = log.rig(dict.fromkeys(log.cameras, (96, 54)))
-    apart = inverse(rig[front].body_from_cam) @ rig[left].body_from_cam
-    truth = inverse(street.rig["front_camera"].body_from_cam) @ street.rig["left_camera"].body_from_cam
-    torch.testing.assert_close(apart, truth, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("name", ["{us}.png", "{us}000.png", "f_{ms}_x.png", "{s:.6f}.png"])
-def test_names_that_are_times_are_a_clock(street, tmp_path, name, capsys):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    begun = 1533151603547000
-    times = [begun + 100_000 * i + 20_000 * k for k in range(2) for i in range(4)]
-    names = [f"{c}/" + name.format(us=t, ms=t // 1000, s=t / 1e6) for t, c in zip(times, 4 * ["front"] + 4 * ["left"], strict=True)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert log.cameras["front"].times_us.tolist() == [0, 100_000, 200_000, 300_000]
-    assert log.cameras["left"].times_us.tolist() == [20_000, 120_000, 220_000, 320_000] and not capsys.readouterr().err
-    assert log.meta["clock"] == "times in the pictures' names"
-
-
-def test_pictures_that_another_camera_took_before_or_after_the_first_are_named(street, tmp_path, capsys):
-    pair = {"front": pictures_along(street, count=5), "left": pictures_along(street, "left_camera", count=5)}
-    names = [f"{c}_{i + 2 * k:03d}.png" for k, c in enumerate(pair) for i in range(5)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert [len(c) for c in log.cameras.values()] == [5, 3] and len(log.points.seen["left"]) == 3
-    assert "2 of 5 pictures of left are left out, the first of them" in capsys.readouterr().err
-
-
-def test_names_that_are_numbers_tell_how_far_between_a_picture_was_taken(street, tmp_path, capsys):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    names = [f"{c}/{100_000 * i + 20_000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert log.cameras["front"].times_us.tolist() == [0, 500_000, 1_000_000, 1_500_000]
-    assert log.cameras["left"].times_us.tolist() == [100_000, 600_000, 1_100_000, 1_600_000]
-    assert not capsys.readouterr().err
-
-
-def test_a_camera_that_took_nothing_in_the_others_time_is_left_out_with_the_fix(street, tmp_path, capsys):
-    pair = {"front": pictures_along(street, count=4), "left": pictures_along(street, "left_camera", count=4)}
-    names = [f"{c}/{i + 1000 * k}.png" for k, c in enumerate(pair) for i in range(4)]
-    log = open_log(renamed(write_colmap(tmp_path / "pair", street, pair), names))
-    assert list(log.cameras) == ["front"]
-    assert "camera left is left out, for it took no picture while front did; name pictures of one moment alike" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("unit", [1, 0.04])
-def test_a_clock_of_another_unit_is_refused(own, unit):
-    names = sorted(p.name for p in (own / "images").iterdir())
-    (own / "sparse/0/times.json").write_text(json.dumps({n: unit * i for i, n in enumerate(names)}))
-    with pytest.raises(ValueError, match="times.json must give whole microseconds by picture name; it has 0"):
-        open_log(own)
 
 
 def test_a_model_is_found_where_tools_leave_it_and_the_nearest_is_taken(own, workspace):

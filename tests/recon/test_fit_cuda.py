@@ -10,8 +10,10 @@ import torch
 import walker
 
 from recon import open_log, reconstruct
-from recon.build import assemble, begin, choose
+from recon.assemble import assemble
+from recon.begin import begin
 from recon.checkpoint import load_checkpoint, save_checkpoint
+from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.report import held_out_table

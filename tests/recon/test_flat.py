@@ -3,17 +3,18 @@
 import numpy as np
 import pytest
 import torch
+from quick_fit import CONFIG, SIZE
 from randomized import gaussians
 
 from recon import open_log
-from recon.build import begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.descent import COLOURS, Descent, rates_at
 from recon.fit.flat import ON, OVER, PRESSED, SUNK, THIN, UNDER, FlatGround
 from recon.fit.model import Splats
 from recon.ground import BARE, GROUND
 from scenes.ground import Ground
 from scenes.poses import matrix_from_quat
-from tests.recon.test_fit import CONFIG, SIZE
 
 SLOPE = (0.1, -0.05)
 UP = torch.nn.functional.normalize(torch.tensor([-SLOPE[0], -SLOPE[1], 1.0]), dim=0)

@@ -9,9 +9,10 @@ import pytest
 import torch
 from painted import drive as drive_without_lidar
 from PIL import Image
+from quick_fit import CONFIG, SIZE
 
 from recon import open_log, reconstruct
-from recon.build import begin
+from recon.begin import begin
 from recon.frames import load_frames
 from recon.gains import gains_along
 from recon.log import Packed
@@ -21,7 +22,6 @@ from scenes import load
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import Pinhole
 from scenes.report import validate
-from tests.recon.test_fit import CONFIG, SIZE
 
 TRUE = np.exp(-0.13 * np.arange(8)) * [1, 1, 1.1, 1, 1, 0.9, 1, 1]
 """Gains of eight frames, from 1 to 0.4, not all of which fall evenly."""

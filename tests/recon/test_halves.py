@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from quick_fit import CONFIG, SIZE
 
 from recon import open_log
-from recon.build import begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.halves import INSTEAD, halves, outdone
 from recon.fit.model import Splats
 from recon.fit.unseen import SEEN
@@ -17,7 +19,6 @@ from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import translation
 from scenes.shade import BLACK
-from tests.recon.test_fit import CONFIG, SIZE
 from tests.recon.test_flanks import an_end
 
 BOX = np.array([4.0, 2.0, 1.5])

@@ -8,8 +8,10 @@ import pytest
 import torch
 import walker
 
+from recon.assemble import assemble
 from recon.assets.extract import at_rest
-from recon.build import assemble, begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.tracks import LIMBED

@@ -6,7 +6,8 @@ import torch
 from PIL import Image
 
 from recon import open_log, reconstruct
-from recon.build import begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.live import EVERY, Live
 from recon.report import EQUAL_DB

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from recon import open_log
-from recon.build import choose
+from recon.defaults import choose
 from recon.frames import load_frames
 from recon.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
 from recon.road import photo_at, road_errors, road_points

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from quick_fit import CONFIG, SIZE
 
 from recon import open_log
 from recon.assets.cleaning import lies_on_road
-from recon.build import begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.densify import shade_of
 from recon.fit.model import Splats
 from recon.log import Track
@@ -19,7 +21,6 @@ from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Pinhole
 from scenes.poses import translation
-from tests.recon.test_fit import CONFIG, SIZE
 
 FLAT = Ground(torch.full((41, 41), 2.0), (-20.0, -20.0), 1.0)
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from quick_fit import CONFIG, SIZE
 
 from recon import open_log
-from recon.build import begin, choose
+from recon.begin import begin
+from recon.defaults import choose
 from recon.fit.fit import GUESSED_FROM
 from recon.fit.model import Splats
 from recon.fit.unseen import NEIGHBOURS, SEEN, SWOLLEN, Shown, as_neighbours, curtains, footprint, pennants, swollen
@@ -19,7 +21,6 @@ from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Fisheye, Pinhole
 from scenes.shade import BLACK
 from tests.bench.presets import random_splats
-from tests.recon.test_fit import CONFIG, SIZE
 
 AHEAD = Camera(Pinhole(160.0, 160.0, 128.0, 96.0), 256, 192, torch.eye(4, dtype=torch.float64))
 
