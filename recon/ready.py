@@ -12,8 +12,8 @@ from recon.checkpoint import tracks_of
 from recon.corrected import as_corrected
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
-from recon.mounts import mounts_by_road
-from recon.turned import turned_by_surfaces
+from recon.mounts_by_road import mounts_by_road
+from recon.mounts_by_surfaces import mounts_by_surfaces
 from recon.movers.search import with_movers
 from recon.offpath import held_out_sweeps
 from render.progress import Progress
@@ -58,7 +58,7 @@ def _corrected(
             log = aligned(log, sweeps, steps.step)
     if "surfaces" in config.refine:
         with Progress("surfaces", total=len(names)) as steps:
-            log = turned_by_surfaces(log, names, same_sweeps(log, sweeps), span, steps.step)
+            log = mounts_by_surfaces(log, names, same_sweeps(log, sweeps), span, steps.step)
     if "road" in config.refine:
         with Progress("mounts", total=len(names)) as steps:
             log = mounts_by_road(log, names, same_sweeps(log, sweeps), span, steps.step)

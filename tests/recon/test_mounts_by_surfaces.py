@@ -12,10 +12,10 @@ from PIL import Image
 from scipy import ndimage
 
 from recon.corrected import TURNED, as_corrected
-from recon.fit.model import small_poses
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
-from recon.turned import turned_by_surfaces
+from recon.mounts_by_surfaces import mounts_by_surfaces
 from scenes.lenses import Pinhole
+from recon.fit.model import small_poses
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -105,8 +105,8 @@ def left_off(log: Log, off: tuple[float, ...], late_us: int = 0) -> np.ndarray:
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """Of a street that is all surfaces, less has to be looked at."""
-    monkeypatch.setattr("recon.turned.PAIRS", 6)
-    monkeypatch.setattr("recon.turned.PIECES", 60)
+    monkeypatch.setattr("recon.mounts_by_surfaces.PAIRS", 6)
+    monkeypatch.setattr("recon.patches.PATCHES", 60)
 
 
 @pytest.mark.parametrize(
@@ -116,13 +116,13 @@ def few(monkeypatch):
 )
 def test_a_camera_that_looks_elsewhere_is_turned_back(off, late_us, capsys):
     log, reports = drive(off, late_us), []
-    better = turned_by_surfaces(log, ["front"], log.sweeps, ALL, lambda: reports.append(1))
+    better = mounts_by_surfaces(log, ["front"], log.sweeps, ALL, lambda: reports.append(1))
     rest = left_off(better, off, late_us)
     assert rest[:2].max() < 0.002 and rest[3:5].max() < 0.02, "where it looks, and stands"
     assert rest[2] < 0.004 and rest[5] < 0.1, "what so few tell less well"
     assert abs(int(better.camera("front").times_us[0]) - late_us) < 10_000
     assert "front is taken turned by 0." in capsys.readouterr().err and len(reports) == 1
-    assert turned_by_surfaces(better, ["front"], better.sweeps, ALL) is better, "where its pictures meet"
+    assert mounts_by_surfaces(better, ["front"], better.sweeps, ALL) is better, "where its pictures meet"
     again = as_corrected(log, json.loads(json.dumps(better.meta)))
     assert torch.equal(again.camera("front").world_from_cam, better.camera("front").world_from_cam)
     assert torch.equal(again.camera("front").times_us, better.camera("front").times_us)
@@ -131,14 +131,14 @@ def test_a_camera_that_looks_elsewhere_is_turned_back(off, late_us, capsys):
 
 def test_what_a_fit_copes_with_is_left_to_it():
     log = drive((0.0, 0.004, 0.0, 0.0, 0.0, 0.0))
-    assert turned_by_surfaces(log, ["front"], log.sweeps, ALL) is log
+    assert mounts_by_surfaces(log, ["front"], log.sweeps, ALL) is log
 
 
 @pytest.mark.parametrize("readout_us", [0, 60_000])
 def test_a_camera_that_looks_as_recorded_is_left_alone(readout_us, capsys):
     """However its rows are read."""
     log = drive(readout_us=readout_us)
-    assert turned_by_surfaces(log, ["front"], log.sweeps, ALL) is log and not capsys.readouterr().err
+    assert mounts_by_surfaces(log, ["front"], log.sweeps, ALL) is log and not capsys.readouterr().err
 
 
 def test_pictures_that_meet_nowhere_tell_nothing():
@@ -147,15 +147,15 @@ def test_pictures_that_meet_nowhere_tell_nothing():
     shaken = torch.from_numpy(np.random.default_rng(1).normal(0, (0.003,) * 3 + (0.1,) * 3, (COUNT, 6)))
     camera = replace(log.camera("front"), world_from_cam=log.camera("front").world_from_cam @ small_poses(shaken))
     log = replace(log, cameras={"front": camera})
-    assert turned_by_surfaces(log, ["front"], log.sweeps, ALL) is log
+    assert mounts_by_surfaces(log, ["front"], log.sweeps, ALL) is log
 
 
 def test_where_nothing_tells_nothing_is_turned():
     log = drive((0.0, 0.0087, 0.0, 0.0, 0.0, 0.0))
-    assert turned_by_surfaces(log, ["front"], (), ALL) is log, "no lidar"
-    assert turned_by_surfaces(log, ["front"], log.sweeps, (0, 100_000)) is log, "it has hardly moved"
+    assert mounts_by_surfaces(log, ["front"], (), ALL) is log, "no lidar"
+    assert mounts_by_surfaces(log, ["front"], log.sweeps, (0, 100_000)) is log, "it has hardly moved"
     behind = replace(log, sweeps=tuple(replace(s, time_us=s.time_us + 10_000_000) for s in log.sweeps))
-    assert turned_by_surfaces(log, ["front"], behind.sweeps, ALL) is log, "no sweep was taken then"
+    assert mounts_by_surfaces(log, ["front"], behind.sweeps, ALL) is log, "no sweep was taken then"
     here = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     around = Track("veh_1", "truck", True, np.array([200.0, 200.0, 20.0]), np.array(ALL), here, np.array([-1, -1]), ())
-    assert turned_by_surfaces(replace(log, tracks=(around,)), ["front"], log.sweeps, ALL).meta == {}, "all of it moves along"
+    assert mounts_by_surfaces(replace(log, tracks=(around,)), ["front"], log.sweeps, ALL).meta == {}, "all of it moves along"

@@ -1,11 +1,11 @@
-"""Cameras that are fixed to the car elsewhere than recorded: what their pictures show of the road does not meet.
+"""Corrects the height and tilt of cameras by the road: what their pictures show of it must meet on the ground.
 
-A mount that is off by centimetres hardly shows in what stands upright. A picture carried onto the ground by it (inverse perspective
-mapping, Mallot et al. 1991) is off by as many percent of its distance as the height is, so that a line seen from 13 m lies elsewhere than
-from 10. Splats make up for that by lying thick, at angles that look right from the recorded path, and a painted dash becomes a fir from
-beside it. Of two pictures, one taken a few metres after the other, the same pieces of bare road are laid out and correlated. A camera
-that is tilted shows much the same as one that stands too low, but the more so the farther off a piece is; what this leaves open is settled
-by how far off mounts are likely to be.
+A mount that is off by centimetres hardly shows in what stands upright. But a picture projected onto the ground with it (inverse perspective
+mapping, Mallot et al. 1991) is off by as many percent of its distance as the camera's height is, so that a line seen from 13 m lies
+elsewhere than from 10 m. Splats compensate by being thick, at angles that look right from the recorded path, and from beside it a painted
+dash becomes a fir. Here the same pieces of bare road are projected from pairs of pictures, one taken a few metres after the other, and
+correlated. Tilt has nearly the effect of a wrong height, but one that grows with distance; what remains open is settled by a prior of how
+large errors of mounts are likely to be.
 """
 
 from __future__ import annotations

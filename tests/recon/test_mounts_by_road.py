@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from recon.corrected import REMOUNTED, as_corrected
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
-from recon.mounts import mounts_by_road
+from recon.mounts_by_road import mounts_by_road
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory
 
