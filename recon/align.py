@@ -1,8 +1,9 @@
-"""A drive whose lidar sweeps do not meet where its recorded poses put them: the path is bent until they do.
+"""Corrects the path of a drive whose lidar sweeps do not agree by its recorded poses.
 
 Heights by GPS drift by decimetres within seconds (KITTI), or are not recorded at all (nuScenes), and splats made from such sweeps lie in
-layers. Every sweep is laid on others that saw the same surfaces, point to plane (Chen and Medioni 1992), and all poses are found
-together, as a pose graph whose steps recorded poses hold: what sweeps do not tell, as the way along a bare road, stays as it was.
+layers. Every sweep is registered point to plane (Chen and Medioni 1992) to others that saw the same surfaces, and all poses are optimised
+together in a pose graph, with the recorded motion as a prior: what sweeps do not determine, as the way along a bare road, stays as
+recorded.
 """
 
 from __future__ import annotations
@@ -18,45 +19,45 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from recon.corrected import MOVED, as_corrected
-from recon.fit.model import small_poses
 from recon.log import Log, Sweep
+from scenes.poses import small_poses
 
 APART = (1, 3, 9, 27)
-"""Sweeps apart that are laid on one another."""
+"""Numbers of sweeps between those that are registered to each other."""
 
 CELL, FARTHEST = 0.25, 60.0
-"""Metres: a sweep keeps one point of each such cell, and none from farther off."""
+"""Metres: a sweep keeps one point in each such cell, and none from farther away."""
 
 KEPT = 8000
-"""Of these, spread over all, about as many are asked for the surface there."""
+"""Points of these, spread evenly, at which a plane is fitted."""
 
 NEIGHBOURS, FLAT = 12, 0.1
-"""Points that span a surface, and its thickness at most, in parts of its smaller extent; so much of the larger that has to be, too, or the
-points lie on one of the lidar's rings and may span anything."""
+"""Points that span a plane, and its largest thickness, as a part of its smaller extent; the smaller extent must be at least as large a part
+of the larger, or the points lie on one of the lidar's rings and could span anything."""
 
 TOGETHER_US = 25_000
-"""Sweeps that begin within so much time are one: a car's lidars turn together."""
+"""Sweeps that begin within this time are one: a car's lidars turn together."""
 
 SAMPLES = 1500
-"""Points of a sweep that are laid on another one."""
+"""Points of a sweep that are registered to another one."""
 
 REACH = (1.0, 0.7, 0.5, 0.3, 0.3)
-"""Metres up to which a surface is looked for, round by round."""
+"""Metres up to which a plane is searched for, round by round."""
 
 ALIKE = 20.0
-"""Neighbouring points err alike: so many count as one."""
+"""Neighbouring points have the same errors: so many count as one."""
 
 STEP = (3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)
-"""Radians and metres by which the correction of one sweep is likely to differ from the next one's."""
+"""Standard deviations, in radians and metres, of the difference between the corrections of consecutive sweeps."""
 
 WHOLE = (0.05, 0.05, 0.05, 2.0, 2.0, 2.0)
-"""The same of a correction itself."""
+"""Standard deviations of a correction itself."""
 
 PROBE = 4
-"""Every which sweep is looked at to see whether anything is to be done."""
+"""Every how many sweeps one is tried, to see whether anything has to be corrected."""
 
 WORTH = 0.03
-"""Metres by which corrections must differ over the sweeps that are laid on one another for them to be made."""
+"""Metres by which corrections of sweeps that are registered to each other must differ for corrections to be made."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.flat import FlatGround
-from recon.fit.model import Knots
+from recon.fit.knots import Knots
 from recon.fit.limbs import Limbs
 from recon.fit.motion import Motion
 from recon.fit.population import Population

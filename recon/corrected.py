@@ -1,6 +1,7 @@
-"""What was found wrong with a recording, put right: all that it knows of the world is moved along a corrected path, and cameras on the car.
+"""Applies corrections to a recording: everything in its world moves along with a corrected path, and cameras move on the car.
 
-A log and the scenes fitted to it say in their `meta` what was corrected, so that it can be done again to the recording as it is read.
+A log and the scenes fitted to it keep the corrections in their `meta`, so that they can be applied to the recording again when it is read
+anew.
 """
 
 from __future__ import annotations
@@ -10,9 +11,8 @@ from dataclasses import replace
 
 import torch
 
-from recon.fit.model import small_poses
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
-from scenes.poses import inverse
+from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
 
 MOVED = "path_correction"

@@ -19,8 +19,7 @@ from recon.log import Log, LogCamera
 from recon.mounts_by_road import SOON_US
 from recon.project import NEAREST, nearest_around
 from scenes.camera import Camera
-from recon.fit.model import small_poses
-from scenes.poses import inverse
+from scenes.poses import inverse, small_poses
 
 WIDTH, SMOOTH = 960, 25
 """Pixels across at which pictures are compared, and the window, in pixels, whose mean brightness is taken out."""

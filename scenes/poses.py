@@ -1,4 +1,6 @@
-"""Rigid poses as float64 `[..., 4, 4]` matrices: quaternions, inverse, interpolation."""
+"""Rigid poses as float64 `[..., 4, 4]` matrices: quaternions, inverse, interpolation, small motions."""
+
+import math
 
 import numpy as np
 import torch
@@ -124,3 +126,24 @@ def interpolate(a: torch.Tensor, b: torch.Tensor, u) -> torch.Tensor:
     u = torch.as_tensor(u, dtype=torch.float64, device=a.device)
     quat = slerp(quat_from_matrix(a[..., :3, :3]), quat_from_matrix(b[..., :3, :3]), u)
     return pose_from(quat, a[..., :3, 3] + u[..., None] * (b[..., :3, 3] - a[..., :3, 3]))
+
+
+_GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
+"""Of SE(3): rotations about the three axes, then translations along them."""
+for _axis, (_i, _j) in enumerate(((2, 1), (0, 2), (1, 0))):
+    _GENERATORS[_axis, _i, _j], _GENERATORS[_axis, _j, _i], _GENERATORS[3 + _axis, _axis, 3] = 1, -1, 1
+
+_POWERS = torch.arange(20, dtype=torch.float64)
+_SERIES = torch.tensor([[(-1) ** k / math.factorial(2 * k + n) for n in (2, 3)] for k in range(20)], dtype=torch.float64)
+"""Taylor series of (1 - cos a) / a^2 and (a - sin a) / a^3 in a^2: exact to float64's last digits up to a whole turn, and smooth at 0."""
+
+
+def small_poses(deltas: torch.Tensor) -> torch.Tensor:
+    """Poses `[..., 4, 4]` of small motions `[..., 6]`: rotation vector (radians, less than a turn), then translation (metres), by the
+    exponential map, which of such a matrix is a cubic (Rodrigues' formula)."""
+    deltas = deltas.to(torch.float64)
+    once = (deltas @ _GENERATORS.flatten(1)).unflatten(-1, (4, 4))
+    twice = once @ once
+    square = deltas[..., :3].square().sum(-1, keepdim=True)
+    second, third = (square**_POWERS @ _SERIES)[..., None, None].unbind(-3)
+    return torch.eye(4, dtype=torch.float64) + once + second * twice + third * (twice @ once)

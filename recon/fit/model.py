@@ -1,12 +1,10 @@
-"""What the fit changes: the splats of background and actors, the sky, the exposures, and small corrections of poses."""
+"""The splats of a fit, those of the background and of all actors together, and how they are rendered."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 
 from render import rasterize
@@ -14,8 +12,6 @@ from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed, SplatModel
 from scenes.harmonics import brighter
-from scenes.poses import interpolate
-from scenes.trajectory import Trajectory
 
 FIELDS = ("means", "quats", "log_scales", "logits", "sh")
 
@@ -80,76 +76,6 @@ class Splats:
 
 
 _STILL = torch.eye(4, dtype=torch.float64)
-
-_GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
-"""What turning about each axis, and moving along it, adds to a small motion's matrix."""
-for _axis, (_i, _j) in enumerate(((2, 1), (0, 2), (1, 0))):
-    _GENERATORS[_axis, _i, _j], _GENERATORS[_axis, _j, _i], _GENERATORS[3 + _axis, _axis, 3] = 1, -1, 1
-
-_POWERS = torch.arange(20, dtype=torch.float64)
-_SERIES = torch.tensor([[(-1) ** k / math.factorial(2 * k + n) for n in (2, 3)] for k in range(20)], dtype=torch.float64)
-"""Of (1 - cos a) / a^2 and (a - sin a) / a^3 in powers of a^2: to float64's last digits for up to a whole turn, and smooth at 0."""
-
-
-def small_poses(deltas: torch.Tensor) -> torch.Tensor:
-    """Poses `[..., 4, 4]` of small motions `[..., 6]`: rotation vector (radians, less than a turn), then translation (metres), by the
-    exponential map, which of such a matrix is a cubic (Rodrigues' formula)."""
-    deltas = deltas.to(torch.float64)
-    once = (deltas @ _GENERATORS.flatten(1)).unflatten(-1, (4, 4))
-    twice = once @ once
-    square = deltas[..., :3].square().sum(-1, keepdim=True)
-    second, third = (square**_POWERS @ _SERIES)[..., None, None].unbind(-3)
-    return _STILL + once + second * twice + third * (twice @ once)
-
-
-def scaled(raw: torch.Tensor, radians: float, metres: float) -> torch.Tensor:
-    """A correction `[..., 6]` in its units as radians and metres."""
-    return raw * raw.new_tensor([radians] * 3 + [metres] * 3)
-
-
-def _between(times_us: np.ndarray, at_us: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """For each moment the index of the earlier neighbour and the share of the later one; beyond 0..1 outside."""
-    if len(times_us) == 1:
-        return torch.zeros(len(at_us), dtype=torch.long), torch.zeros(len(at_us), dtype=torch.float64)
-    k = np.searchsorted(times_us, at_us).clip(1, len(times_us) - 1) - 1
-    return torch.from_numpy(k), torch.from_numpy((at_us - times_us[k]) / (times_us[k + 1] - times_us[k]))
-
-
-class Knots:
-    """A trajectory with small corrections `[K, 6]` in the body's own frame at some of its times, the knots; between them linear.
-
-    Poses that nothing trains, those of held-out frames, are no knots: their neighbours' corrections carry them.
-    """
-
-    def __init__(self, trajectory: Trajectory, knots_us: torch.Tensor | None = None):
-        self.trajectory = trajectory
-        self.knots_us = trajectory.times_us if knots_us is None else knots_us
-        self.deltas = torch.zeros(len(self.knots_us), 6)
-
-    def base(self, times_us: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Uncorrected poses `[V, 4, 4]` at times, and for each the earlier knot and the share of the later one."""
-        k, u = _between(self.trajectory.times_us.numpy(), times_us)
-        poses = self.trajectory.world_from_body
-        knot, share = _between(self.knots_us.numpy(), times_us)
-        # corrections are held, not extrapolated, beyond the first and last knot
-        return interpolate(poses[k], poses[(k + 1).clamp_max(len(poses) - 1)], u), knot, share.clamp(0, 1)
-
-    def correction(self, knot: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-        """Small motions `[..., 6]` between knots; differentiable in `deltas`."""
-        after = (knot + 1).clamp_max(len(self.deltas) - 1)
-        share = share.to(self.deltas)[..., None]
-        return self.deltas[knot] * (1 - share) + self.deltas[after] * share
-
-    def corrected(self, radians: float, metres: float) -> Trajectory:
-        """The trajectory with its corrections, in these units, applied."""
-        _, knot, share = self.base(self.trajectory.times_us.numpy())
-        deltas = scaled(self.correction(knot, share).detach(), radians, metres)
-        return replace(self.trajectory, world_from_body=self.trajectory.world_from_body @ small_poses(deltas))
-
-    def unrest(self) -> torch.Tensor:
-        """Sum of squared second differences of the corrections: bodies do not shake."""
-        d = self.deltas
-        return (d[2:] - 2 * d[1:-1] + d[:-2]).square().sum() if len(d) > 2 else d.sum() * 0
 
 
 def dimmed_actors(splats: Splats, gain: torch.Tensor | None) -> Splats:

@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from recon.fit.model import Knots, Splats, scaled, small_poses
+from recon.fit.knots import Knots, scaled
+from recon.fit.model import Splats
 from recon.fit.shutter import readout_shifts
 from recon.frames import Frames
 from recon.log import Track
 from recon.view import View
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import OpenCV, Pinhole
-from scenes.poses import inverse
+from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
 
 EGO, EXTRINSIC, ACTOR = (1e-3, 1e-2), (1e-3, 1e-3), (1e-2, 5e-2)

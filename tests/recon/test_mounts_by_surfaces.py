@@ -15,8 +15,7 @@ from recon.corrected import TURNED, as_corrected
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
 from recon.mounts_by_surfaces import mounts_by_surfaces
 from scenes.lenses import Pinhole
-from recon.fit.model import small_poses
-from scenes.poses import inverse
+from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
 
 COUNT, STEP_US, SPEED = 12, 100_000, 10.0

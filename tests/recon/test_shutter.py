@@ -7,7 +7,8 @@ from randomized import gaussians
 from street import START_US, rig, street
 
 from recon.album import at_once
-from recon.fit.model import Knots, Splats
+from recon.fit.knots import Knots
+from recon.fit.model import Splats
 from recon.fit.motion import EGO, Motion
 from recon.fit.shutter import as_read
 from recon.frames import Frames

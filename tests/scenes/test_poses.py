@@ -16,6 +16,7 @@ from scenes.poses import (
     pose_from,
     quat_from_matrix,
     slerp,
+    small_poses,
     translation,
     yaw,
     yaw_of,
@@ -116,3 +117,27 @@ def test_the_nearest_rotation_mirrors_nothing():
     assert torch.allclose(near @ near.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3), rtol=0, atol=1e-12)
     turn = yaw(0.7)[:3, :3]
     assert torch.allclose(nearest_rotation(1.3 * turn), turn, rtol=0, atol=1e-14)
+
+
+def test_small_poses_are_the_exponential_map():
+    delta = torch.tensor([[0.0, 0.0, 0.3, 1.0, 2.0, 3.0], [0.0] * 6])
+    poses = small_poses(delta)
+    torch.testing.assert_close(poses[1], torch.eye(4, dtype=torch.float64))
+    assert float(torch.atan2(poses[0, 1, 0], poses[0, 0, 0])) == pytest.approx(0.3, abs=1e-6)
+    torch.testing.assert_close(small_poses(-delta[0]) @ poses[0], torch.eye(4, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.02, 1.0, math.pi - 1e-9, math.pi, 6.2])
+def test_small_poses_and_their_gradients_are_those_of_the_matrix_exponential(angle):
+    generator = torch.Generator().manual_seed(2)
+    deltas, weights = (torch.randn(20, *shape, dtype=torch.float64, generator=generator) for shape in ((6,), (4, 4)))
+    deltas[:, :3] *= angle / deltas[:, :3].norm(dim=1, keepdim=True)
+    deltas.requires_grad_()
+    found = small_poses(deltas)
+    x, y, z, *moved = deltas.unbind(1)
+    o = torch.zeros_like(x)
+    rows = ([o, -z, y, moved[0]], [z, o, -x, moved[1]], [-y, x, o, moved[2]], [o] * 4)
+    exact = torch.linalg.matrix_exp(torch.stack([torch.stack(row, 1) for row in rows], 1))
+    torch.testing.assert_close(found, exact, atol=1e-13, rtol=0)
+    slopes = [torch.autograd.grad((poses * weights).sum(), deltas, retain_graph=True)[0] for poses in (found, exact)]
+    torch.testing.assert_close(*slopes, atol=1e-12, rtol=0)
