@@ -8,11 +8,12 @@ from randomized import gaussians
 from scipy.spatial import cKDTree
 
 from recon import open_log
+from recon.body_path import body_path
 from recon.frames import Frames, load_frames
 from recon.log import Log, LogCamera
+from recon.seeds.actors import even_limit
 from recon.seeds.carpet import carpet
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, nearest_box, splats_from, thin
-from recon.start import body_path, even_limit
 from recon.view import View
 from scenes.camera import RigCamera
 from scenes.ground import Ground
