@@ -43,16 +43,20 @@ class Residual(nn.Module):
         return x + self.second(F.silu(self.first(F.silu(x))))
 
 
+QUARTER, EIGHTH = 48, 96
+"""Channels at a quarter and at an eighth of the picture's size."""
+
+
 class Encoder(nn.Module):
     """sRGB `[B, 3, H, W]` in 0..1, sides multiples of 8, to latents `[B, 16, H/8, W/8]` of about unit variance."""
 
-    def __init__(self, quarter: int = 48, eighth: int = 96):
+    def __init__(self):
         super().__init__()
-        self.stem = nn.Conv2d(48, quarter, 3, padding=1)
-        self.quarter = Residual(quarter)
-        self.down = nn.Conv2d(quarter, eighth, 3, stride=2, padding=1)
-        self.eighth = nn.Sequential(Residual(eighth), Residual(eighth))
-        self.head = nn.Conv2d(eighth, LATENT, 1)
+        self.stem = nn.Conv2d(48, QUARTER, 3, padding=1)
+        self.quarter = Residual(QUARTER)
+        self.down = nn.Conv2d(QUARTER, EIGHTH, 3, stride=2, padding=1)
+        self.eighth = nn.Sequential(Residual(EIGHTH), Residual(EIGHTH))
+        self.head = nn.Conv2d(EIGHTH, LATENT, 1)
 
     def features(self, rgb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Features at a quarter `[B, 48, H/4, W/4]` and an eighth `[B, 96, H/8, W/8]` of the size, and the latents."""
@@ -67,13 +71,13 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """Latents `[B, 16, H/8, W/8]` back to sRGB `[B, 3, H, W]`."""
 
-    def __init__(self, quarter: int = 48, eighth: int = 96):
+    def __init__(self):
         super().__init__()
-        self.stem = nn.Conv2d(LATENT, eighth, 3, padding=1)
-        self.eighth = nn.Sequential(Residual(eighth), Residual(eighth))
-        self.up = nn.Conv2d(eighth, quarter * 4, 1)
-        self.quarter = Residual(quarter)
-        self.head = nn.Conv2d(quarter, 48, 3, padding=1)
+        self.stem = nn.Conv2d(LATENT, EIGHTH, 3, padding=1)
+        self.eighth = nn.Sequential(Residual(EIGHTH), Residual(EIGHTH))
+        self.up = nn.Conv2d(EIGHTH, QUARTER * 4, 1)
+        self.quarter = Residual(QUARTER)
+        self.head = nn.Conv2d(QUARTER, 48, 3, padding=1)
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
         x = F.pixel_shuffle(self.up(self.eighth(self.stem(latent))), 2)

@@ -116,9 +116,9 @@ class Clip:
         """Photo `t` as float32 `[H, W, 3]` in 0..1."""
         return self.photos[t].float() / 255
 
-    def render(self, scene: Scene, *outputs: str, shadows: bool = True) -> list[Frame]:
+    def render(self, scene: Scene, *outputs: str) -> list[Frame]:
         """What a scene shows to the clip's cameras, on the host."""
-        return [frame.to("cpu") for frame in self.draw(scene.to(self.device), *outputs, shadows=shadows)]
+        return [frame.to("cpu") for frame in self.draw(scene.to(self.device), *outputs)]
 
     def draw(self, scene: Scene, *outputs: str, shadows: bool = True) -> list[Frame]:
         """The same where the scene is."""
