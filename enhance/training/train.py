@@ -118,27 +118,34 @@ def train(
     made_folder(out)
     report = _Reporter(run, progress)
     with Stops() as stops:
-        go = partial(_stage, run, checkpoint, save_every, report, stops)
-        go("autoencoder", partial(draw_images, run, sampler), partial(autoencoder_step, run))
-        if "autoencoder" in run.stages:
-            run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
-        go("prior", partial(draw_right, run, sampler), partial(prior_step, run))
-        go("objects", lambda step: sampler.objects(4 * step + 3, config.looked_at), partial(objects_step, run))
-        if "objects" in run.stages and not run.passed("objects"):  # else the checkpoint has it
-            run.save(checkpoint)  # what follows takes long, and a training that is killed in it must not have been in vain
-            _learn_usual(run, sampler, report, stops)
-        # its objects are read once and then cheap to draw: further processes would each have to read them
-        go("shade", lambda step: sampler.grounds(step, 2 * config.looked_at), partial(shade_step, run), processes=0)
-        now = run.net.state_dict()
-        frozen = {k: v for k, v in now.items() if k.startswith(FROZEN)}
-        run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
-        for name, parameter in run.net.named_parameters():
-            parameter.requires_grad_(not name.startswith(FROZEN))
-        go("enhancer", partial(draw_clips, run, sampler), partial(enhancer_step, run, perceptual))
+        _all_stages(run, sampler, perceptual, checkpoint, save_every, report, stops)
     run.save(checkpoint)
     header = {**(about or {}), **_made_of(pair_set, photos, origin), **_made_by(run)}
     save_net(run.average, weights, {**header, **_gain(run, pair_set, origin, report)})
     return weights
+
+
+def _all_stages(
+    run: Run, sampler: Sampler, perceptual: PatchPerceptual, checkpoint: Path, save_every: float, report: _Reporter, stops: Stops
+) -> None:
+    """Train the run's stages, one after the other; those that a checkpoint has passed are skipped."""
+    go = partial(_stage, run, checkpoint, save_every, report, stops)
+    go("autoencoder", partial(draw_images, run, sampler), partial(autoencoder_step, run))
+    if "autoencoder" in run.stages:
+        run.net.encoder.load_state_dict(run.autoencoder.encoder.state_dict())
+    go("prior", partial(draw_right, run, sampler), partial(prior_step, run))
+    go("objects", lambda step: sampler.objects(4 * step + 3, run.config.looked_at), partial(objects_step, run))
+    if "objects" in run.stages and not run.passed("objects"):  # else the checkpoint has it
+        run.save(checkpoint)  # what follows takes long, and a training that is killed in it must not have been in vain
+        _learn_usual(run, sampler, report, stops)
+    # its objects are read once and then cheap to draw: further processes would each have to read them
+    go("shade", lambda step: sampler.grounds(step, 2 * run.config.looked_at), partial(shade_step, run), processes=0)
+    now = run.net.state_dict()
+    frozen = {k: v for k, v in now.items() if k.startswith(FROZEN)}
+    run.average.load_state_dict(now if run.step["enhancer"] == 0 else run.average.state_dict() | frozen)
+    for name, parameter in run.net.named_parameters():
+        parameter.requires_grad_(not name.startswith(FROZEN))
+    go("enhancer", partial(draw_clips, run, sampler), partial(enhancer_step, run, perceptual))
 
 
 def _made_of(pairs: PairSet | None, photos: Sequence[str | Path], origin: dict | None) -> dict[str, object]:
