@@ -55,3 +55,45 @@ def street():
     import street as made
 
     return made.street()
+
+
+@pytest.fixture(scope="session")
+def desk(tmp_path_factory) -> Path:
+    """A folder with a scene, a databank and a clip; read-only by agreement."""
+    import street as made
+
+    from render.video import VideoWriter
+    from scenes import Databank, save
+
+    folder = tmp_path_factory.mktemp("desk")
+    save(made.street(), folder / "street")
+    bank = Databank(folder / "bank")
+    bank.add(made.car())
+    bank.add(made.car("van", (0.8, 0.8, 0.2)))
+    with VideoWriter(folder / "clip.mp4", 10, 64, 48) as video:
+        for _ in range(3):
+            video.write(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(1)))
+    return folder
+
+
+@pytest.fixture
+def door(desk, monkeypatch, capsys):
+    """Call the front door in this process, which has its packages loaded: (words, exit code) -> (stdout, stderr)."""
+    import sidestep as front
+
+    monkeypatch.chdir(desk)
+    monkeypatch.setenv("COLUMNS", "400")
+    before = signal.getsignal(signal.SIGTERM)
+
+    def call(words: list[str], code: int = 0) -> tuple[str, str]:
+        try:
+            front.main(words)
+            ended = 0
+        except SystemExit as end:
+            ended = end.code
+        out, errors = capsys.readouterr()
+        assert ended == code, errors
+        return out, errors
+
+    yield call
+    signal.signal(signal.SIGTERM, before)
