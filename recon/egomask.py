@@ -21,24 +21,25 @@ from scenes.camera import Camera
 from scenes.poses import inverse
 
 WIDTH = 320
-"""Pixels across the small pictures that are looked at."""
+"""Width in pixels of the reduced pictures that are searched."""
 
 LOOKS, FEWEST = 48, 12
-"""Pictures that are looked at, evenly along the way, and how many it takes."""
+"""Pictures that are searched, evenly along the way, and how many are needed."""
 
 APART, FARTHEST = 0.1, 3.0
-"""Metres between the pictures before and after a look, and from the first picture to the farthest, that it takes at least: of a car that
-stands, poses err by millimetres each way, and its street stays as its bonnet does."""
+"""Metres needed between the pictures before and after each, and from the first picture to the farthest: while a car stands, its poses
+jitter by millimetres, and its street stays in place as its bonnet does."""
 
 FAINT, ALONG = 2.0, 0.25
-"""Levels a pixel of such a picture: fainter edges count less, as dust and reflections in a windscreen are; and of an edge the part across
-the motion under which it counts less, as a lane line's, along which the car does not quite go."""
+"""Levels a pixel below which an edge counts less, as those of dust and reflections in a windscreen; and the part of an edge across the
+motion below which it counts less, as that of a lane line, along which the car does not quite drive."""
 
 SOFT = 9
-"""Pixels of such a picture over which a change of brightness is no edge: the road in the car's own headlights is brighter near by."""
+"""Pixels over which a change of brightness is no edge: in the car's own headlights the road is brighter near by."""
 
 STAYS = 0.25
-"""Mean of edges, from -1 to 1, from which on one stays: among as many pictures of a street one in a thousand reaches 0.15."""
+"""Mean score of an edge, from -1 to 1, from which on it stays in place: in as many pictures of a street one edge in a thousand reaches
+0.15."""
 
 DOWN = 0.05
 """Sine of the angle below the horizon from which on what is seen is near enough to move."""

@@ -1,5 +1,5 @@
-"""Where lidar looked through, nothing stands: splats that hang there may look right from the recorded path, as a car that passes its camera
-or what a picture's border cuts, and are a ghost in the air from beside it."""
+"""Removes splats where lidar looked through. From the recorded path splats in the air may look right, as a car that passes its camera, or
+what a picture's border cuts off; from beside it they are ghosts."""
 
 from __future__ import annotations
 

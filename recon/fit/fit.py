@@ -34,30 +34,30 @@ from scenes.gaussians import Placed
 from scenes.sky import sample_equirect
 
 SKY_PRIOR = 3e-6
-"""Of the squared distance of the sky from its first picture, in a step's gradient: a twentieth of what a picture's sky weighs, and more
-than what shines through a wall, which Adam would turn into noise that a shifted view shows between the houses."""
+"""Weight, in a step's gradient, of the squared distance of the sky from its initial picture: a twentieth of what a picture's sky weighs,
+but more than what shines through a wall, which Adam would turn into noise that a shifted view shows between the houses."""
 
 ASIDE_EVERY = 2
-"""Every how many steps it is looked at what is open from aside of the path."""
+"""Steps between renders from beside the path, which show gaps that the path does not."""
 
 BLAME_EVERY = 3
-"""Every how many steps it is found out which splats show what is wrong, as long as some are added."""
+"""Steps between those that ask which splats show errors, as long as splats are added."""
 
 GUESSED_FROM = 0.8
-"""Part of the fit from which splats that pictures hardly show keep their neighbours' colours, and movers' rest; the others are fitted on
-around them."""
+"""Part of the fit from which splats that pictures hardly show take their neighbours' colours, and movers' unseen sides are completed; the
+rest is fitted on around them."""
 
 CLIPPED = 0.99
-"""Colours of pictures from which on they may be clipped."""
+"""Colour of a picture from which on it may be clipped."""
 
 FADE = 0.003
-"""Logit that a splat loses each time it is seen, unless the pictures hold it up: what nothing needs, goes. It settles as steps do, which
-could not hold up anything against it at the end."""
+"""Logit that a splat loses each time it is in sight, unless pictures hold it up: what nothing needs fades. It decays as the step sizes do,
+which could not resist it at the end."""
 
 RATES = {"means": 3e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 1e-2, "harmonics": 1e-3}
-"""Adam's step a field; of means in parts of each splat's reach: 0.3 pixels. A splat is in sight of some hundred steps, which must take it
-from where it begins to what pictures show: with places at a third and scales at a quarter of this, fits ended half way. Twice as long a
-step of colours puts into them what depth should say."""
+"""Adam's step sizes by field; of means as a part of each splat's reach, which is 0.3 pixels. A splat is in sight for a few hundred steps,
+which must take it from its seed to what pictures show: with a third of the rate of means and a quarter of that of scales, fits ended half
+way. Twice the rate of colours puts into colours what belongs into depth."""
 
 
 class Fit:
