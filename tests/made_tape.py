@@ -13,6 +13,7 @@ from recon.log import Log
 from render import render_frame
 from scenes import Trajectory
 from scenes.camera import Camera
+from scenes.lenses import Pinhole
 from scenes.poses import inverse, translation, yaw
 
 FRAMES = 6
@@ -66,7 +67,8 @@ def tape(street) -> Tape:
     points = street.background.gaussians.means.double().numpy()
     points = points[np.abs(points[:, 1]) > 2.0]  # where the car drives, it is itself what a lidar sees
     points = points[np.random.default_rng(0).choice(len(points), 150, replace=False)]
-    still = replace(street, ego=ego)
+    lens = Pinhole(58.0, 56.0, 47.0, 28.5)  # of four numbers that cannot be told for one another
+    still = replace(street, ego=ego, rig={"front_camera": replace(street.rig["front_camera"], lens=lens)})
     return Tape(still, ego, {"front": front, "right": front @ translation(0.5, 0.0, 0.0)}, points)
 
 
@@ -80,6 +82,8 @@ def check(log: Log, tape: Tape, names: dict[str, str], atol: float = 1e-6, lidar
     for theirs, ours in names.items():
         camera = log.camera(ours)
         assert len(camera) == FRAMES and (camera.width, camera.height) == SIZE
+        np.testing.assert_allclose(camera.lens.params()[:4], tape.street.rig["front_camera"].lens.params(), atol=1e-5)
+        assert not camera.lens.params()[4:].any()
         for i, t in enumerate(camera.times_us.tolist()):
             truth = tape.camera(theirs, t)
             torch.testing.assert_close(home @ camera.world_from_cam[i], away @ truth.world_from_cam, atol=atol, rtol=0)

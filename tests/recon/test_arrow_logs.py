@@ -59,7 +59,9 @@ def test_an_argoverse_log_reads_as_it_was_recorded(argoverse, recorded):
     check(log, recorded, RING, atol=1e-5)
     assert log.front == ("ring_front_center", "ring_front_right") and len(log.tracks) == 2
     assert isinstance(log.camera("ring_front_center").lens, Pinhole)  # its pictures are published undistorted
-    assert set(log.sweeps[0].read().sensor.tolist()) == {0, 1}
+    points, stamp = log.sweeps[0].read(), log.sweeps[0].time_us
+    assert points.sensor.tolist() == [i % 64 // 32 for i in range(len(points.xyz))]
+    np.testing.assert_allclose(points.times_us - stamp, np.linspace(0, STEP_US, len(points.xyz)), atol=1)  # as they were written
 
 
 def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
@@ -71,6 +73,14 @@ def test_a_waymo_segment_reads_as_it_was_recorded(waymo, near):
     assert shutters == {"front": ("rows", READOUT_US), "front_right": ("columns", -READOUT_US)}  # the right one from right to left
     assert log.rig({"front_right": (96, 54)})["front_right"].times_us[0] == log.camera("front_right").times_us[0] + READOUT_US // 2
     assert open_log(waymo).name == log.name  # the only segment needs no name
+
+
+def test_waymo_lenses_bend_as_their_calibration_says(own_waymo):
+    bent = {"k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.004, "k3": 0.005}
+    columns = {f"[CameraCalibrationComponent].intrinsic.{k}": value for k, value in bent.items()}
+    changed(own_waymo / f"camera_calibration/{SEGMENT}.parquet", lambda table: table.assign(**columns))
+    lens = open_log(own_waymo / SEGMENT).camera("front").lens
+    assert {k: getattr(lens, k) for k in bent} == pytest.approx(bent)
 
 
 def test_argoverse_boxes_stand_where_each_alone_is_placed(own_argoverse):

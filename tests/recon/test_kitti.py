@@ -70,6 +70,19 @@ def test_a_sequence_reads_as_it_was_recorded(odometry, recorded):
     np.testing.assert_allclose(sweep.times_us, 500_000 + np.arctan2(y, x) / (2 * np.pi) * 100_000, atol=2)  # untwisted, not taken at once
 
 
+def test_a_car_that_rolls_and_pitches_stands_as_the_devkit_has_it(own):
+    """R = Rz(yaw) Ry(pitch) Rx(roll), each counter-clockwise about its axis (convertOxtsToPose.m)."""
+    roll, pitch, yaw = 0.1, -0.2, 0.3
+    for file in (own / "oxts/data").iterdir():
+        numbers = file.read_text().split()
+        file.write_text(" ".join([*numbers[:3], str(roll), str(pitch), str(yaw), *numbers[6:]]))
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    about_x, about_y = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]), np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    turns = open_log(own).ego.world_from_body[:, :3, :3].numpy()
+    np.testing.assert_allclose(turns, np.broadcast_to(about_z @ about_y @ about_x, turns.shape), atol=1e-9)
+
+
 def test_a_spinning_lidars_points_stand_still_though_the_car_moves(raw, recorded):
     """Taken as one moment, the same sweep would smear by what the car drives in half a turn."""
     log = open_log(raw)

@@ -1,15 +1,17 @@
 import shutil
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from made_tape import STAMPS, check, tape
+from made_tape import STAMPS, STEP_US, check, tape
 
 from recon import open_log
 from recon.readers.ncore import lens_of
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
+from scenes.poses import inverse
 
 pytest.importorskip("ncore", reason="needs nvidia-ncore, which Python 3.14 cannot install: pip install 'sidestep[ncore]'")
 import made_ncore  # noqa: E402
@@ -33,6 +35,7 @@ def test_a_sequence_reads_as_it_was_recorded(sequence, recorded):
     shutters = {name: (c.shutter, c.readout_us) for name, c in log.cameras.items()}
     assert shutters == {NAMES["front"]: ("rows", READOUT_US), NAMES["right"]: ("rows", -READOUT_US)}
     assert open_log(sequence / "made.json").name == log.name
+    assert all((s.read().times_us == s.time_us - STEP_US // 3).all() for s in log.sweeps), "not at their turn's end"
 
 
 def test_every_lens_is_read_in_its_own_convention():
@@ -63,6 +66,24 @@ def test_a_sequence_need_not_have_masks_and_cuboids(tmp_path, recorded):
     log = open_log(write_ncore(tmp_path / "bare", recorded, annotated=False))
     assert not log.tracks and log.cameras[NAMES["front"]].ego_mask is None
     check(log, recorded, NAMES)
+
+
+def test_a_cuboid_that_leans_stands_on_the_middle_of_its_base(tmp_path, recorded, monkeypatch):
+    """Turned about x, then y, then z, as the package's own `transform_bbox` has it."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos([0.1, -0.2, 0.3]), np.sin([0.1, -0.2, 0.3])
+    about_x, about_y = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]), np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    turned, upright = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ about_y @ about_x, made_ncore.cuboid
+
+    def leaning(*told):
+        seen = upright(*told)
+        return replace(seen, bbox3=replace(seen.bbox3, centroid=(9.0, 2.0, 1.0), rot=(0.1, -0.2, 0.3)))
+
+    monkeypatch.setattr(made_ncore, "cuboid", leaning)
+    log = open_log(write_ncore(tmp_path / "sequence", recorded))
+    for track in log.tracks:
+        local = (inverse(log.ego.at_each(torch.from_numpy(track.times_us))) @ track.world_from_box).numpy()
+        np.testing.assert_allclose(local[:, :3, :3], np.broadcast_to(turned, (len(local), 3, 3)), atol=1e-6)
+        np.testing.assert_allclose(local[:, :3, 3], [[9.0, 2.0, 1.0] - turned[:, 2] * track.size[2] / 2] * len(local), atol=1e-5)
 
 
 def test_cameras_may_begin_before_the_lidar(tmp_path, recorded, monkeypatch):

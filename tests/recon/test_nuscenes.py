@@ -50,6 +50,13 @@ def test_points_were_taken_when_the_lidar_looked_there(own, recorded, late, know
     assert np.abs(sweep.read().times_us - sweep.time_us - wanted).max() < 100
 
 
+def test_boxes_are_of_the_moment_of_their_samples_own_sweep(own, data_set):
+    path = own / "v1.0-mini" / "sample.json"
+    path.write_text(json.dumps([{**row, "timestamp": row["timestamp"] - 40_000} for row in json.loads(path.read_text())]))
+    late, whole = (next(t for t in open_log(root / "scene-0061").tracks if t.moving).times_us for root in (own, data_set))
+    assert (late - whole).tolist() == [0, 0, -40_000, 0, 0, 0], "the third has no sweep among the key frames"
+
+
 def test_a_scene_must_be_named_and_exist(data_set):
     with pytest.raises(ValueError, match="holds 2 scenes .scene-0061, scene-0103.; name one, as .*scene-0061"):
         open_log(data_set)

@@ -19,7 +19,7 @@ def test_the_made_drive_reads_as_it_was_written(drive, street):
     assert list(log.cameras) == ["front_camera", "left_camera"]
     assert [s.index for s in log.sweeps] == [i for i in range(8) if i != ABSENT]
     for name, camera in log.cameras.items():
-        assert camera.times_us.tolist() == street.frame_times(name).tolist()
+        assert camera.times_us.tolist() == street.frame_times(name).tolist() and camera.lens == street.rig[name].lens
         expected = torch.stack([street.camera(name, t).world_from_cam for t in camera.times_us.tolist()])
         torch.testing.assert_close(camera.world_from_cam, expected, atol=1e-9, rtol=0)
     assert log.meta["licence"] == "CC BY 4.0" and "Hesai" in log.meta["attribution"]
