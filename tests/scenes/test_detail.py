@@ -41,6 +41,19 @@ def test_merging_keeps_mean_covariance_and_colour():
     torch.testing.assert_close(wide, spread.trace() + 3 * torch.tensor(-6.0).exp(), atol=1e-6, rtol=1e-4)
 
 
+def test_of_two_merged_splats_each_counts_as_much_as_it_covers():
+    """Of the first the two longest axes span four times as much, and it is half as dense."""
+    g = gaussians(2, 1)
+    scales, opacities = torch.tensor([[0.2, 0.1, 0.01], [0.05, 0.01, 0.1]]), torch.tensor([0.4, 0.8])
+    means = torch.tensor([[0.1, 0.1, 0.1], [0.4, 0.1, 0.1]])
+    one = coarser(replace(g, means=means, log_scales=scales.log(), logit_opacities=torch.logit(opacities)), 1.0)
+    torch.testing.assert_close(one.means[0], (2 * means[0] + means[1]) / 3, atol=1e-6, rtol=0)
+    torch.testing.assert_close(one.sh[0], (2 * g.sh[0] + g.sh[1]) / 3, atol=1e-6, rtol=0)
+    wide = one.log_scales[0].exp()
+    covered = float(torch.sigmoid(one.logit_opacities[0]) * wide.prod() / wide.min())
+    assert covered == pytest.approx(0.4 * 0.02 + 0.8 * 0.005, rel=1e-4), "as much as both do"
+
+
 def test_splats_alone_in_their_cells_stay_as_they_are():
     g = gaussians(100)
     assert coarser(g, 1e-6) is g

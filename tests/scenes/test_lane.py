@@ -94,12 +94,16 @@ def test_boxes_touch_as_the_plane_says(street):
     assert not boxes_touch(high, other, START_US)
 
 
-def test_standing_in_a_house_is_said_and_a_kerb_is_not(street):
+def test_standing_in_a_house_is_said_and_a_kerb_and_a_bridge_above_are_not(street):
     inside = insert(street, car(), Placement("car", 12, 9))
     assert any("stands in something of the background" in w for w in inside.warnings)
     kerb = box((6.0, 3.0, 0.2), (0.5, 0.5, 0.5))
     kerb = replace(kerb, means=kerb.means + torch.tensor([12.0, -2.5, 0.0]))
     background = Placed(Gaussians.cat([street.background.gaussians, kerb]), street.background.world_from_local)
+    assert collisions(replace(street, background=background), insert(street, car(), Placement("car", 12, -2.5)).actor) == {}
+    bridge = box((6.0, 8.0, 0.5), (0.5, 0.5, 0.5))
+    bridge = replace(bridge, means=bridge.means + torch.tensor([12.0, -2.5, 1.7]))
+    background = Placed(Gaussians.cat([street.background.gaussians, bridge]), street.background.world_from_local)
     assert collisions(replace(street, background=background), insert(street, car(), Placement("car", 12, -2.5)).actor) == {}
 
 
@@ -125,6 +129,7 @@ def test_an_asset_from_a_darker_bluer_place_comes_to_the_light_of_this_one(stree
     wanted, got = (rgb_from_sh(a.gaussians.sh[:, 0]) for a in (car(), back))
     assert float((wanted - got).abs().mean()) < 0.02
     assert back.meta["light_gain"] == pytest.approx([2.5, 2.0, 1.4286], rel=1e-3)
+    assert matched(back, street, torch.tensor([12.0, 0.0])) is back, "it is in this light by now"
 
 
 def test_an_asset_that_would_have_to_be_more_than_four_times_as_bright_says_so(street):

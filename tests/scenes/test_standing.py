@@ -9,7 +9,7 @@ from street import START_US, STEP_US, car, street
 from scenes import Ground, Trajectory, load, save
 from scenes.edit import Edit, edited
 from scenes.poses import translation, yaw, yaw_of
-from scenes.standing import EDGE, FAR, standing_pose, stood
+from scenes.standing import EDGE, FAR, moved, standing_pose, stood
 from scenes.usd.edit import add_change
 from scenes.usd.undo import undo
 
@@ -73,3 +73,17 @@ def test_beyond_the_edge_of_the_ground_it_counts_less_and_less():
 def test_without_a_ground_the_recorded_path_stays():
     path = recorded([0.1] * 9)
     assert stood(path, car().size, replace(hill(path), ground=None)) is path
+
+
+def test_what_is_shifted_up_a_slope_climbs_with_the_ground_and_no_further():
+    """A body that is tilted as the slope is would climb by itself, and by the ground once more."""
+    rise = Ground((0.2 * torch.arange(-10.0, 50.0)).expand(40, 60).contiguous(), (-10.0, -20.0), 1.0)
+    scene = replace(street(), ground=rise)
+    places = torch.tensor([[8.0 + 0.5 * i, -3.0] for i in range(9)], dtype=torch.float64)
+    high = translation(z=0.1)
+    path = Trajectory(TIMES, torch.stack([high @ standing_pose(scene, xy, 0.0, car().size) for xy in places]))
+    for by in ((3.0, 0.0), (-3.0, 1.0)):
+        after = moved(path, by, car().size, scene).world_from_body
+        wanted = torch.stack([high @ standing_pose(scene, xy, 0.0, car().size) for xy in after[:, :2, 3]])
+        torch.testing.assert_close(after, wanted, atol=1e-6, rtol=0)
+        assert (after[:, 0, 3] - places[:, 0]).tolist() == pytest.approx([by[0] / 1.04**0.5] * 9), "metres along the slope"
