@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon.align import about, aligned
-from recon.corrected import as_corrected, moved
+from recon.corrected import MOVED, REMOUNTED, TURNED, as_corrected, moved
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
 from scenes.lenses import Pinhole
 from scenes.poses import inverse
@@ -106,6 +106,24 @@ def test_a_recording_is_moved_again_as_its_scene_says():
     torch.testing.assert_close(again.ego.world_from_body, better.ego.world_from_body, atol=1e-12, rtol=0)
     np.testing.assert_allclose(again.sweeps[7].read().xyz, better.sweeps[7].read().xyz, atol=1e-9)
     assert as_corrected(log, {}) is log
+
+
+def test_all_that_was_corrected_is_so_again_in_the_order_in_which_it_was_found():
+    """The path, how cameras are turned, how high they stand: each was measured where the former had put them."""
+    log, back = drifting(height=0.4, radians=0.3)
+    found = {
+        MOVED: {"times_us": log.ego.times_us.tolist(), "poses": back.flatten(1).tolist()},
+        TURNED: {"front": [0.3, -0.2, 0.1, 0.05, 0.1, -0.1, 0.03]},
+        REMOUNTED: {"front": [0.2, 0.1]},
+    }
+    one_by_one = log
+    for kind, what in found.items():
+        one_by_one = as_corrected(one_by_one, {kind: what})
+    at_once = as_corrected(log, json.loads(json.dumps(one_by_one.meta)))
+    assert torch.equal(at_once.camera("front").times_us, one_by_one.camera("front").times_us)
+    for one, other in ((at_once.ego, one_by_one.ego), (at_once.tracks[0].trajectory(), one_by_one.tracks[0].trajectory())):
+        assert torch.equal(one.world_from_body, other.world_from_body)
+    assert torch.equal(at_once.camera("front").world_from_cam, one_by_one.camera("front").world_from_cam)
 
 
 def test_lidars_that_turn_together_are_laid_on_others_together():

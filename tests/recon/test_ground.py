@@ -27,6 +27,16 @@ def test_a_sloped_street_is_found_under_cars_and_beside_walls():
         assert abs(float(ground.height(torch.tensor([x, y]))) - 0.02 * x) < 0.08
 
 
+def test_the_ground_goes_through_the_middle_of_noise():
+    """The lowest of a hundred points in each cell lie 6 cm under it."""
+    generator = np.random.default_rng(5)
+    xy = generator.uniform([-10, -6], [30, 6], (200_000, 2))
+    points = np.column_stack([xy, 0.02 * xy[:, 0] + generator.normal(0, 0.03, len(xy))])
+    ground = estimate_ground(points, path())
+    at = torch.from_numpy(generator.uniform([0, -4], [20, 4], (200, 2)))
+    assert abs(float((ground.height(at) - 0.02 * at[:, 0]).mean())) < 0.01
+
+
 def test_a_street_is_bare_where_lidar_shows_it_and_nothing_on_it():
     generator = np.random.default_rng(3)
     points = street_points(generator, 1_000_000)
