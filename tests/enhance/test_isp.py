@@ -24,6 +24,20 @@ def test_one_stop_doubles_linear_light():
     assert torch.allclose(rgb_to_linear_rgb(Isp(exposure=1)(x)), 2 * rgb_to_linear_rgb(x), atol=1e-5)
 
 
+def test_settings_are_applied_as_a_camera_does():
+    """Gains first, then saturation about the luma that they leave, the exponent, and the curve."""
+    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+    light = torch.tensor([0.30, 0.12, 0.05])
+    isp = Isp(exposure=-0.4, red=0.3, blue=-0.5, saturation=1.1, gamma=1.2, tone=0.5)
+    red, green, blue = 0.30 * 2**-0.1, 0.12 * 2**-0.4, 0.05 * 2**-0.9
+    luma = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    curved = [(luma + 1.1 * (c - luma)) ** 1.2 for c in (red, green, blue)]
+    wanted = [1.5 * c / (1 + 0.5 * c) for c in curved]
+    found = rgb_to_linear_rgb(isp(linear_rgb_to_rgb(light[:, None, None].expand(3, 2, 2))))
+    assert found[:, 0, 0].tolist() == pytest.approx(wanted, rel=1e-4)
+
+
 def test_no_saturation_is_grey():
     y = Isp(saturation=0)(image())
     assert torch.allclose(y, y.mean(0, keepdim=True).expand_as(y), atol=1e-6)
@@ -35,6 +49,7 @@ def test_pixels_outside_the_mask_are_exact():
     y = alter(x, mask, Isp(exposure=-1, red=0.4))
     outside = (mask == 0).expand_as(x)
     assert torch.equal(y[outside], x[outside]) and not torch.equal(y, x)
+    torch.testing.assert_close(y[~outside], (x + Isp(exposure=-1, red=0.4)(x))[~outside] / 2, atol=1e-6, rtol=0)
 
 
 def test_noise_has_the_spread_that_was_asked_for():

@@ -35,6 +35,8 @@ def test_the_same_light_changes_nothing_and_the_mask_is_kept():
     assert torch.allclose(relit(rgb, normals, mask, lit_from(1, 0, 1), lit_from(1, 0, 1), 1.0), rgb, atol=1e-5)
     other = relit(rgb, normals, mask, lit_from(1, 0, 1), lit_from(1, 0, 1), 0.5)
     assert torch.equal(other[mask == 0], rgb[mask == 0]) and (other[mask > 0] < rgb[mask > 0]).all()
+    soft = relit(rgb, normals, mask / 4, lit_from(1, 0, 1), lit_from(1, 0, 1), 0.5)
+    torch.testing.assert_close(soft, rgb + (other - rgb) / 4, atol=1e-6, rtol=0)
 
 
 def test_relighting_there_and_back_is_the_photo():

@@ -1,5 +1,8 @@
 """What the tables measure."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +10,10 @@ from small_net import SMALL, stirred
 
 from enhance.drift import drift, of_video
 from enhance.enhancer import Enhancer
+from enhance.evaluate import HIGHEST, measured
 from enhance.metrics import feature_distance, interval, region_ssim, sharpness, warp_error
 from enhance.network.net import Net
+from enhance.pairs.shards import PairSet, write_shard
 from render.compare import ssim
 from render.video import VideoWriter
 
@@ -69,8 +74,35 @@ def test_a_picture_that_moves_with_its_flow_does_not_flicker():
 def test_the_interval_holds_the_mean_and_leaves_out_what_is_unknown():
     values = [*np.random.default_rng(0).normal(1, 0.5, 40), float("nan")]
     low, high = interval(values)
-    assert low < np.nanmean(values) < high and high - low < 0.5
+    assert low < np.nanmean(values) < high
+    assert high - low == pytest.approx(2 * 1.96 * np.nanstd(values) / 40**0.5, rel=0.08), "as a normal mean's 95 percent"
     assert np.isnan(interval([1.0])).all()
+
+
+def test_a_row_tells_the_region_apart_and_what_flickers_where_the_frame_before_was_seen(tmp_path):
+    """Of a clip whose second frame is 26 levels off in a fifth of it, and right elsewhere."""
+    right = torch.randint(40, 200, (40, 50, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8).repeat(2, 1, 1, 1)
+    given, region, visible = right.clone(), torch.zeros(2, 40, 50, dtype=torch.uint8), torch.zeros(2, 40, 50, dtype=torch.uint8)
+    given[1, 10:30, 10:30] += 26
+    region[:, 10:30, 10:30], visible[:, :, :25] = 255, 1
+    flow, depth = torch.zeros(2, 40, 50, 2, dtype=torch.float16), torch.ones(2, 40, 50, dtype=torch.float16)
+    tensors = {
+        "input": given,
+        "target": right,
+        "region": region,
+        "instance": region.clone(),
+        "flow": flow,
+        "visible": visible,
+        "depth": depth,
+    }
+    write_shard(tmp_path / "isp" / "a_0000.safetensors", tensors, {"kind": "isp", "split": "held out"})
+    row = measured("isp", "identity", PairSet(tmp_path).shards, Enhancer(Net(SMALL)), lambda rgb: [rgb])
+    off = 20 * math.log10(255 / 26)
+    assert row.mean("region") == pytest.approx((HIGHEST + off) / 2, abs=1e-3)
+    assert row.mean("frame") == pytest.approx((HIGHEST + off + 10 * math.log10(5)) / 2, abs=1e-3)
+    assert row.mean("warp error") == pytest.approx(26 * 300 / 1000, abs=1e-3)
+    perfect = replace(row, clips=row.clips | {"region": [math.inf]})
+    assert perfect.gain(row) == [HIGHEST - row.mean("region")] and perfect.mean("region") == math.inf
 
 
 def test_the_identity_does_not_drift_and_a_stirred_network_may(tmp_path):

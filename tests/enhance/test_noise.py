@@ -1,11 +1,16 @@
 """A sensor's noise, of objects put right."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
-from enhance.correcting.corrections import correct
+from enhance.correcting.corrections import Correction, correct
+from enhance.correcting.grain import Grain
 from enhance.correcting.noise import denoised, variances
 from enhance.correcting.objects import ObjectNet
+from enhance.correcting.shade import KNOTS
 from enhance.metrics import region_ssim
 from render.compare import psnr
 from tests.enhance.test_grain import RIGHT, altered, put_in
@@ -45,3 +50,13 @@ def test_dark_noise_in_other_colours_is_undone_as_the_camera_made_it():
     mask = ids > 0
     assert psnr(better, RIGHT, mask) > psnr(given.permute(1, 2, 0), RIGHT, mask) + 6.5
     assert region_ssim(better, RIGHT, mask) > 0.95
+
+
+def test_noise_counts_from_twice_that_around_on_and_as_it_was_before_it_was_sharpened():
+    """Sharpening multiplies its variance by a square."""
+    sharp = Grain.of(altered(RIGHT, sharpen=1.2)), Grain.of(RIGHT)
+    plain = Correction(torch.zeros(15), torch.zeros(KNOTS), None, torch.tensor([5e-4, 1e-4]).double(), 1)
+    assert plain.excess() == (0.0, pytest.approx(5e-4 - 2e-4 - 2e-5))
+    assert replace(plain, noise=torch.tensor([2.1e-4, 1e-4]).double()).excess() == (0.0, 0.0), "as right ones may have"
+    sharpened, variance = replace(plain, grain=sharp).excess()
+    assert 0.5 < sharpened < 1.5 and variance == pytest.approx(plain.excess()[1] / (1 + sharpened) ** 2)
