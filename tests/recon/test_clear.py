@@ -1,7 +1,10 @@
 """Nothing stands where lidar looked through."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
 import torch
 from made_sweeps import drive, standing
 
@@ -52,3 +55,16 @@ def test_a_drive_without_lidar_knows_nothing():
 def test_some_sweeps_of_a_long_drive_are_asked():
     log = drive(THINGS, count=LOOKS + 9)
     assert len(Clear.of(log, EVER, FLAT).images) == LOOKS
+
+
+@pytest.mark.parametrize(
+    ("through", "there", "clear"),
+    [(4, 0, True), (3, 0, False), (10, 1, True), (9, 1, False), (20, 2, True), (19, 2, False), (20, 3, False)],
+)
+def test_what_some_sweeps_struck_is_clear_where_ten_times_as_many_looked_through(through, there, clear):
+    told = [(True, False)] * through + [(False, True)] * there + [(False, False)] * (LOOKS - through - there)
+    images = [
+        SimpleNamespace(middle=np.zeros(3), votes_with_silence=lambda xyz, vote=vote: np.tile(np.array(vote)[:, None], len(xyz)))
+        for vote in told
+    ]
+    assert Clear(images, FLAT).holds(splats((5.0, 0.0, 1.0))).tolist() == [clear]

@@ -114,6 +114,20 @@ def test_an_spz_file_is_what_niantics_page_says(tmp_path):
         assert (matrix_from_quat(g.quats[0]) - wanted).abs().max() < (0.02 if version == 2 else 0.004)
 
 
+def test_a_splat_file_is_what_its_authors_converter_writes(tmp_path):
+    """One record by hand, as antimatter15's convert.py has it: position, scale, RGBA, and w, x, y, z about 128."""
+    quat = 0.8, -0.2, 0.4, 0.4
+    record = struct.pack("<6f8B", 1.5, -2.25, 0.5, 0.1, 2.0, 0.003, 255, 0, 51, 102, *(round(128 + 128 * q) for q in quat))
+    (tmp_path / "a.splat").write_bytes(record)
+    g, stored = load(tmp_path / "a.splat"), [byte - 128 for byte in record[28:]]
+    assert g.quats[0].tolist() == pytest.approx(quat, abs=0.005)
+    g, stored = replace(g, quats=g.quats / g.quats.norm()), [q / math.hypot(*stored) for q in stored]
+    alike(g, 0, [1.5, -2.25, 0.5], stored, [math.log(v) for v in (0.1, 2.0, 0.003)], 0.4, [(c - 0.5) / C0 for c in (1.0, 0.0, 0.2)])
+    save(g, tmp_path / "b.splat")
+    again = (tmp_path / "b.splat").read_bytes()
+    assert again[:12] + again[24:] == record[:12] + record[24:], "but for the last bit of a scale"
+
+
 def test_harmonics_of_degree_4_in_an_spz_file_are_left_out_and_told(tmp_path, capsys):
     rest = b"".join(bytes([i] * 3) for i in range(24))
     (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0) + bytes(20) + rest))
