@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +13,15 @@ from recon.seeds.shade import shade
 from render import render_frame
 from render.frame_types import Frame
 from render.occlusion import shadow_box, trace_field
-from render.shadow import Shade, cast, shadow_casters
+from render.shadow import GRAZING, Shade, cast, shadow_casters
 from scenes import Camera, Equirectangular, Gaussians, OpenCV, Orthographic, Placed, Sky
 from scenes.edit import Edit, edited
+from scenes.formats.transform import moved
 from scenes.hdr import load_hdr
 from scenes.insert import insert
 from scenes.light import disc, light_of
 from scenes.placement import Placement
-from scenes.poses import inverse
+from scenes.poses import inverse, pose_from
 
 CAR = car()
 OVERCAST = light_of(replace(made_street(), sky=None)).directions.float()
@@ -95,6 +97,19 @@ def test_a_shadow_on_a_slope_is_as_long_as_the_sun_stands_high_over_the_slope(st
         assert at(shade, -2.1 - 0.85 * length, 0) > 0.8 and at(shade, -2.1 - 1.15 * length, 0) < 0.2, rise
 
 
+def test_a_slope_gets_more_of_the_light_that_it_faces(street):
+    """As much of each direction's light as on level ground, but for how steeply it falls onto the slope."""
+    ground = replace(street.ground, heights=(0.15 * torch.arange(60.0)).expand(40, 60).contiguous())
+    result = insert(replace(open_street(street), sky=None, ground=ground), CAR, Placement("car", 12, 0))
+    shade, normal = Shade(result.scene), torch.tensor([-0.15, 0.0, 1.0], dtype=torch.float64) / (1 + 0.15**2) ** 0.5
+    local, weights = shade.at(result.actor, START_US)
+    world = shade.light.directions
+    wanted = (world @ normal).clamp_min(0) / world[:, 2].clamp_min(GRAZING)
+    assert wanted.min() < 0.8 and wanted.max() > 1.2
+    torch.testing.assert_close(weights.double(), wanted, atol=0.06, rtol=0)  # the slope is told in steps of 1.5 degrees
+    torch.testing.assert_close(local[:, 2].double(), world @ normal, atol=0.01, rtol=0)
+
+
 def test_a_shadow_climbs_what_stands_in_it():
     shade = field(sun(0.4))
     x = -2.1 - 0.5 * 1.5 / math.tan(0.4)  # half-way along the shadow the ray that grazes the roof is half as high
@@ -130,7 +145,11 @@ def open_street(street):
     return replace(street, background=Placed(g.select(g.means[:, 2] < 0.1), street.background.world_from_local))
 
 
-def test_houses_keep_the_sun_off(street):
+@pytest.mark.parametrize("turn", [0.0, math.pi / 4])
+def test_houses_keep_the_sun_off(street, turn):
+    """However the frame is turned in which their splats are."""
+    pose = pose_from([math.cos(turn / 2), 0, 0, math.sin(turn / 2)], [0, 0, 0])
+    street = replace(street, background=Placed(moved(street.background.gaussians, inverse(pose), Path("street")), pose))
     high = torch.full((32, 64, 3), 0.1)
     high[13, 14] = 2000.0  # 17 degrees high, to the left of the street (+y)
     for scene, least, most in ((open_street(street), 0.7, 1.0), (street, 0.0, 0.4)):

@@ -96,6 +96,15 @@ def test_place_and_time_put_the_sun_into_a_blue_sky_only(street):
     assert 0.75 < clear_sky_share(1.2) < 0.95 and clear_sky_share(0.1) < clear_sky_share(0.5)
 
 
+@pytest.mark.parametrize(("hour", "east"), [(16, 1), (23, -1)])
+def test_the_sun_stands_in_the_east_in_the_morning_and_in_the_west_in_the_evening(street, hour, east):
+    """Of a world whose x is east, in San Francisco, 8 hours behind the clock: its shadows fall to the other side."""
+    here = {**street.meta, "geodetic_origin": {"lat": 37.776, "long": -122.399, "height": 3.0}}
+    then = replace(street.ego, times_us=street.ego.times_us - street.ego.times_us[0] + at(2019, 5, 10, hour, 0, 0))
+    sun = light_of(replace(street, meta=here, ego=then, sky=Sky(torch.tensor([0.2, 0.35, 0.6]).expand(32, 64, 3).contiguous()))).sun
+    assert east * sun[0] > 0.6 and 0.3 < sun[2] < 0.8
+
+
 def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
     """Cars along a road whose ground is dark on the far side from the sun, or as bright on both."""
     sun = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
@@ -103,7 +112,7 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
     parked = [{"track": f"veh_{i}", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": b} for i, b in enumerate(boxes)]
     ground = street.background.gaussians.select(street.background.gaussians.means[:, 2] == 0)
     ground = Gaussians.cat([ground.map(lambda t: t)] * 3)
-    for dim, expected in ((0.4, 0.6), (1.0, 0.0), (1.5, 0.0)):
+    for dim, expected in ((0.4, 0.6), (1.5, 0.0), (1.0, 0.0)):
         shaded = (ground.means[:, 1] < -0.9) & (ground.means[:, 1] > -3.1)
         colour = srgb_from_linear(torch.where(shaded[:, None], 0.2 * dim, 0.2)).expand(-1, 3)
         scene = replace(
@@ -113,6 +122,11 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
         assert shadows_beside_parked(scene, sun) == pytest.approx(expected, abs=0.02)
         gone = replace(scene, meta=unparked(scene.meta, ["veh_1", "veh_2", "veh_3"]))
         assert len(gone.meta["parked"]) == 2 and shadows_beside_parked(gone, sun) == pytest.approx(expected, abs=0.02)
+    here = {"geodetic_origin": {"lat": 37.776, "long": -122.399, "height": 3.0}}
+    noon = replace(street.ego, times_us=street.ego.times_us - street.ego.times_us[0] + at(2019, 5, 10, 20, 0, 0))
+    blue = Sky(torch.tensor([0.2, 0.35, 0.6]).expand(32, 64, 3).contiguous())
+    told = [light_of(replace(scene, ego=noon, sky=blue, meta={**here, **more})).sun for more in ({}, {"parked": parked})]
+    assert told[0] is not None and told[1] is None, "a sun that casts no shadows is behind houses that nobody saw"
     assert shadows_beside_parked(street, sun) is None
     assert shadows_beside_parked(replace(scene, meta={"parked": parked[:2]}), sun) is None
 
