@@ -1,7 +1,7 @@
 """The front door: `sidestep COMMAND`, one dataclass each. The main job stands here; commands about one package in its commands.py.
 
-Exit codes: 0 done, 1 bad data (one line says what, where and the fix; SIDESTEP_TRACEBACK=1 shows where it came from), 2 usage,
-130 interrupted, 143 stopped by SIGTERM.
+Exit codes: 0 done, 1 bad data, or words that do not fit it (one line says what, where and the fix; SIDESTEP_TRACEBACK=1 shows where it came
+from), 2 usage: words that are wrong whatever the data, 130 interrupted, 143 stopped by SIGTERM.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union
@@ -210,7 +211,10 @@ class Render:
         print(f"wrote {', '.join(map(str, written))}")
 
 
-DESCRIPTION = "Reconstruct a recorded drive as Gaussian splats, render it from beside its path with inserted assets, and enhance the clip."
+DESCRIPTION = (
+    "Reconstruct a recorded drive as Gaussian splats, render it from beside its path with inserted assets, and enhance the clip. "
+    "sidestep --version says which Sidestep this is."
+)
 COMMANDS = {
     "recon": Recon, "assets": Assets, "insert": Insert, "edit": Edit, "render": Render, "pairs": Pairs, "train": Train, "enhance": Enhance,
     "convert": Convert, "info": Info, "validate": Validate, "doctor": Doctor, "demo": Demo,
@@ -218,8 +222,11 @@ COMMANDS = {
 
 
 def parse(words: list[str]) -> Any:
-    """The command that the words say; prints help or what is wrong and exits where they say none."""
+    """The command that the words say; prints help, the version or what is wrong and exits where they say none."""
     program, commands = "sidestep", dict[str, Any](COMMANDS)
+    if words == ["--version"]:
+        print(f"sidestep {_version()}")
+        sys.exit(0)
     if len(words) > 1 and words[0] == "assets" and not words[1].startswith("-"):
         program, commands, words = "sidestep assets", ACTIONS, words[1:]
     if words and not words[0].startswith("-"):
@@ -231,8 +238,24 @@ def parse(words: list[str]) -> Any:
     return tyro.cli(choices, prog="sidestep", description=DESCRIPTION, args=words)
 
 
+def _version() -> str:
+    try:
+        return version("sidestep")
+    except PackageNotFoundError:
+        return "unknown: run from a source tree that was never installed"
+
+
+def _open_streams() -> None:
+    """Open what the caller closed of the standard streams, as `2>&-` does, to nowhere: the next files to be opened would get their numbers,
+    and what libraries write there."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the process runs
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit."""
+    _open_streams()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that half-written files are removed on the way out
     try:
         parse(list(sys.argv[1:] if arguments is None else arguments)).run()

@@ -50,14 +50,20 @@ print(f"{version}, {torch.get_num_threads()} threads; {device}")
 """
 WARP = """
 import tempfile
+from pathlib import Path
 warp.config.quiet = True
+kept = "compiled ones are kept in"
 try:
     warp.init()
     tempfile.TemporaryFile(dir=warp.config.kernel_cache_dir)
-except (PermissionError, NotADirectoryError):
-    raise OSError(f"compiled kernels cannot be kept in {warp.config.kernel_cache_dir}") from None
+except OSError as error:
+    if error.errno is None:
+        raise
+    if not any(Path(warp.config.kernel_cache_dir).glob("wp_*")):
+        raise OSError(f"compiled kernels cannot be kept in {warp.config.kernel_cache_dir}") from None
+    kept = "only compiled ones, which cannot be added to:"
 devices = ", ".join(str(device) for device in warp.get_devices())
-print(f"{version}, kernels run on {devices}; compiled ones are kept in {warp.config.kernel_cache_dir}")
+print(f"{version}, kernels run on {devices}; {kept} {warp.config.kernel_cache_dir}")
 """
 AV = "av.codec.Codec('libx264', 'w'), av.codec.Codec('h264', 'r'); print(f'{version}, writes and reads H.264')"
 USD = """

@@ -1,14 +1,19 @@
 """The front door as a user meets it: separate processes where exit codes and output count, small scenes everywhere."""
 
 import json
+import os
+import re
+import shlex
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import street as made
 import torch
-from front_door import SHOOT, sidestep
+from front_door import SHOOT, environment, sidestep
 
 from render.video import read_video
 from scenes import Databank, SplatModel, load, save
@@ -212,6 +217,31 @@ def test_help_speaks_of_values_as_they_are_written(door, words):
     """Not as Python has them: {None}|STR is nothing that can be typed."""
     told = door([*words.split(), "--help"], 0)[0]
     assert "--" in told and "None" not in told and "STR]" not in told
+
+
+def test_the_version_is_told(door):
+    assert re.fullmatch(r"sidestep (\d+\.\d+\.\d+|unknown: .*)\n", door(["--version"])[0])
+
+
+def test_streams_that_the_caller_closed_stop_nothing(desk, tmp_path):
+    words = [
+        sys.executable,
+        "-m",
+        "sidestep",
+        "render",
+        desk / "street",
+        "--size",
+        "32x18",
+        "--duration",
+        "100ms",
+        "-o",
+        tmp_path / "a.mp4",
+    ]
+    line = shlex.join(map(str, words))
+    run = subprocess.run(f"{line} 2>&-", shell=True, env=environment(), stdout=subprocess.PIPE, text=True)
+    assert run.returncode == 0 and sorted(os.listdir(tmp_path)) == ["a.json", "a.mp4"], run.stdout
+    run = subprocess.run(f"{line} >&- 2>&-", shell=True, env=environment(), stdout=subprocess.PIPE, text=True)
+    assert run.returncode == 1 and not run.stdout  # a.mp4 exists, which nobody hears
 
 
 def test_existing_outputs_are_replaced_with_w(door, tmp_path):

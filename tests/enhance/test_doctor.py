@@ -4,7 +4,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from enhance.doctor import LIBRARIES, NEEDS, Finding, Need, examine, report
+from enhance.doctor import LIBRARIES, NEEDS, WARP, Finding, Need, examine, report
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -50,6 +50,18 @@ def test_a_home_that_takes_no_compiled_kernels_asks_for_another_folder_not_for_a
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "file"))
     lines = list(report(examine(tuple(n for n in NEEDS if n.name == "warp-lang"))))
     assert any(line.startswith("needed: export WARP_CACHE_PATH=") for line in lines), lines
+
+
+def test_a_folder_of_kernels_that_takes_no_more_serves_as_far_as_it_goes():
+    for folder, said in (("full", "only compiled ones, which cannot be added to: full"), ("bare", "kernels cannot be kept in bare")):
+        setting = "import os, tempfile, warp; from pathlib import Path; warp.config.kernel_cache_dir = FOLDER; warp.init = lambda: None\n"
+        refusing = (
+            "def refuse(dir): raise OSError(30, 'Read-only file system', dir)\ntempfile.TemporaryFile, warp.get_devices = refuse, list\n"
+        )
+        holding = "os.chdir(tempfile.mkdtemp()); Path('full/wp_one').mkdir(parents=True)\nversion = '1'\n"
+        (found,) = examine((need(setting.replace("FOLDER", repr(folder)) + refusing + holding + WARP),))
+        assert said in found.said and found.state == ("ok" if folder == "full" else "broken"), found
+        assert any("WARP_CACHE_PATH" in line for line in report(iter([found]))) == (folder == "bare")
 
 
 def test_nothing_lacking_says_so():
