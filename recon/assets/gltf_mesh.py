@@ -8,20 +8,30 @@ from __future__ import annotations
 import json
 from io import BytesIO
 from pathlib import Path
+from urllib.parse import unquote
 
 from scenes.formats.gltf import CHUNK, HEADER
 
 SUFFIXES = (".glb", ".gltf")
 
+READ = ("KHR_materials_", "KHR_lights_punctual", "KHR_mesh_quantization", "EXT_texture_webp")
+"""How the names of extensions begin without which, or with which, a mesh that requires them looks the same here."""
+
 
 def load_gltf(path: Path):
-    """trimesh's scene of a .glb or .gltf file. Raises whatever trimesh, or a file that is none, makes it raise."""
+    """trimesh's scene of a .glb or .gltf file. Raises whatever trimesh, or a file that is none, makes it raise, and ValueError for what
+    trimesh would leave out, or read otherwise than it is meant."""
     import trimesh
 
     data, binary = path.read_bytes(), path.suffix.lower() == ".glb"
+    if binary and not data.startswith(b"glTF"):
+        raise ValueError("it does not start as a GLB file does")
+    if binary and (claimed := HEADER.unpack_from(data)[2]) > len(data):
+        raise ValueError(f"it has {len(data)} of the {claimed} bytes that its header claims; fetch or export it again")
     begin = HEADER.size + CHUNK.size if binary else 0
     end = begin + CHUNK.unpack_from(data, HEADER.size)[0] if binary else len(data)
     tree = json.loads(data[begin:end])
+    _check_meant(tree, path.parent)
     materials = tree.setdefault("materials", [])
     for primitive in (p for mesh in tree.get("meshes", ()) for p in mesh["primitives"]):
         primitive.setdefault("material", len(materials))
@@ -32,3 +42,20 @@ def load_gltf(path: Path):
         text = HEADER.pack(b"glTF", 2, begin + len(text) + len(data) - end) + CHUNK.pack(len(text), b"JSON") + text + data[end:]
     beside = trimesh.resolvers.FilePathResolver(str(path))  # where its textures and buffers lie
     return trimesh.load(BytesIO(text), file_type=path.suffix[1:].lower(), resolver=beside, process=False)
+
+
+def _check_meant(tree: dict, folder: Path) -> None:
+    """Write the names of files as they are, of which trimesh knows no %20. ValueError where one of them is not there, which trimesh shows
+    as white, where an extension is required that is not read, and where numbers are stored as parts of a whole, which it takes as they
+    are."""
+    for name in tree.get("extensionsRequired", ()):
+        if not name.startswith(READ):
+            raise ValueError(f"it requires {name}, which is not read; export it without, uncompressed")
+    for entry in (e for kind in ("images", "buffers") for e in tree.get(kind, ()) if not e.get("uri", "data:").startswith("data:")):
+        entry["uri"] = unquote(entry["uri"])
+        if not (file := folder / entry["uri"]).is_file() or not file.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{entry['uri']}, which it names, is not beside it or in a folder there")
+    for primitive in (p for mesh in tree.get("meshes", ()) for p in mesh["primitives"]):
+        for attribute in ("POSITION", "NORMAL", "TEXCOORD_0"):
+            if attribute in primitive["attributes"] and tree["accessors"][primitive["attributes"][attribute]].get("normalized"):
+                raise ValueError(f"its {attribute} are quantized, normalized whole numbers, which are not read; export it with float ones")

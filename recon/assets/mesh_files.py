@@ -33,13 +33,15 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
         raise FileNotFoundError(f"{path} does not exist")
     try:
         loaded = load_gltf(path) if path.suffix.lower() in GLTF else trimesh.load(path, process=False)
+        found: list = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
     except Exception as problem:  # trimesh's readers raise whatever their formats' libraries do
         why = f"{type(problem).__name__}: {problem}"
         raise ValueError(f"{path} does not read as a mesh ({why}); .glb with its textures inside is best") from None
-    found: list = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
     parts: list[trimesh.Trimesh] = [p for p in found if isinstance(p, trimesh.Trimesh) and len(p.faces)]
     if not parts:
         raise ValueError(f"{path} holds no triangles")
+    if not all(p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in parts):
+        raise ValueError(f"{path} has triangles of vertices that it does not hold; export it again")
     if not all(np.isfinite(p.vertices).all() for p in parts):
         raise ValueError(f"{path} has vertices that are not finite")
     turn = turn_to_asset(up, forward)

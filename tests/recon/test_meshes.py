@@ -167,6 +167,48 @@ def test_what_cannot_be_seen_is_refused_before_it_is_fitted(tmp_path):
         read_mesh(tmp_path / "line.glb")
 
 
+def test_a_truncated_file_says_so(box, tmp_path):
+    (tmp_path / "a.glb").write_bytes(box.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"it has \d+ of the \d+ bytes that its header claims"):
+        read_mesh(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "requires KHR_draco_mesh_compression, which is not read"),
+        (lambda t: t.update(extensionsRequired=["KHR_texture_transform"]), "requires KHR_texture_transform, which is not read"),
+        (lambda t: t.update(images=[{"uri": "gone%20far.png"}]), "gone far.png, which it names, is not beside it"),
+        (lambda t: t.update(images=[{"uri": "../gone.png"}]), "../gone.png, which it names, is not beside it"),
+        (lambda t: t["accessors"][attributes(t)["TEXCOORD_0"]].update(normalized=True), "its TEXCOORD_0 are quantized"),
+        (lambda t: t["accessors"][attributes(t)["POSITION"]].update(count=8), "triangles of vertices that it does not hold"),
+    ],
+    ids=["compressed", "turned textures", "lost picture", "picture outside", "quantized", "few vertices"],
+)
+def test_what_would_look_otherwise_than_it_is_meant_is_refused(box, tmp_path, change, said):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "gone.png").touch()
+    file = tmp_path / "in" / "a.glb"
+    file.write_bytes(box.read_bytes())
+    rewritten(file, change)
+    with pytest.raises(ValueError, match=said):
+        read_mesh(file)
+
+
+def attributes(tree: dict) -> dict:
+    return tree["meshes"][0]["primitives"][0]["attributes"]
+
+
+def test_a_picture_beside_whose_name_is_escaped_is_found(box, tmp_path):
+    from PIL import Image
+
+    file = tmp_path / "a.glb"
+    file.write_bytes(box.read_bytes())
+    Image.new("RGB", (4, 4), (200, 0, 0)).save(tmp_path / "all red.png")
+    rewritten(file, lambda tree: tree.update(images=[{"uri": "all%20red.png"}]))
+    assert (_textures(file)[:, :3] == (200, 0, 0)).all()
+
+
 @pytest.mark.filterwarnings("error")
 def test_vertices_that_are_not_finite_are_refused_without_further_words(tmp_path):
     box = trimesh.creation.box((1.8, 1.5, 4.2))
