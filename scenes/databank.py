@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
@@ -149,14 +150,18 @@ class Databank:
                 (partial / "asset.json").write_text(told, encoding="utf-8")
                 if thumb_png is not None:
                     (partial / "thumb.png").write_bytes(thumb_png)
+            index = {"format": FORMAT, "version": VERSION, "entries": [asdict(e) for e in [*entries, entry]]}
+            try:
+                with atomic_file(self.path / "index.json") as partial:
+                    partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
+            except OSError:
+                shutil.rmtree(self.path / home, ignore_errors=True)  # no index tells of it
+                raise
         except BaseException:
             for empty in new:
                 with suppress(OSError):
                     empty.rmdir()
             raise
-        index = {"format": FORMAT, "version": VERSION, "entries": [asdict(e) for e in [*entries, entry]]}
-        with atomic_file(self.path / "index.json") as partial:
-            partial.write_text(json.dumps(index, indent=1, ensure_ascii=False), encoding="utf-8")
         return id
 
     def original(self, asset: Asset) -> Asset | None:

@@ -1,4 +1,5 @@
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -109,6 +110,23 @@ def test_an_add_that_breaks_off_leaves_the_databank_as_it_was(bank, monkeypatch)
     assert {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()} == before
     monkeypatch.undo()
     assert bank.add(asset()) == "car/0003"
+
+
+def test_an_asset_that_the_index_has_no_room_for_leaves_no_folder(bank, monkeypatch):
+    """As on a disk that the asset has filled to its last byte."""
+
+    @contextmanager
+    def full(_):
+        raise OSError(28, "No space left on device")
+        yield
+
+    before = {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()}
+    monkeypatch.setattr("scenes.databank.atomic_file", full)
+    for label in ("Car", "Truck"):
+        with pytest.raises(OSError, match="No space"):
+            bank.add(asset(4, label))
+    assert {p: p.read_bytes() for p in bank.path.rglob("*") if p.is_file()} == before
+    assert sorted(p.name for p in (bank.path / "assets").glob("*/*")) == ["0001", "0001", "0002"]
 
 
 def test_an_add_that_fails_leaves_no_folder(tmp_path):
