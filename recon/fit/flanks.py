@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from recon.mirror import FEWEST, SOLID
 from recon.outline import outline
 from recon.seeds.points import alike
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh
+from scenes.poses import matrix_from_quat
 
 END = 1.0
 """Metres from the front or rear within which a splat is of that end."""
@@ -28,12 +28,18 @@ ALONG, UP = 0.4, 0.1
 WIDE, THICK, LOGIT = 0.6, 0.02, 3.0
 """Their standard deviations along these two, in what is between them, and in metres across; the logit of their opacity."""
 
-THERE, OPEN = 0.12, 0.3
-"""Metres along and up within which something known of the outer half tells that a side is there, and the part of it that is not there from
-which on the rest is made."""
+INSET = 0.1
+"""Metres inside the outline at which a side is drawn: on it, pictures taken from behind would show it around the rear's blurred rim."""
+
+THERE, OPEN = 0.8, 0.3
+"""Opacity from aside of what is known further out than that, from which on a side is there: what pictures from behind show deep within a
+rear is none of it, nor are specks. And the part of it that is not there from which on the rest is made."""
 
 BONNET, BONNETED = ((0.6, 1.0), (0.28, 0.05)), {"car", "pickup", "vehicle"}
 """Parts of the height, and how far ahead of the middle vehicles reach there, in lengths, of those classes that end in a bonnet."""
+
+WIDTH = 0.03
+"""Metres by which a splat is taken to be wider than it is, as a picture from some metres aside shows it."""
 
 COLUMN = 0.1
 """Metres of an end's width, each of which counts once in the colour of a height, however many splats it has."""
@@ -54,16 +60,25 @@ def flanks(known: Gaussians, size: np.ndarray, label: str) -> Gaussians:
         ahead, half = (float(np.interp(z, shape[0], reach)) for reach in shape[1:])
         first, last = ahead - WIDE * ALONG, WIDE * ALONG - _other_end(z / size[2], end, label) * size[0]
         x = np.linspace(first, last, max(0, math.ceil((first - last) / ALONG) + 1))
-        places.append(np.stack([x * end, np.full(len(x), half), np.full(len(x), z)], 1))
+        places.append(np.stack([x * end, np.full(len(x), half - INSET), np.full(len(x), z)], 1))
         rgb.append(np.tile(_middle_colour(means, colours, z, at_ends[end]), (len(x), 1)))
     left, colour, made = np.concatenate(places), np.concatenate(rgb), []
     for side in (1.0, -1.0):
-        outer = means[means[:, 1] * side > left[:, 1].max(initial=0) / 2]
-        away = cKDTree(outer[:, [0, 2]]).query(left[:, [0, 2]])[0] if len(outer) else np.full(len(left), np.inf)
-        lacking = away > THERE
+        outer = means[:, 1] * side > np.interp(means[:, 2], shape[0], shape[2]) - INSET
+        lacking = _opacity_from_aside(solid.select(torch.from_numpy(outer)), left[:, [0, 2]]) < THERE
         if len(left) and lacking.mean() > OPEN:
             made.append(alike(left[lacking] * [1, side, 1], colour[lacking], (WIDE * ALONG, THICK, WIDE * UP), LOGIT, known.sh.shape[1]))
     return Gaussians.cat(made) if made else Gaussians.empty(known.sh.shape[1])
+
+
+def _opacity_from_aside(splats: Gaussians, at: np.ndarray) -> np.ndarray:
+    """What `splats` of a vehicle hide `[N]` from far aside, along y, at places (x, z) `at` `[N, 2]`."""
+    means, logits = (x.double().cpu() for x in (splats.means, splats.logit_opacities))
+    axes = (matrix_from_quat(splats.quats) * splats.log_scales.exp()[:, None]).double().cpu()[:, [0, 2]]
+    whitening = torch.linalg.inv(torch.linalg.cholesky(axes @ axes.mT + WIDTH**2 * torch.eye(2)))
+    off = torch.from_numpy(at)[:, None] - means[:, [0, 2]]
+    squares = torch.einsum("nij,pnj->pni", whitening, off).square().sum(-1)
+    return (1 - (1 - torch.sigmoid(logits) * (-squares / 2).exp()).prod(1)).numpy()
 
 
 def _other_end(height: float, end: float, label: str) -> float:
