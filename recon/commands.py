@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from scenes.alone import sole
 from scenes.opening import check_device
 from scenes.options import (
     AngleOrNone,
@@ -74,17 +75,18 @@ class Recon:
         check_device(self.device)
         if self.size is not None:
             check_size(self.size)  # before photos are placed, which takes long
-        log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
 
         def fix() -> str:
             begun = checkpoint_path(self.output).exists()
             return "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
 
-        with stopped_saying(fix):
-            reconstruct(
-                log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
-                size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
-            )  # fmt: skip
+        with sole(self.output):
+            log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
+            with stopped_saying(fix):
+                reconstruct(
+                    log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
+                    size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
+                )  # fmt: skip
 
 
 @dataclass

@@ -13,6 +13,7 @@ import torch
 from front_door import SHOOT
 
 from scenes import Gaussians, Placed, save
+from scenes.alone import sole
 from scenes.usd.splats import save_gaussians
 
 INSERT = ["insert", "street", "--asset", "car/0001"]
@@ -123,6 +124,13 @@ def test_photos_that_claim_to_be_huge_are_bad_data(door, tmp_path):
         (tmp_path / "walk" / f"{i}.png").write_bytes(data)
     _, errors = door(["recon", str(tmp_path / "walk"), "-o", str(tmp_path / "s1")], 1)
     assert "0.png does not decode as an image" in errors and "fetch the file again" in errors
+
+
+def test_a_scene_that_another_command_reconstructs_is_left_to_it(door, tmp_path):
+    words = ["recon", str(tmp_path), "-o", str(tmp_path / "s1")]
+    with sole(tmp_path / "s1"):
+        assert "s1 is being written by another command" in door(words, 1)[1]
+    assert "not a known layout" in door(words, 1)[1]
 
 
 DEVICE_TAKERS = [

@@ -8,7 +8,7 @@ import pytest
 from street import car
 
 from scenes import Databank, load, save
-from scenes.alone import alone
+from scenes.alone import alone, sole
 from scenes.edit import Edit
 from scenes.usd.edit import add_change
 from scenes.usd.undo import undone
@@ -114,3 +114,20 @@ def test_assets_added_at_once_to_a_databank_that_is_not_there_yet_are_all_in_it(
     ids.append(bank.add(car()))
     first.join(30)
     assert sorted(ids) == ["car/0001", "car/0002"] == [e.id for e in bank.entries()]
+
+
+def test_what_one_command_writes_for_hours_no_other_begins(tmp_path):
+    with sole(tmp_path / "s"):
+        handle = os.open(tmp_path / ".s.busy", os.O_RDWR)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(FileExistsError, match=r"s is being written by another command .* wait until it is done"), sole(tmp_path / "s"):
+            pass
+        with sole(tmp_path / "other"):
+            pass
+    assert not list(tmp_path.iterdir()), "whoever was refused must not take away what holds"
+    os.close(handle)
+    (tmp_path / ".s.busy").touch()  # a killed one left it
+    with pytest.raises(KeyError), sole(tmp_path / "s"):
+        raise KeyError
+    assert not list(tmp_path.iterdir())
