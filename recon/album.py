@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch.nn import functional as F
 
+from recon.evaluation.report import readout_ends
 from recon.fit.shutter import readout_shift
-from recon.frames import Frames
 from recon.log import LogCamera
-from recon.report import readout_ends
+from recon.views.frames import Frames
 from render import render_frame
 from render.album import keep_photos
 from render.rays import camera_rays

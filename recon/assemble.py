@@ -10,8 +10,8 @@ import torch
 from recon.fit.fit import Fit
 from recon.fit.model import MODEL
 from recon.log import Log, Track
-from recon.skies import seen_sky
 from recon.start import Start
+from recon.views.skies import seen_sky
 from scenes.asset import Actor, Asset
 from scenes.camera import DARKEST, RigCamera
 from scenes.gaussians import Placed

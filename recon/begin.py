@@ -9,7 +9,6 @@ from dataclasses import replace
 import torch
 
 from recon.defaults import HELD_OUT
-from recon.exposed import exposed_by
 from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
@@ -19,13 +18,14 @@ from recon.fit.limbs import Limbs
 from recon.fit.motion import Motion
 from recon.fit.population import Population
 from recon.fit.strides import stride_of
-from recon.frames import Frames, load_frames
 from recon.log import Log
+from recon.objects.tracks import LIMBED
 from recon.ready import moving_things
 from recon.seeds.triangulate import triangulated
-from recon.sky_told import under_their_sky
 from recon.start import Start, prepare
-from recon.tracks import LIMBED
+from recon.views.exposed import exposed_by
+from recon.views.frames import Frames, load_frames
+from recon.views.sky_told import under_their_sky
 from render.progress import Progress
 from scenes.camera import RigCamera
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from recon.frames import Frames
 from recon.log import Log
+from recon.views.frames import Frames
 from scenes.camera import RigCamera
 from scenes.poses import interpolate, inverse
 from scenes.trajectory import Trajectory

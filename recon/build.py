@@ -11,20 +11,20 @@ from recon.album import keep_album
 from recon.assemble import assemble
 from recon.begin import begin
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint
-from recon.corrected import KINDS
 from recon.defaults import HELD_OUT, choose, fit_config, fit_size
+from recon.evaluation.live import Live
+from recon.evaluation.offpath import held_out_sweeps, off_path_table, off_path_text
+from recon.evaluation.report import held_out_table, table_text
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.run import run
-from recon.frames import check_size
-from recon.live import Live
 from recon.log import Log
 from recon.memory import check_memory
-from recon.offpath import held_out_sweeps, off_path_table, off_path_text
 from recon.ready import fitted, readied, same_sweeps
-from recon.report import held_out_table, table_text
+from recon.registration.corrected import KINDS
 from recon.sound import check_path
 from recon.start import Start
+from recon.views.frames import check_size
 from render.progress import Progress
 from scenes.atomic import atomic_folder
 from scenes.files import save

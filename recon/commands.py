@@ -66,7 +66,7 @@ class Recon:
         from recon import open_log, reconstruct
         from recon.build import check_free
         from recon.checkpoint import checkpoint_path
-        from recon.frames import check_size
+        from recon.views.frames import check_size
 
         shelf = self.output.parent
         if not shelf.exists() and shelf.parent.is_dir():

@@ -6,16 +6,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
-from recon.adjust import adjusted
-from recon.align import aligned
 from recon.checkpoint import tracks_of
-from recon.corrected import as_corrected
+from recon.evaluation.offpath import held_out_sweeps
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
-from recon.mounts_by_road import mounts_by_road
-from recon.mounts_by_surfaces import mounts_by_surfaces
 from recon.movers.search import with_movers
-from recon.offpath import held_out_sweeps
+from recon.registration.adjust import adjusted
+from recon.registration.align import aligned
+from recon.registration.corrected import as_corrected
+from recon.registration.mounts_by_road import mounts_by_road
+from recon.registration.mounts_by_surfaces import mounts_by_surfaces
 from render.progress import Progress
 
 

@@ -9,15 +9,14 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.actors import Split, split_points
 from recon.body_path import body_path
 from recon.fit.model import Splats, draw
 from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
-from recon.frames import Frames
 from recon.ground import estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
 from recon.movers.traffic import traffic
+from recon.objects.actors import Split, split_points
 from recon.seeds.actors import actor_seeds, times_of
 from recon.seeds.aside import seen_from_aside
 from recon.seeds.beyond import beyond_lidar
@@ -27,7 +26,8 @@ from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
 from recon.seeds.standing import by_all_sweeps
-from recon.skies import SkyPicture, like_sky
+from recon.views.frames import Frames
+from recon.views.skies import SkyPicture, like_sky
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground

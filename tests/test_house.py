@@ -43,6 +43,19 @@ def test_imports_run_one_way(package):
         assert not wrong, f"{path.relative_to(REPOSITORY)} imports {', '.join(sorted(wrong))}, which stands above {package}"
 
 
+def test_imports_in_recon_run_down_the_table_of_its_page():
+    room = REPOSITORY / "recon"
+    first = [line.split(" | ")[0] for line in (room / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| [")]
+    order = [Path(target).stem for target in re.findall(r"\]\(([^)]+)\)", "".join(first))]
+    files = {path: path.relative_to(room).parts[0].removesuffix(".py") for path in sorted(room.rglob("*.py"))}
+    del files[room / "__init__.py"]
+    assert sorted(order) == sorted(set(files.values()))
+    for path, name in files.items():
+        modules = [node.module or "" for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        wrong = {module.split(".")[1] for module in modules if module.startswith("recon.")} - set(order[order.index(name) :])
+        assert not wrong, f"{path.relative_to(REPOSITORY)} imports {', '.join(sorted(wrong))}, which recon/README.md has before {name}"
+
+
 def test_scenes_do_not_know_warp():
     for path in (REPOSITORY / "scenes").rglob("*.py"):
         assert "warp" not in imported_packages(path), path

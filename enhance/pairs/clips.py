@@ -9,8 +9,8 @@ import torch
 
 from enhance.pairs.shards import to_bytes
 from recon.album import at_once
-from recon.egomask import at_size
 from recon.log import Log, LogCamera
+from recon.views.egomask import at_size
 from render import render_frame
 from render.frame_types import Frame
 from render.video import from_bytes

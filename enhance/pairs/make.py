@@ -16,8 +16,8 @@ from enhance.pairs.diffusion_renderer import Relit
 from enhance.pairs.inputs import check_cameras, check_kinds, held_out_camera, open_reconstruction, open_recording
 from enhance.pairs.shards import PairSet, is_whole, to_bytes, write_shard
 from enhance.pairs.sources import Sources
-from recon.egomask import with_ego_masks
 from recon.log import Log, LogCamera
+from recon.views.egomask import with_ego_masks
 from scenes.scene import Scene
 from scenes.spread import spread
 

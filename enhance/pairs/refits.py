@@ -21,11 +21,11 @@ from enhance.pairs.clips import scene_time
 from recon.album import at_once
 from recon.assemble import assemble
 from recon.begin import begin
-from recon.corrected import as_corrected
 from recon.defaults import choose
 from recon.fit.config import FitConfig
-from recon.frames import size_like
 from recon.log import Log, LogCamera, Track
+from recon.registration.corrected import as_corrected
+from recon.views.frames import size_like
 from render import render_frame
 from render.progress import Progress
 from render.references import References, Shot

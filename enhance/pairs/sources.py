@@ -16,10 +16,10 @@ from enhance.pairs.refits import REFITS, SHORT, Less, Refit, as_reconstructed, e
 from enhance.pairs.shards import KINDS
 from recon import stopped_early
 from recon.assets.extract import FEWEST_SPLATS, Candidate, candidates
-from recon.corrected import as_corrected
 from recon.early import SHORT as EARLY
-from recon.egomask import with_ego_masks
 from recon.log import Log
+from recon.registration.corrected import as_corrected
+from recon.views.egomask import with_ego_masks
 from render.references import References, Shot
 from scenes.asset import Asset
 from scenes.databank import Databank

@@ -18,9 +18,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.assets.patching import OPAQUE, STEP, in_colours_of, patched, shown_alone
-from recon.mirror import SOLID, THERE
-from recon.outline import outline
-from recon.tracks import VEHICLES
+from recon.objects.mirror import SOLID, THERE
+from recon.objects.outline import outline
+from recon.objects.tracks import VEHICLES
 from scenes.asset import Asset
 from scenes.gaussians import Gaussians
 from scenes.seen import unseen_sides

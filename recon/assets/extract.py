@@ -17,7 +17,7 @@ from recon.assets.closing import closed
 from recon.assets.looking import looking_at
 from recon.assets.photos import photos_of
 from recon.assets.sight import FARTHEST, Sight, Views, sight_of
-from recon.mirror import mirrored, within_box
+from recon.objects.mirror import mirrored, within_box
 from render import Frame, rasterize
 from render.album import shots_in
 from render.references import Shot

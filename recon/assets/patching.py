@@ -14,8 +14,8 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from recon.mirror import SOLID
-from recon.outline import CLEARANCE
+from recon.objects.mirror import SOLID
+from recon.objects.outline import CLEARANCE
 from recon.seeds.points import Cloud, splats_from
 from render import Frame, rasterize
 from scenes.camera import Camera

@@ -1,4 +1,4 @@
-"""What lies behind a picture, by direction: a kernel each, where the plain functions of `scenes/sky.py` and `recon/skies.py` are some
+"""What lies behind a picture, by direction: a kernel each, where the plain functions of `scenes/sky.py` and `recon/views/skies.py` are some
 twenty operations."""
 
 from __future__ import annotations

@@ -22,12 +22,12 @@ from recon.fit.sight import Eye, in_sight
 from recon.fit.targets import Targets, ego_at, scale_of
 from recon.fit.turns import Turns
 from recon.fit.unseen import Shown
-from recon.frames import Frames
 from recon.kernels.descent import Rates
 from recon.kernels.develop import SKY_STEP
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed

@@ -12,8 +12,8 @@ import math
 import numpy as np
 import torch
 
-from recon.mirror import FEWEST, SOLID
-from recon.outline import outline
+from recon.objects.mirror import FEWEST, SOLID
+from recon.objects.outline import outline
 from recon.seeds.points import alike
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh

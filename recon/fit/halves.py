@@ -16,8 +16,8 @@ from recon.fit.flanks import flanks
 from recon.fit.model import Splats
 from recon.fit.unseen import SEEN
 from recon.log import Track
-from recon.mirror import other_half
-from recon.tracks import VEHICLES
+from recon.objects.mirror import other_half
+from recon.objects.tracks import VEHICLES
 from scenes.gaussians import Gaussians
 
 INSTEAD = 0.3

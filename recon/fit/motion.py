@@ -12,9 +12,9 @@ import torch
 from recon.fit.knots import Knots, scaled
 from recon.fit.model import Splats
 from recon.fit.shutter import readout_shifts
-from recon.frames import Frames
 from recon.log import Track
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import OpenCV, Pinhole
 from scenes.poses import inverse, small_poses

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 
 from recon.fit.behind import masked, sampled
 from recon.fit.motion import Motion
-from recon.frames import Frames
 from recon.side_by_side import side_by_side
-from recon.skies import always_hidden
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.skies import always_hidden
+from recon.views.view import View
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.spread import spread
@@ -41,7 +41,7 @@ class Openings:
     """What a fit's pictures say of the sky.
 
     sky     by a training view's camera and index, what of it is surely sky, bool `[H, W]`
-    hidden  bool `[HIDDEN, 2 HIDDEN]`: directions in which none of them shows it, though some look there (`recon/skies.py`)
+    hidden  bool `[HIDDEN, 2 HIDDEN]`: directions in which none of them shows it, though some look there (`recon/views/skies.py`)
     """
 
     def __init__(self, frames: Frames, motion: Motion, device: torch.device):

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.frames import Frames
 from recon.seeds.fill import STEP, Search
-from recon.skies import like_sky
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.skies import like_sky
+from recon.views.view import View
 from scenes.gaussians import Gaussians
 
 REFILLED_AT = (0.2, 0.4)

@@ -8,9 +8,9 @@ import torch
 import torch.nn.functional as F
 
 from recon.fit.motion import Motion
-from recon.frames import Frames
 from recon.log import Track
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 

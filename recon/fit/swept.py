@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from recon.actors import APART_US
 from recon.fit.model import Splats
 from recon.log import Track
+from recon.objects.actors import APART_US
 from scenes.ground import Ground
 
 CELL = 0.2

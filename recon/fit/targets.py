@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from recon.frames import SMALLEST
-from recon.view import View
+from recon.views.frames import SMALLEST
+from recon.views.view import View
 from render.kept import kept_beside
 from scenes.camera import Camera
 

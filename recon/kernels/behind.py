@@ -27,7 +27,7 @@ def look_up(
     directions: wp.array[wp.vec3], mask: wp.array2d[wp.uint8], out: wp.array[wp.uint8],
     first: int,
 ):  # fmt: skip
-    """What a mask `[R, 2 R]` says of each direction: as `recon.skies.cells` does."""
+    """What a mask `[R, 2 R]` says of each direction: as `recon.views.skies.cells` does."""
     i = first + wp.tid()
     rows = mask.shape[0]
     at = place(directions[i], rows, 2 * rows)

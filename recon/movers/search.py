@@ -11,13 +11,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from recon.actors import MARGIN, SWEPT_MARGIN, inside
 from recon.ground import estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.movers.boxing import boxed
 from recon.movers.following import FEWEST, Cluster, Followed, Patience, follow
 from recon.movers.freespace import RangeImage, range_images, tally
-from recon.tracks import named
+from recon.objects.actors import MARGIN, SWEPT_MARGIN, inside
+from recon.objects.tracks import named
 from scenes.ground import Ground
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory

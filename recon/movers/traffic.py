@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from recon.frames import Frames
 from recon.log import Log, Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.sighting import Sighting, sightings
+from recon.objects.tracks import named, upright
 from recon.seeds.stereo import Plate, plate_of
-from recon.tracks import named, upright
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from render.progress import Progress
 from scenes.ground import Ground
 

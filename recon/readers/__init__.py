@@ -14,8 +14,8 @@ from recon.readers.ncore import is_ncore, read_ncore
 from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
 from recon.readers.photos import check_enough, is_photos, is_video, read_photos
+from recon.readers.recorder import without_recorder
 from recon.readers.waymo import is_waymo, read_waymo
-from recon.recorder import without_recorder
 from recon.sound import sound
 
 

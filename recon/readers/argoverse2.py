@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, lengthened
+from recon.objects.tracks import Boxes, from_middles, slug, tracks_of
 from recon.readers.arrow import read_table
 from recon.readers.stated import posed, stating
-from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.poses import translation
 from scenes.trajectory import Trajectory

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, Sweep, Track, leading, lengthened
+from recon.objects.tracks import Boxes, slug, tracks_of, upright
 from recon.readers.kitti_files import (
     SHARE,
     calibration,
@@ -34,7 +35,6 @@ from recon.readers.kitti_files import (
 )
 from recon.readers.spin import untwisted
 from recon.readers.stated import rigid
-from recon.tracks import Boxes, slug, tracks_of, upright
 from scenes.poses import inverse, yaw
 from scenes.trajectory import Trajectory
 

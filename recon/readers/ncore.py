@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track, lengthened
+from recon.objects.tracks import Boxes, from_middles, slug, tracks_of
 from recon.readers.stated import rigid, stating
-from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Fisheye, FTheta, Lens, OpenCV, Pinhole
 from scenes.poses import inverse, translation
 from scenes.trajectory import Trajectory

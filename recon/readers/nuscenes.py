@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
+from recon.objects.tracks import Boxes, from_middles, slug, tracks_of
 from recon.readers.stated import posed, stating
-from recon.tracks import Boxes, from_middles, slug, tracks_of
 from scenes.lenses import Pinhole
 from scenes.names import unknown
 from scenes.poses import translation

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, image_size, leading, lengthened
+from recon.objects.tracks import named, slug, upright
 from recon.readers.stated import posed, stating
 from recon.readers.unpickle import read_frame
-from recon.tracks import named, slug, upright
 from scenes.lenses import Pinhole
 from scenes.poses import translation
 from scenes.trajectory import Trajectory

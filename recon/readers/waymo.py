@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, lengthened
+from recon.objects.tracks import Boxes, from_middles, tracks_of, upright
 from recon.readers.arrow import Rows, read_cell, read_table
 from recon.readers.stated import rigid, stating
-from recon.tracks import Boxes, from_middles, tracks_of, upright
 from scenes.lenses import OpenCV
 from scenes.names import unknown
 from scenes.poses import CAM_FROM_FLU, inverse, translation

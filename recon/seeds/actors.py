@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
-from recon.actors import Split, box_skin
-from recon.frames import Frames
 from recon.log import Log, Sweep, Track
+from recon.objects.actors import Split, box_skin
+from recon.objects.tracks import LIMBED
 from recon.seeds.points import Cloud, colours, merged_colours, splats_from, thin
 from recon.seeds.shade import shade
-from recon.tracks import LIMBED
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
 

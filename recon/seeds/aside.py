@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.frames import Frames
 from recon.log import Log
-from recon.project import project
 from recon.seeds.carpet import NEAR_GROUND
 from recon.seeds.points import Cloud, middle_colours, one_a_voxel
+from recon.views.frames import Frames
+from recon.views.project import project
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse

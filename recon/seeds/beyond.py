@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from recon.frames import Frames
 from recon.log import Log, SparsePoints, Track
-from recon.project import project
 from recon.seeds.dense import AGREE, OTHERS, Depths, believed, measured_by
 from recon.seeds.measured import Measured, grid_of
 from recon.seeds.points import Cloud
+from recon.views.frames import Frames
+from recon.views.project import project
 from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.ground import Ground

@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 import torch
 
-from recon.frames import Frames
-from recon.ground_rays import ground_hits
 from recon.log import Log, SparsePoints, Track
-from recon.project import project
+from recon.seeds.ground_rays import ground_hits
 from recon.seeds.measured import PICTURES, Measured, by_pictures
 from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.stereo import Plate, plate_of, swept
 from recon.side_by_side import side_by_side
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.project import project
+from recon.views.view import View
 from render.progress import Progress
 from scenes.camera import Camera
 from scenes.ground import Ground

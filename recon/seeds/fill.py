@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.ground_rays import ground_hits
 from recon.log import Track
+from recon.seeds.ground_rays import ground_hits
 from recon.seeds.points import Cloud, nearest_box, splats_from
 from recon.seeds.sweep import companions, swept_depth
-from recon.view import View
+from recon.views.view import View
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground

@@ -10,13 +10,13 @@ import torch
 import torch.nn.functional as F
 from scipy import ndimage
 
-from recon.actors import Split
-from recon.frames import Frames
 from recon.log import Log, Sweep, Track
-from recon.project import project
+from recon.objects.actors import Split
 from recon.seeds.points import nearest_box
 from recon.seeds.stereo import WIDTH, Plate
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.project import project
+from recon.views.view import View
 from render.rays import camera_rays, world_directions
 from scenes.camera import Camera
 from scenes.poses import inverse

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from recon.frames import Frames
 from recon.log import Log, Track
-from recon.project import project
+from recon.views.frames import Frames
+from recon.views.project import project
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb

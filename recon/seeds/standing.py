@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from recon.actors import Split
-from recon.frames import Frames
 from recon.log import Log, Track
+from recon.objects.actors import Split
 from recon.seeds.measured import Measured, as_known, grid_of, nearest_points
 from recon.seeds.points import Cloud, nearest_box, thin
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from render.rays import camera_rays
 from scenes.camera import Camera
 

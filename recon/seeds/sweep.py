@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from recon.view import View
+from recon.views.view import View
 from scenes.camera import Camera
 from scenes.poses import inverse
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.frames import Frames
 from recon.log import Log, SparsePoints
 from recon.sfm.posed import AHEAD, Posed, picture_name, triangulate
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 
 TOGETHER_US = 25_000
 """Pictures of two cameras that were taken so near each other are matched, too."""

@@ -20,8 +20,8 @@ from PIL import Image
 from scipy import ndimage
 
 from recon import FitConfig
+from recon.evaluation.report import read_out
 from recon.log import Log, LogCamera, Packed
-from recon.report import read_out
 from render import render_frame
 from render.compare import psnr
 from tests.bench.recon import fitted, opened

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from recon import open_log
-from recon.actors import MARGIN, inside
 from recon.log import Log, Track
 from recon.movers.search import with_movers
+from recon.objects.actors import MARGIN, inside
 from scenes.poses import inverse
 
 FEWEST = 5

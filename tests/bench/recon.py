@@ -27,15 +27,15 @@ from scipy.spatial import ConvexHull, QhullError
 from recon import open_log
 from recon.assemble import assemble
 from recon.begin import begin
-from recon.corrected import as_corrected
 from recon.defaults import HELD_OUT, choose, fit_config
+from recon.evaluation.offpath import held_out_sweeps, off_path_table
+from recon.evaluation.report import held_out_table, read_out
 from recon.fit.config import FitConfig
-from recon.frames import Frames
 from recon.log import Log, Sweep, Track
-from recon.offpath import held_out_sweeps, off_path_table
+from recon.objects.tracks import LIMBED
 from recon.ready import annotated, readied
-from recon.report import held_out_table, read_out
-from recon.tracks import LIMBED
+from recon.registration.corrected import as_corrected
+from recon.views.frames import Frames
 from render import render_frame
 from scenes.camera import Camera, RigCamera
 from scenes.poses import inverse

@@ -23,9 +23,9 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
-from recon.frames import Frames, load_frames
 from recon.log import Log, LogCamera, Packed
-from recon.skies import sky_mask
+from recon.views.frames import Frames, load_frames
+from recon.views.skies import sky_mask
 from render.rays import world_directions
 from scenes.camera import Camera
 from scenes.hdr import load_hdr
@@ -179,7 +179,7 @@ def _painted(log: Log, camera: LogCamera, index: int, look: Look, sky: np.ndarra
 
 def _depth(log: Log, camera: Camera) -> np.ndarray:
     """Metres to what each pixel shows, by the nearest point of lidar in the picture; with what is above it as far."""
-    from recon.project import project
+    from recon.views.project import project
     from scenes.poses import inverse
 
     small = camera.resized(96, 54)
@@ -193,7 +193,7 @@ def _depth(log: Log, camera: Camera) -> np.ndarray:
 
 def _lamps(start: torch.Tensor, camera: Camera) -> np.ndarray:
     """Street lamps `[h, w, 1]`, levels: along the street from where the body starts `[4, 4]`, 7 m up, with halos."""
-    from recon.project import project
+    from recon.views.project import project
     from scenes.poses import inverse
 
     places = np.array([[12.0 + 18 * k, side, 7.0] for k in range(6) for side in (-6.0, 7.0)])

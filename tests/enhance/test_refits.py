@@ -9,8 +9,8 @@ from made_drive import write_drive
 
 from enhance.pairs.refits import SHORT, Less, as_reconstructed, by_turns, exposed_as, refits, rendered_aside, thinned
 from recon import open_log
-from recon.corrected import MOVED
 from recon.fit.fit import Fit
+from recon.registration.corrected import MOVED
 from render import render_frame
 from render.compare import psnr
 from scenes.poses import inverse

@@ -8,8 +8,8 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import Split, _placed, _retimed, inside, split_points
 from recon.log import LidarPoints, Log, Sweep, Track
+from recon.objects.actors import Split, _placed, _retimed, inside, split_points
 from scenes.poses import translation, yaw
 from scenes.trajectory import Trajectory
 

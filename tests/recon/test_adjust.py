@@ -5,11 +5,11 @@ import pytest
 import torch
 from painted import SIZE, drive
 
-from recon.adjust import adjusted
-from recon.align import about
-from recon.corrected import MOVED, as_corrected, moved
 from recon.fit.config import FitConfig
 from recon.ready import readied
+from recon.registration.adjust import adjusted
+from recon.registration.align import about
+from recon.registration.corrected import MOVED, as_corrected, moved
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 

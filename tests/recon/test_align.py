@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from recon.align import about, aligned
-from recon.corrected import MOVED, REMOUNTED, TURNED, as_corrected, moved
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from recon.registration.align import about, aligned
+from recon.registration.corrected import MOVED, REMOUNTED, TURNED, as_corrected, moved
 from scenes.lenses import Pinhole
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory

@@ -17,9 +17,9 @@ from made_waymo import NAMES as FIVE  # noqa: E402
 from made_waymo import READOUT_US, SEGMENT, near_points, write_waymo  # noqa: E402
 
 from recon import open_log  # noqa: E402
+from recon.objects.tracks import nearness  # noqa: E402
 from recon.readers.arrow import Rows  # noqa: E402
 from recon.readers.waymo import BODY, POSE, STAMP, _from_range, _rotations, read_waymo  # noqa: E402
-from recon.tracks import nearness  # noqa: E402
 from scenes.lenses import OpenCV, Pinhole  # noqa: E402
 from scenes.poses import inverse, pose_from, translation, yaw  # noqa: E402
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.frames import Frames
 from recon.log import Log, LogCamera
 from recon.seeds.aside import FARTHEST, seen_from_aside
 from recon.seeds.points import Cloud
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from scenes.ground import Ground
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory

@@ -11,7 +11,7 @@ from recon import extract_assets
 from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned
 from recon.assets.looking import looking_at
 from recon.assets.sight import Views, sight_of
-from recon.mirror import within_box
+from recon.objects.mirror import within_box
 from render import rasterize, render_frame
 from render.album import keep_photos
 from render.references import Shot

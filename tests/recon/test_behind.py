@@ -1,7 +1,7 @@
 import torch
 
 from recon.fit.behind import masked, sampled
-from recon.skies import cells
+from recon.views.skies import cells
 from scenes.sky import sample_equirect
 
 

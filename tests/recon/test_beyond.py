@@ -3,7 +3,6 @@ import pytest
 import torch
 from painted import SIZE, WALL, depth_of, drive
 
-from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import Log
 from recon.seeds import dense, measured, stereo
@@ -11,6 +10,7 @@ from recon.seeds.beyond import _beyond, _points, _seen_through, beyond_lidar
 from recon.seeds.dense import DUG, Depths, believed
 from recon.seeds.measured import Measured, as_known, grid_of
 from recon.seeds.stereo import plate_of
+from recon.views.frames import load_frames
 
 STEPS = [0.0] + [0.6] * 8
 

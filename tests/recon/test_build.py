@@ -15,11 +15,11 @@ from quick_fit import CONFIG, SIZE
 from recon import open_log, reconstruct
 from recon.checkpoint import checkpoint_path, load_checkpoint
 from recon.commands import Recon
-from recon.corrected import REMOUNTED, TURNED, as_corrected, moved
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.log import LogCamera
 from recon.memory import check_memory
+from recon.registration.corrected import REMOUNTED, TURNED, as_corrected, moved
 from render.album import references_of
 from scenes import Scene, load
 from scenes.poses import inverse, translation

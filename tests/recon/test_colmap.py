@@ -10,11 +10,11 @@ from PIL import Image
 
 from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
-from recon.frames import load_frames
-from recon.gains import picture_gains
 from recon.ground import estimate_ground
 from recon.readers.gauge import find_gauge, up_from_cameras
 from recon.seeds.dense import agreeing, cloud_from_pictures
+from recon.views.frames import load_frames
+from recon.views.gains import picture_gains
 from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert

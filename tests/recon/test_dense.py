@@ -3,13 +3,13 @@ import pytest
 import torch
 from painted import AHEAD, BOARD, SIZE, WALL, board_left, depth_of, drive
 
-from recon.frames import load_frames
 from recon.ground import estimate_ground
 from recon.log import SparsePoints, Track
 from recon.seeds import dense, stereo
 from recon.seeds.dense import DUG, _chosen, agreed, agreeing, cloud_from_pictures, companions, depths, ground_depth
 from recon.seeds.stereo import plate_of
 from recon.seeds.triangulate import triangulated
+from recon.views.frames import load_frames
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.lenses import Fisheye, OpenCV, Pinhole

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 
 from recon import FitConfig, open_log, reconstruct
-from recon.egomask import ego_mask, with_ego_masks
-from recon.frames import load_frames
 from recon.log import Log, LogCamera, Packed
+from recon.views.egomask import ego_mask, with_ego_masks
+from recon.views.frames import load_frames
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr

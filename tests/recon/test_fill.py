@@ -6,8 +6,8 @@ import torch
 
 from recon.seeds.fill import FAR, unexplained
 from recon.seeds.sweep import companions, swept_depth
-from recon.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sky, seen_sky, sky_mask
-from recon.view import View
+from recon.views.skies import HIDDEN, SkyPicture, always_hidden, cells, finer, like_sky, seen_sky, sky_mask
+from recon.views.view import View
 from scenes import Camera, Gaussians, Pinhole, Placed, RigCamera, Scene, Sky, Trajectory
 from scenes.ground import Ground
 

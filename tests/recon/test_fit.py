@@ -9,7 +9,6 @@ from PIL import Image
 from quick_fit import CONFIG, SIZE
 
 from recon import open_log
-from recon.actors import split_points
 from recon.assemble import assemble
 from recon.begin import begin
 from recon.checkpoint import load_checkpoint, save_checkpoint
@@ -20,8 +19,9 @@ from recon.fit.model import Splats
 from recon.fit.openings import ASIDE_WEIGHT, HORIZON
 from recon.fit.swept import Swept
 from recon.fit.turns import Turns
+from recon.objects.actors import split_points
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers, mistake
-from recon.skies import cells
+from recon.views.skies import cells
 from render import render_frame
 from render.rays import world_directions
 from scenes.poses import translation

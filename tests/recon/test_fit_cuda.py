@@ -14,9 +14,9 @@ from recon.assemble import assemble
 from recon.begin import begin
 from recon.checkpoint import load_checkpoint, save_checkpoint
 from recon.defaults import choose
+from recon.evaluation.report import held_out_table
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
-from recon.report import held_out_table
 
 ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
 CONFIG = FitConfig(steps=160, budget=11_000, stages=((0.0, 2), (0.5, 1)), grow_every=6)

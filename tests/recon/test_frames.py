@@ -10,11 +10,11 @@ from PIL import Image
 
 from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
-from recon.frames import Frames, load_frames, size_like
 from recon.log import LidarPoints, Log, LogCamera, Packed, SparsePoints, Sweep
-from recon.skies import fine_sky, like_sky
-from recon.sky_told import under_their_sky
-from recon.view import View
+from recon.views.frames import Frames, load_frames, size_like
+from recon.views.skies import fine_sky, like_sky
+from recon.views.sky_told import under_their_sky
+from recon.views.view import View
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse
 from scenes.trajectory import Trajectory

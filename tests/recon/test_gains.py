@@ -13,9 +13,9 @@ from quick_fit import CONFIG, SIZE
 
 from recon import open_log, reconstruct
 from recon.begin import begin
-from recon.frames import load_frames
-from recon.gains import gains_along
 from recon.log import Packed
+from recon.views.frames import load_frames
+from recon.views.gains import gains_along
 from render import render_frame
 from render.compare import psnr
 from scenes import load

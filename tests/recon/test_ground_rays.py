@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.ground_rays import ground_hits
 from recon.seeds.dense import ground_depth
+from recon.seeds.ground_rays import ground_hits
 from recon.seeds.stereo import Plate
 from scenes.ground import Ground
 

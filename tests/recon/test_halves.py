@@ -14,7 +14,7 @@ from recon.fit.halves import INSTEAD, halves, outdone
 from recon.fit.model import Splats
 from recon.fit.unseen import SEEN
 from recon.log import Track
-from recon.mirror import FEWEST, THERE
+from recon.objects.mirror import FEWEST, THERE
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import translation

@@ -14,7 +14,7 @@ from recon.begin import begin
 from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
-from recon.tracks import LIMBED
+from recon.objects.tracks import LIMBED
 from render import render_frame
 from scenes import Scene
 

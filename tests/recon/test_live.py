@@ -8,9 +8,9 @@ from PIL import Image
 from recon import open_log, reconstruct
 from recon.begin import begin
 from recon.defaults import choose
+from recon.evaluation.live import EVERY, Live
+from recon.evaluation.report import EQUAL_DB
 from recon.fit.config import FitConfig
-from recon.live import EVERY, Live
-from recon.report import EQUAL_DB
 
 CONFIG = FitConfig(steps=4 * EVERY, budget=9000, stages=((0.0, 2), (0.5, 1)), grow_every=10)
 SIZE = (96, 54)

@@ -5,11 +5,11 @@ import pytest
 import torch
 from painted import SIZE, drive, sweep_of, wall
 
-from recon.actors import split_points
-from recon.frames import load_frames
 from recon.log import Track
+from recon.objects.actors import split_points
 from recon.seeds.measured import SLACK, SOON_US, Measured, by_lidar, by_lidar_of_movers, by_pictures, grid_of, mistake, nearest_points
 from recon.seeds.stereo import plate_of
+from recon.views.frames import load_frames
 from scenes.camera import Camera
 from scenes.lenses import Fisheye, OpenCV, Pinhole
 from scenes.poses import translation

@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
-from recon.corrected import REMOUNTED, as_corrected
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep
-from recon.mounts_by_road import mounts_by_road
+from recon.registration.corrected import REMOUNTED, as_corrected
+from recon.registration.mounts_by_road import mounts_by_road
 from scenes.lenses import Pinhole
 from scenes.trajectory import Trajectory
 

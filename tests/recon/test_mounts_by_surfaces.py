@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from scipy import ndimage
 
-from recon.corrected import TURNED, as_corrected
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
-from recon.mounts_by_surfaces import mounts_by_surfaces
+from recon.registration.corrected import TURNED, as_corrected
+from recon.registration.mounts_by_surfaces import mounts_by_surfaces
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
@@ -104,8 +104,8 @@ def left_off(log: Log, off: tuple[float, ...], late_us: int = 0) -> np.ndarray:
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """Of a street that is all surfaces, less has to be looked at."""
-    monkeypatch.setattr("recon.mounts_by_surfaces.PAIRS", 6)
-    monkeypatch.setattr("recon.patches.PATCHES", 60)
+    monkeypatch.setattr("recon.registration.mounts_by_surfaces.PAIRS", 6)
+    monkeypatch.setattr("recon.registration.patches.PATCHES", 60)
 
 
 @pytest.mark.parametrize(

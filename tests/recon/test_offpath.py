@@ -6,9 +6,9 @@ import torch
 
 from recon import open_log
 from recon.defaults import choose
-from recon.frames import load_frames
-from recon.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
-from recon.road import photo_at, road_errors, road_points
+from recon.evaluation.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
+from recon.evaluation.road import photo_at, road_errors, road_points
+from recon.views.frames import load_frames
 from scenes import Gaussians
 from tests.street import splats
 

@@ -8,9 +8,9 @@ import torch
 from made_drive import ABSENT, SCANNED_US
 
 from recon import open_log
-from recon.actors import inside
+from recon.objects.actors import inside
+from recon.objects.tracks import slug
 from recon.readers.pandaset import LABELS
-from recon.tracks import slug
 from scenes.poses import inverse
 
 

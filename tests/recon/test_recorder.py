@@ -4,7 +4,7 @@ import torch
 
 from recon import open_log
 from recon.log import LidarPoints, Log, Sweep, Track
-from recon.recorder import without_recorder
+from recon.readers.recorder import without_recorder
 from scenes import Trajectory
 from scenes.poses import translation, yaw
 

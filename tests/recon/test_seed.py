@@ -9,12 +9,12 @@ from scipy.spatial import cKDTree
 
 from recon import open_log
 from recon.body_path import body_path
-from recon.frames import Frames, load_frames
 from recon.log import Log, LogCamera
 from recon.seeds.actors import even_limit
 from recon.seeds.carpet import carpet
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, nearest_box, splats_from, thin
-from recon.view import View
+from recon.views.frames import Frames, load_frames
+from recon.views.view import View
 from scenes.camera import RigCamera
 from scenes.ground import Ground
 from scenes.harmonics import rgb_from_sh

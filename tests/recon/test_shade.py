@@ -12,8 +12,8 @@ from recon.defaults import choose
 from recon.fit.densify import shade_of
 from recon.fit.model import Splats
 from recon.log import Track
+from recon.objects.tracks import LIMBED
 from recon.seeds.shade import ABOVE, BESIDE, shade
-from recon.tracks import LIMBED
 from render import rasterize
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed

@@ -7,14 +7,14 @@ from randomized import gaussians
 from street import START_US, rig, street
 
 from recon.album import at_once
+from recon.evaluation.report import read_out
 from recon.fit.knots import Knots
 from recon.fit.model import Splats
 from recon.fit.motion import EGO, Motion
 from recon.fit.shutter import as_read
-from recon.frames import Frames
 from recon.log import Track
-from recon.report import read_out
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from render import render_frame
 from render.compare import psnr
 from scenes import Camera, Pinhole

@@ -9,10 +9,10 @@ import torch
 from painted import SIZE, drive, sweep_of
 from painted import wall as wall_points
 
-from recon.actors import split_points
-from recon.frames import load_frames
+from recon.objects.actors import split_points
 from recon.seeds.measured import grid_of
 from recon.seeds.standing import BESIDE, CLOSE, FURTHER, RISES, by_all_sweeps, upwards
+from recon.views.frames import load_frames
 from scenes.lenses import Fisheye, OpenCV, Pinhole
 
 RISE = np.repeat(np.linspace(0.4, -0.2, 60)[:, None], 30, 1)  # 0.01 a row, the uppermost first

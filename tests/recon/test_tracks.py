@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from recon.log import Track
-from recon.tracks import Boxes, facing, named, tracks_of, upright
+from recon.objects.tracks import Boxes, facing, named, tracks_of, upright
 from scenes.trajectory import Trajectory
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from painted import BOARD, SIZE, Rear, drive
 
-from recon.frames import load_frames
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.sighting import Sighting
 from recon.movers.traffic import around, believed, boxes, spaced, traffic
 from recon.seeds import stereo
+from recon.views.frames import load_frames
 from scenes.ground import Ground
 
 FLAT = Ground(torch.zeros(300, 300), (-50.0, -75.0), 0.5)

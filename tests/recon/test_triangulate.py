@@ -3,13 +3,13 @@ import pytest
 import torch
 from painted import SIZE, depth_of, drive
 
-from recon.frames import load_frames
-from recon.project import project
 from recon.readers.colmap import lens_of
 from recon.readers.colmap_model import ModelCamera
 from recon.seeds.triangulate import matched, triangulated
 from recon.sfm.posed import colmap_lens
-from recon.view import View
+from recon.views.frames import load_frames
+from recon.views.project import project
+from recon.views.view import View
 from scenes.lenses import Fisheye, FTheta, OpenCV, Pinhole
 from scenes.poses import inverse
 

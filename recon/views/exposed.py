@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.gains import gains_along, picture_gains
 from recon.log import Log, SparsePoints
-from recon.project import project
-from recon.view import View
+from recon.views.gains import gains_along, picture_gains
+from recon.views.project import project
+from recon.views.view import View
 from scenes.camera import Camera
 from scenes.poses import inverse
 from scenes.trajectory import between

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.align import Surfaces
 from recon.log import Log, LogCamera
-from recon.mounts_by_road import SOON_US
-from recon.project import NEAREST, nearest_around
+from recon.registration.align import Surfaces
+from recon.registration.mounts_by_road import SOON_US
+from recon.views.project import NEAREST, nearest_around
 from scenes.camera import Camera
 from scenes.poses import inverse, small_poses
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from recon.evaluation.report import DRIVING, EQUAL_DB
 from recon.fit.fit import Fit
-from recon.report import DRIVING, EQUAL_DB
 from render.compare import psnr
 from scenes.spread import spread
 

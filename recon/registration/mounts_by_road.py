@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.corrected import REMOUNTED, as_corrected
 from recon.ground import estimate_ground
 from recon.log import Log, LogCamera, Sweep
+from recon.registration.corrected import REMOUNTED, as_corrected
 from scenes.ground import Ground
 
 WAY, WITHIN_US = 2.5, 3_000_000

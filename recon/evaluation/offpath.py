@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from recon.actors import split_points
-from recon.frames import Frames
+from recon.evaluation.report import EQUAL_DB
+from recon.evaluation.road import photo_at, road_errors, road_points, shown_road, standing
 from recon.log import Log, Sweep
-from recon.project import nearest_around, project
-from recon.report import EQUAL_DB
-from recon.road import photo_at, road_errors, road_points, shown_road, standing
-from recon.skies import always_hidden, cells, looks_of
+from recon.objects.actors import split_points
+from recon.views.frames import Frames
+from recon.views.project import nearest_around, project
+from recon.views.skies import always_hidden, cells, looks_of
 from render import render_frame
 from render.compare import decibels
 from render.rays import world_directions

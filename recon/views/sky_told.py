@@ -16,9 +16,9 @@ import torch
 from scipy import ndimage
 
 from recon.log import Log, SparsePoints
-from recon.project import project
-from recon.skies import closed, even, like_sky, reaching_top, sky_mask
-from recon.view import View
+from recon.views.project import project
+from recon.views.skies import closed, even, like_sky, reaching_top, sky_mask
+from recon.views.view import View
 from render.rays import world_directions
 from scenes.poses import inverse
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from recon.actors import APART_US
 from recon.log import Track
+from recon.objects.actors import APART_US
 from scenes.poses import inverse, pose_from
 from scenes.trajectory import Trajectory
 

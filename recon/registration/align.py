@@ -18,8 +18,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
-from recon.corrected import MOVED, as_corrected
 from recon.log import Log, Sweep
+from recon.registration.corrected import MOVED, as_corrected
 from scenes.poses import small_poses
 
 APART = (1, 3, 9, 27)

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.corrected import MOVED, as_corrected
 from recon.log import Log
+from recon.registration.corrected import MOVED, as_corrected
 from recon.sfm.posed import AHEAD, Posed, adjust, picture_name
 from scenes.poses import inverse
 

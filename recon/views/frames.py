@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from recon.egomask import at_size, ego_mask
-from recon.exposed import balanced, exposed
 from recon.log import Log, LogCamera
-from recon.skies import WIRE, fine_sky, like_sky
-from recon.sky_told import coarse_sky, under_their_sky
-from recon.view import View
+from recon.views.egomask import at_size, ego_mask
+from recon.views.exposed import balanced, exposed
+from recon.views.skies import WIRE, fine_sky, like_sky
+from recon.views.sky_told import coarse_sky, under_their_sky
+from recon.views.view import View
 from scenes.camera import Camera, followed
 
 SMALLEST = 16

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 
 from recon.fit.shutter import as_read
-from recon.frames import Frames
 from recon.log import LogCamera
-from recon.view import View
+from recon.views.frames import Frames
+from recon.views.view import View
 from render import render_frame
 from render.compare import psnr, ssim
 from scenes.camera import Camera, RigCamera

@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
-from recon.actors import box_skin
-from recon.frames import Frames
 from recon.log import Track
-from recon.project import nearest_around, project
-from recon.view import View
+from recon.objects.actors import box_skin
+from recon.views.frames import Frames
+from recon.views.project import nearest_around, project
+from recon.views.view import View
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from recon.project import project
+from recon.views.project import project
 from scenes.camera import Camera
 from scenes.poses import inverse
 

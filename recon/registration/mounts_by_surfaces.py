@@ -17,12 +17,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from recon.actors import SWEPT_MARGIN, inside
-from recon.align import FARTHEST, Surfaces
-from recon.corrected import TURNED, as_corrected
 from recon.log import Log, Sweep
-from recon.mounts_by_road import OVERLAP, far_pairs
-from recon.patches import CameraPictures, Matches
+from recon.objects.actors import SWEPT_MARGIN, inside
+from recon.registration.align import FARTHEST, Surfaces
+from recon.registration.corrected import TURNED, as_corrected
+from recon.registration.mounts_by_road import OVERLAP, far_pairs
+from recon.registration.patches import CameraPictures, Matches
 from scenes.trajectory import all_near
 
 PAIRS = 16
