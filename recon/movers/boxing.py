@@ -64,10 +64,16 @@ def label(size: np.ndarray) -> str:
     return "car" if size[0] < 6 else "truck"
 
 
-def smoothed(times: np.ndarray, places: np.ndarray, at: np.ndarray, told: np.ndarray | None = None) -> np.ndarray:
+def smoothed(
+    times: np.ndarray,
+    places: np.ndarray,
+    at: np.ndarray,
+    told: np.ndarray | None = None,
+    speeds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """Places `[K, 2]` at rising seconds `at` of places `[T, 2]` seen at rising `times`, by least squares with `PUSH`; what is farther off
     than three times what is likely pulls no harder (Huber 1964). told: how surely each place is known, inverse covariances `[T, 2, 2]`;
-    `OFF` every way where None."""
+    `OFF` every way where None. speeds: how fast they went, too, `[T, 2]` in m/s, and how far off each of both is, `[2]`."""
     knots = np.union1d(times, at)
     seen = np.searchsorted(knots, times)
     bend = np.zeros((max(len(knots) - 2, 0), len(knots)))
@@ -77,9 +83,16 @@ def smoothed(times: np.ndarray, places: np.ndarray, at: np.ndarray, told: np.nda
         bend[i, i : i + 3] = np.array([1 / before, -1 / before - 1 / after, 1 / after]) / half * np.sqrt(half) / PUSH
     told = np.broadcast_to(np.eye(2) / OFF**2, (len(times), 2, 2)) if told is None else told
     calm = (bend.T @ bend + 1e-9 * np.eye(len(knots)))[:, :, None, None] * np.eye(2)
+    drawn = np.zeros((len(knots), 2))
+    if speeds is not None:
+        ends = np.stack([np.maximum(seen - 1, 0), np.minimum(seen + 1, len(knots) - 1)])
+        pace = np.zeros((len(times), len(knots)))
+        np.put_along_axis(pace, ends.T, np.array([-1, 1]) / (knots[ends[1]] - knots[ends[0]])[:, None], axis=1)
+        calm += (pace.T @ pace)[:, :, None, None] * np.diag(1 / speeds[1] ** 2)
+        drawn += pace.T @ speeds[0] / speeds[1] ** 2
     weight = np.ones(len(times))
     for _ in range(4):
-        matrix, right = calm.copy(), np.zeros((len(knots), 2))
+        matrix, right = calm.copy(), drawn.copy()
         np.add.at(matrix, (seen, seen), weight[:, None, None] * told)
         np.add.at(right, seen, weight[:, None] * np.einsum("tij,tj->ti", told, places))
         flat = matrix.swapaxes(1, 2).reshape(right.size, right.size)

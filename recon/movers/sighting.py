@@ -51,7 +51,8 @@ APART = 0.6
 class Sighting:
     """Something that moves, in a picture at `time_us`: where the middle of what is seen of it stands `[2]`, the street's direction there
     `[2]`, how far ahead of the camera that is, and its speed along the street in m/s; by how much it looks more alike than what stands
-    still, `worth`, and the ground before it than if it went on there, `grounded`."""
+    still, `worth`, and the ground before it than if it went on there, `grounded`. cut: whether the picture's border is so near that there
+    may be more of it beyond."""
 
     time_us: int
     place: np.ndarray
@@ -60,6 +61,7 @@ class Sighting:
     speed: float
     worth: float
     grounded: float
+    cut: bool
 
 
 def sightings(
@@ -96,7 +98,9 @@ def sightings(
         fits = (worth > WORTH) & (grounded > GROUNDED) & (np.abs(speeds[best]) >= SLOWEST)
         for x in np.flatnonzero(fits):
             ray = np.array([(x + 0.5 - plate.centre[0]) / plate.focal[0], 0.0, 1.0]) @ plate.cam_from_world[:3, :3]
-            one = Sighting(time_us, (eye + z * ray)[:2], along, float(z), float(speeds[best[x]]), float(worth[x]), float(grounded[x]))
+            cut = not across < x < len(stands[0]) - across
+            told = float(z), float(speeds[best[x]]), float(worth[x]), float(grounded[x])
+            one = Sighting(time_us, (eye + z * ray)[:2], along, *told, cut)
             found.append((float(worth[x] + min(grounded[x], worth[x])), int(x), across, z, one))
     kept: list[tuple[float, int, int, float, Sighting]] = []
     for new in sorted(found, key=lambda f: -f[0]):

@@ -9,14 +9,15 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from recon.log import Log, Track
-from recon.movers.boxing import CAR, smoothed
+from recon.movers.going import boxed
 from recon.movers.sighting import Sighting, sightings
-from recon.objects.tracks import named, upright
+from recon.objects.tracks import named
 from recon.seeds.stereo import Plate, plate_of
 from recon.views.frames import Frames
 from recon.views.view import View
 from render.progress import Progress
 from scenes.ground import Ground
+from scenes.lane import Lane
 
 GAPS_US = (200_000, 500_000)
 """Before and after a picture, about when others were taken that it is compared with: within the first a car that comes is still in view,
@@ -54,17 +55,8 @@ KEPT, AT_LEAST = 0.5, 1.0
 """Part of the speed that pictures tell, and metres a second at least, by which its places may have it go otherwise: what does not go where
 it seems to is something else."""
 
-OFF = 0.08, 0.012
-"""Parts of their distance by which places are off, along the line of sight and across."""
-
-BEYOND_US = 700_000
-"""How long before its first picture and after its last one it goes on, at the picture's border or far away."""
-
-SAME = (1.3, 1.0), 0.4
+SAME = (1.3, 1.3), 0.4
 """Lengths and widths of a box within which another's middle belongs to the same thing, and the part of its time in which that must be."""
-
-HIGH = 1.55
-"""Metres up of a car, whose sizes all are taken to have: before a street that is far away nobody sees where its roof ends."""
 
 
 def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
@@ -86,7 +78,7 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
         for i, plate in enumerate(plates):
             seen.append(sightings(plate, int(times[i]), around(i, plates, times), ground, path, float(paces[i])))
             steps.step()
-    return named(boxes(seen, times, eyes, ground), log.ego)
+    return named(boxes(seen, times, plates, Lane(log.ego), ground), log.ego)
 
 
 def spaced(views: Sequence[View]) -> list[View]:
@@ -107,12 +99,12 @@ def way_of(places: np.ndarray) -> np.ndarray:
     return np.array(way)
 
 
-def boxes(seen: list[list[Sighting]], times: np.ndarray, eyes: np.ndarray, ground: Ground) -> list[Track]:
-    """Tracks of what was seen in pictures at `times` `[T]` from `eyes` `[T, 2]`."""
+def boxes(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], lane: Lane, ground: Ground) -> list[Track]:
+    """Tracks of what was seen in pictures, `plates`, at `times` `[T]`, along a lane."""
     followed = [f for f in follow(seen) if believed(f, times)]
     made: list[Track] = []
     for one in sorted(followed, key=lambda f: -sum(s.worth for s in f)):
-        track = boxed(one, times, eyes, ground)
+        track = boxed(one, times, plates, lane, ground)
         if not any(_within(track, other) > SAME[1] for other in made):
             made.append(track)
     return made
@@ -165,27 +157,6 @@ def believed(thing: list[Sighting], times: np.ndarray) -> bool:
     told = float(np.median([s.speed for s in thing]))
     went = float(np.polyfit(seconds, steps, 1)[0])
     return bool(abs(told) * np.ptp(seconds) > WENT and abs(went - told) < max(KEPT * abs(told), AT_LEAST))
-
-
-def boxed(thing: list[Sighting], times: np.ndarray, eyes: np.ndarray, ground: Ground) -> Track:
-    """The box of a thing, a car's, at those of the pictures' `times` at which it is there."""
-    own = np.array([s.time_us for s in thing])
-    at = (times >= own[0] - BEYOND_US) & (times <= own[-1] + BEYOND_US)
-    stamps, places = times[at], np.stack([s.place for s in thing])
-    sight = places - eyes[np.searchsorted(times, own)]
-    away = np.linalg.norm(sight, axis=1)
-    axes = np.stack([sight, sight[:, ::-1] * [-1, 1]], 1) / away[:, None, None]
-    told = np.einsum("tki,tkj,tk->tij", axes, axes, 1 / np.outer(away, OFF) ** 2)
-    face = smoothed(own / 1e6, places, stamps / 1e6, told)
-    street = np.stack([np.interp(stamps, own, [s.along[k] for s in thing]) for k in (0, 1)], 1)
-    # what is seen of it is the end that looks at us; it may go past us after that
-    beyond = np.sign(np.median((street * (face - eyes[at])).sum(1)))
-    middle = face + street * beyond * CAR[0] / 2
-    ahead = street * np.sign(np.median([s.speed for s in thing]))
-    base = np.column_stack([middle, ground.height(torch.from_numpy(middle)).numpy()])
-    poses = upright(base, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])))
-    size = np.array([*CAR, HIGH])
-    return Track("", "car", True, size, stamps, poses, np.full(len(stamps), -1), (f"seen at {base[0].round(1).tolist()}",))
 
 
 def _within(track: Track, other: Track) -> float:

@@ -13,12 +13,16 @@ from recon.objects.tracks import LIMBED
 from recon.seeds.points import Cloud, colours, merged_colours, splats_from, thin
 from recon.seeds.shade import shade
 from recon.views.frames import Frames
-from recon.views.view import View
+from recon.views.project import project
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
+from scenes.poses import inverse
 
 ACTORS_PART, MOST_OF_ONE = 0.09, 3000
 """Part of the splat budget that all movers' lidar points may take, and the most of one mover: traffic must leave the street its splats."""
+
+NEARLY = 0.9
+"""Part of the most points of a box's skin that a picture shows, from which on it shows nearly as much."""
 
 
 def actor_seeds(
@@ -54,7 +58,7 @@ def _actor(
     trajectory = track.trajectory()
     if len(points) < 100:
         skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
-        moment = _nearest(log, track, frames.of(0))
+        moment = _shown_best(log, frames, track, skin)
         points, taken_us = np.concatenate([points, skin]), np.concatenate([taken_us, np.full(len(skin), moment)])
     times = sorted({v.time_us for v in frames.training() if trajectory.covers(v.time_us)})
     poses = dict(zip(times, trajectory.at_each(torch.tensor(times, dtype=torch.int64)), strict=True))
@@ -67,15 +71,17 @@ def _actor(
     return splats_from(cloud, sides, sh_count, 0.15)
 
 
-def _nearest(log: Log, track: Track, views: list[View]) -> int:
-    """Time of the view during which a box is nearest to the body, of those in whose time there is one; the first where there is none."""
-    trajectory = track.trajectory()
-    there = [v for v in views if trajectory.covers(v.time_us)]
-    if not there:
-        return views[0].time_us if views else 0
-    times = torch.tensor([v.time_us for v in there])
-    apart = (trajectory.at_each(times) - log.ego.at_each(times))[:, :3, 3].norm(dim=1)
-    return there[int(apart.argmin())].time_us
+def _shown_best(log: Log, frames: Frames, track: Track, skin: np.ndarray) -> int:
+    """Time of the training picture from nearest by of those that show nearly as much of a box's skin, points `[N, 3]` on it, as any does;
+    0 where none shows any of it. From nearest by of all it may be beside the camera."""
+    trajectory, shown = track.trajectory(), []
+    for view in frames.training():
+        if trajectory.covers(view.time_us):
+            camera = frames.camera(log, view)
+            placed = inverse(camera.world_from_cam) @ trajectory.at(view.time_us)
+            shown.append((int(project(skin, placed.numpy(), camera)[3].sum()), float(placed[:3, 3].norm()), view.time_us))
+    most = max((count for count, *_ in shown), default=0)
+    return min(((away, time) for count, away, time in shown if count and count >= NEARLY * most), default=(0.0, 0))[1]
 
 
 def times_of(sweeps: Sequence[Sweep], index: np.ndarray) -> np.ndarray:

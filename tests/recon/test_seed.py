@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import painted
 import pytest
 import torch
 from randomized import gaussians
@@ -9,8 +10,9 @@ from scipy.spatial import cKDTree
 
 from recon import open_log
 from recon.body_path import body_path
-from recon.log import Log, LogCamera
-from recon.seeds.actors import even_limit
+from recon.log import Log, LogCamera, Track
+from recon.objects.actors import split_points
+from recon.seeds.actors import actor_seeds, even_limit
 from recon.seeds.carpet import carpet
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, nearest_box, splats_from, thin
 from recon.views.frames import Frames, load_frames
@@ -178,3 +180,18 @@ def test_on_a_long_way_the_carpet_keeps_to_its_part_and_still_hides_what_is_belo
     assert (away < 1.0 / 0.75 * float(spread)).all()
     few = carpet(Cloud(road[:9], np.full((9, 3), 0.4)), flat, Trajectory(ego.times_us[:9], poses[:9]), 1, 20_000)
     assert few.log_scales[0, 0].exp() == pytest.approx(0.75 * 0.3)
+
+
+@pytest.mark.parametrize(("ends_at", "shown"), [(14.0, True), (-3.0, False)], ids=["overtakes", "stays behind"])
+def test_a_mover_without_lidar_points_looks_as_in_pictures_that_show_it(ends_at, shown):
+    """Not as in the one that was taken when it was nearest, since it is beside the camera then."""
+    log = painted.drive([0.0] * 8, ("front",))
+    places = torch.linspace(-5, ends_at, 8, dtype=torch.float64)
+    poses = torch.stack([translation(float(x), 4.0) for x in places])
+    times = log.camera("front").times_us.numpy()
+    track = Track("veh_1", "car", True, np.array([4.3, 1.8, 1.5]), times, poses, np.full(8, -1), ())
+    frames = load_frames(log, ["front"], (0, 10**18), (80, 45), 8)
+    split = split_points(log, [], [track])
+    made = list(actor_seeds(log, frames, [], split, Ground(torch.zeros(80, 80), (-20.0, -20.0), 0.5), np.ones((1, 3)), 1, 10_000))
+    assert [t.name for t, _ in made] == (["veh_1"] if shown else [])
+    assert all(len(seeds) > 100 for _, seeds in made)

@@ -1,5 +1,7 @@
 """Boards that go along a painted street like cars' rears, which pictures alone show."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import painted
 import pytest
@@ -8,11 +10,15 @@ from painted import BOARD, SIZE, Rear, drive
 
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
+from recon.movers.going import BEYOND_US
 from recon.movers.sighting import Sighting
 from recon.movers.traffic import around, believed, boxes, spaced, traffic
 from recon.seeds import stereo
 from recon.views.frames import load_frames
 from scenes.ground import Ground
+from scenes.lane import Lane
+from scenes.poses import CAM_FROM_FLU, translation
+from scenes.trajectory import Trajectory
 
 FLAT = Ground(torch.zeros(300, 300), (-50.0, -75.0), 0.5)
 STEPS = [0.0] + [0.6] * 15
@@ -75,8 +81,24 @@ def test_of_a_fast_video_every_few_pictures_are_looked_at():
     assert spaced([]) == []
 
 
-def sighted(time_us: int, x: float, speed: float, y: float = 0.0) -> Sighting:
-    return Sighting(time_us, np.array([x, y]), np.array([1.0, 0.0]), x, speed, 0.3, 0.2)
+def sighted(time_us: int, x: float, speed: float, y: float = 0.0, cut: bool = False) -> Sighting:
+    return Sighting(time_us, np.array([x, y]), np.array([1.0, 0.0]), x, speed, 0.3, 0.2, cut)
+
+
+def tracked_all(seen: Sequence[list[Sighting]]) -> list[Track]:
+    """The boxes of what pictures show that a camera takes on the spot 0.1 seconds apart, 53 degrees wide, 1.5 metres above a straight
+    street."""
+    cam_from_world = (CAM_FROM_FLU @ translation(z=-1.5)).numpy()
+    plate = stereo.Plate(torch.zeros(90, 160), (160.0, 160.0), (80.0, 45.0), cam_from_world, torch.zeros(90, 160, 2), np.ones((90, 160)))
+    lane = Lane(Trajectory(torch.tensor([0, 10**6]), torch.stack([translation(), translation(x=10.0)])))
+    return boxes(list(seen), np.arange(len(seen)) * 100_000, [plate] * len(seen), lane, FLAT)
+
+
+def tracked(seen: list[Sighting], count: int) -> Track:
+    """The box of one thing, in `count` pictures."""
+    by_time = {s.time_us: [s] for s in seen}
+    (track,) = tracked_all([by_time.get(100_000 * k, []) for k in range(count)])
+    return track
 
 
 def test_what_does_not_go_where_it_seems_to_is_not_believed():
@@ -87,11 +109,40 @@ def test_what_does_not_go_where_it_seems_to_is_not_believed():
     assert not believed([sighted(t, 12 + 6 * t / 1e6, 6.0) for t in times[::2]], times)  # half of the pictures do not show it
 
 
-def test_a_car_that_passes_us_keeps_its_box_beyond_what_was_seen_of_it():
-    times, eyes = np.arange(14) * 100_000, np.zeros((14, 2))
-    (track,) = boxes([[sighted(t, 14 - 10 * t / 1e6, -10.0, 3.0)] if t < 900_000 else [] for t in times], times, eyes, FLAT)
+def test_a_car_that_passes_us_keeps_its_box_until_it_is_behind_us():
+    track = tracked([sighted(t, 14 - 10 * t / 1e6, -10.0, 3.0) for t in range(0, 900_000, 100_000)], 30)
     middles = track.world_from_box[:, 0, 3].numpy()
-    assert track.times_us[-1] == 1_300_000 and np.allclose(middles, 14 - 10 * track.times_us / 1e6 + CAR[0] / 2, atol=0.3)
+    assert np.allclose(middles, 14 - 10 * track.times_us / 1e6 + CAR[0] / 2, atol=0.3)
+    assert -CAR[0] / 2 - 0.1 < middles[-1] < -CAR[0] / 2 + 1.1
+
+
+def test_a_car_that_overtakes_us_has_its_box_from_when_it_is_beside_us():
+    track = tracked([sighted(t, 10 * t / 1e6 - 8, 10.0, 2.5) for t in range(2_000_000, 3_000_000, 100_000)], 32)
+    middles = track.world_from_box[:, 0, 3].numpy()
+    assert np.allclose(middles, 10 * track.times_us / 1e6 - 8 + CAR[0] / 2, atol=0.3)
+    assert -CAR[0] / 2 - 0.1 < middles[0] < -CAR[0] / 2 + 1.1
+
+
+def test_far_away_a_car_goes_on_for_a_moment_only():
+    track = tracked([sighted(t, 20 + 5 * t / 1e6, 5.0) for t in range(1_500_000, 2_500_000, 100_000)], 50)
+    assert track.times_us[[0, -1]].tolist() == [1_500_000 - BEYOND_US, 2_400_000 + BEYOND_US]
+
+
+def test_where_the_border_cuts_a_car_it_keeps_to_its_lane():
+    """What is left of it in the picture looks as if it came nearer to us sideways."""
+
+    def seen(cut: bool) -> list[Sighting]:
+        sides = {t: 3.5 - max(0.0, 0.8 - t / 1e6) for t in range(0, 2_000_000, 100_000)}
+        return [sighted(t, 8 + 5 * t / 1e6, 5.0, side, cut and side < 3.5) for t, side in sides.items()]
+
+    off = {cut: np.abs(tracked(seen(cut), 20).world_from_box[:, 1, 3].numpy() - 3.5).max() for cut in (False, True)}
+    assert off[True] < 0.2 and off[False] > 2 * off[True]
+
+
+def test_of_two_sightings_of_one_car_side_by_side_one_box_is_made():
+    times = range(0, 2_000_000, 100_000)
+    (track,) = tracked_all([[sighted(t, 20 + 5 * t / 1e6, 5.0, y) for y in (-0.9, 1.0)] for t in times])
+    assert len(track.times_us) == 20
 
 
 def test_a_picture_is_compared_with_those_soon_before_and_after_it():
@@ -109,3 +160,12 @@ def test_a_way_keeps_to_the_lines_of_sight_where_distances_are_unsure():
     seen = true + out * np.where(np.arange(21) % 2, 2.0, -2.0)[:, None]
     told = out[:, :, None] * out[:, None] / 4 + across[:, :, None] * across[:, None] * 100
     assert np.abs(smoothed(times, seen, times, told) - true).max() < 0.7
+
+
+def test_a_way_is_as_fast_as_it_is_told_where_places_are_unsure():
+    times = np.linspace(0, 1, 11)
+    true = np.stack([20 + 5 * times, np.full(11, 4.0)], 1)
+    seen, told = true + np.stack([2 * times - 1, 0 * times], 1), np.broadcast_to(np.eye(2) / 4, (11, 2, 2))
+    speeds = np.tile([5.0, 0.0], (11, 1)), np.array([0.3, 0.3])
+    assert np.abs(smoothed(times, seen, times, told, speeds) - true).max() < 0.1
+    assert np.abs(smoothed(times, seen, times, told) - true).max() > 0.8
