@@ -10,7 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from urllib.parse import unquote
 
-from scenes.formats.gltf import CHUNK, HEADER
+from scenes.formats.gltf import CHUNK, HEADER, read_glb
 
 SUFFIXES = (".glb", ".gltf")
 
@@ -23,38 +23,39 @@ def load_gltf(path: Path):
     trimesh would leave out, or read otherwise than it is meant."""
     import trimesh
 
-    data, binary = path.read_bytes(), path.suffix.lower() == ".glb"
-    if binary and not data.startswith(b"glTF"):
-        raise ValueError("it does not start as a GLB file does")
-    if binary and (claimed := HEADER.unpack_from(data)[2]) > len(data):
-        raise ValueError(f"it has {len(data)} of the {claimed} bytes that its header claims; fetch or export it again")
-    begin = HEADER.size + CHUNK.size if binary else 0
-    end = begin + CHUNK.unpack_from(data, HEADER.size)[0] if binary else len(data)
-    tree = json.loads(data[begin:end])
-    _check_meant(tree, path.parent)
+    tree, binary = read_glb(path) if path.suffix.lower() == ".glb" else (json.loads(path.read_bytes()), None)
+    _check_read(tree)
+    _find_files(tree, path.parent)
     materials = tree.setdefault("materials", [])
     for primitive in (p for mesh in tree.get("meshes", ()) for p in mesh["primitives"]):
         primitive.setdefault("material", len(materials))
     materials.append({})
     text = json.dumps(tree).encode()
-    if binary:
+    if binary is not None:
         text += b" " * (-len(text) % 4)
-        text = HEADER.pack(b"glTF", 2, begin + len(text) + len(data) - end) + CHUNK.pack(len(text), b"JSON") + text + data[end:]
+        chunks = CHUNK.pack(len(text), b"JSON") + text
+        if len(binary):
+            chunks += CHUNK.pack(len(binary), b"BIN\0") + binary.tobytes()
+        text = HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks
     beside = trimesh.resolvers.FilePathResolver(str(path))  # where its textures and buffers lie
     return trimesh.load(BytesIO(text), file_type=path.suffix[1:].lower(), resolver=beside, process=False)
 
 
-def _check_meant(tree: dict, folder: Path) -> None:
+def _find_files(tree: dict, folder: Path) -> None:
     """Write the names of files as they are, of which trimesh knows no %20. ValueError where one of them is not there, which trimesh shows
-    as white, where an extension is required that is not read, and where numbers are stored as parts of a whole, which it takes as they
-    are."""
-    for name in tree.get("extensionsRequired", ()):
-        if not name.startswith(READ):
-            raise ValueError(f"it requires {name}, which is not read; export it without, uncompressed")
+    as white."""
     for entry in (e for kind in ("images", "buffers") for e in tree.get(kind, ()) if not e.get("uri", "data:").startswith("data:")):
         entry["uri"] = unquote(entry["uri"])
         if not (file := folder / entry["uri"]).is_file() or not file.resolve().is_relative_to(folder.resolve()):
             raise ValueError(f"{entry['uri']}, which it names, is not beside it or in a folder there")
+
+
+def _check_read(tree: dict) -> None:
+    """ValueError where an extension is required that is not read, and where numbers are stored as parts of a whole, which trimesh takes as
+    they are."""
+    for name in tree.get("extensionsRequired", ()):
+        if not name.startswith(READ):
+            raise ValueError(f"it requires {name}, which is not read; export it without, uncompressed")
     for primitive in (p for mesh in tree.get("meshes", ()) for p in mesh["primitives"]):
         for attribute in ("POSITION", "NORMAL", "TEXCOORD_0"):
             if attribute in primitive["attributes"] and tree["accessors"][primitive["attributes"][attribute]].get("normalized"):

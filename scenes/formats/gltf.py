@@ -19,7 +19,7 @@ _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "
 
 
 def read_glb(path: Path) -> tuple[dict, np.ndarray]:
-    """The JSON of a file and its binary chunk, mapped; each claimed size is checked against the file's."""
+    """The JSON of a file and its binary chunk, mapped; each claimed size is checked against the file's, which may be longer."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         head = file.read(HEADER.size + CHUNK.size)
@@ -27,16 +27,17 @@ def read_glb(path: Path) -> tuple[dict, np.ndarray]:
             raise ValueError(f"{path} is not a GLB file: it does not start with glTF and a chunk")
         _, version, total = HEADER.unpack_from(head)
         length, kind = CHUNK.unpack_from(head, HEADER.size)
-        if version != 2 or total != size or kind != b"JSON" or len(head) + length > size:
-            raise ValueError(f"{path} is truncated or corrupt: its header claims glTF {version}, {total} bytes; it has {size}")
+        if version != 2 or total > size or kind != b"JSON" or len(head) + length > total:
+            claims = f"its header claims glTF {version}, {total} bytes; it has {size}"
+            raise ValueError(f"{path} is truncated or corrupt: {claims}; fetch or export it again")
         text = file.read(length)
         at = len(head) + length
-        tail = file.read(CHUNK.size)
+        tail = file.read(min(CHUNK.size, total - at))
     tree = parsed(path, text)
     if len(tail) < CHUNK.size:
         return tree, np.zeros(0, np.uint8)
     length, kind = CHUNK.unpack(tail)
-    if kind != b"BIN\0" or at + CHUNK.size + length > size:
+    if kind != b"BIN\0" or at + CHUNK.size + length > total:
         raise ValueError(f"{path} is truncated or corrupt: its second chunk claims {length} bytes of {kind!r}")
     return tree, np.memmap(path, np.uint8, "r", at + CHUNK.size, (length,)) if length else np.zeros(0, np.uint8)
 

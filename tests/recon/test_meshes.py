@@ -169,8 +169,13 @@ def test_what_cannot_be_seen_is_refused_before_it_is_fitted(tmp_path):
 
 def test_a_truncated_file_says_so(box, tmp_path):
     (tmp_path / "a.glb").write_bytes(box.read_bytes()[:-100])
-    with pytest.raises(ValueError, match=r"it has \d+ of the \d+ bytes that its header claims"):
+    with pytest.raises(ValueError, match=r"claims glTF 2, \d+ bytes; it has \d+; fetch"):
         read_mesh(tmp_path / "a.glb")
+
+
+def test_what_stands_behind_a_whole_glb_file_is_not_read(box, tmp_path):
+    (tmp_path / "a.glb").write_bytes(box.read_bytes() + b"\n" * 12)
+    assert np.array_equal(read_mesh(tmp_path / "a.glb").vertices, read_mesh(box).vertices)
 
 
 @pytest.mark.parametrize(
