@@ -6,6 +6,7 @@ from), 2 usage: words that are wrong whatever the data, 130 interrupted, 143 sto
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -272,8 +273,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         if os.environ.get("SIDESTEP_TRACEBACK"):
             raise
-        named = isinstance(error, OSError) and error.strerror
-        fail(f"{error.filename or 'the disk'}: {error.strerror}" if isinstance(error, OSError) and named else error, 1)
+        fail(told(error), 1)
+
+
+def told(error: Exception) -> str:
+    """What an error says, where, and with its notes; of a disk that is full, also the fix."""
+    if not isinstance(error, OSError) or not error.strerror:
+        return str(error)
+    fix = ["make room there"] * (error.errno in (errno.ENOSPC, errno.EDQUOT))
+    return "; ".join([f"{error.filename or 'the disk'}: {error.strerror}", *fix, *getattr(error, "__notes__", [])])
 
 
 def lacks_memory(error: Exception) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -10,9 +11,11 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from scenes import units
+from scenes.alone import check_still, sole
+from scenes.atomic import made_folder
 from scenes.opening import UsageError, check_device, fresh
 from scenes.options import FileOrNone, Flag, FolderOrNone, Names, Output, Overwrite, WeightsOrNone, written
-from scenes.stops import stopped_saying
+from scenes.stops import resumed, stopped_saying
 
 
 @dataclass
@@ -71,7 +74,8 @@ class Pairs:
         if self.relit is not None and "relight" not in (self.kinds or ("relight",)):
             raise UsageError("--relit is for the kind relight, which --kinds does not name; add it, or leave out --relit")
         check_device(self.device)
-        with stopped_saying(lambda: "the same command goes on from here"):
+        _with_shelf(self.output)
+        with sole(self.output), stopped_saying(lambda: "the same command goes on from here"):
             drives = []
             for path, name, data in zip(self.scenes, names, self.data, strict=True):  # all now: a wrong one must not cost another's hours
                 scene = open_reconstruction(path)
@@ -110,6 +114,12 @@ def _check_there(*paths: Path) -> None:
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist")
+
+
+def _with_shelf(output: Path) -> None:
+    """Make the folder that an output stands in, where it is missing."""
+    if not output.parent.exists():
+        made_folder(output.parent)
 
 
 def _some(flag: str, names: tuple[str, ...] | None) -> None:
@@ -156,15 +166,19 @@ class Train:
         _check_seed(self.seed)
         _check_there(*self.photos)
         check_device(self.device)
-        pairs = PairSet(*self.pairs)
-        with Progress("train", 1000) as steps:
+        for folder in self.pairs:
+            for part in (folder, *folder.glob("*")):  # a training could not go on with more pairs than it was begun with
+                check_still(part)
+        _with_shelf(self.output)
+        with sole(self.output), Progress("train", 1000) as steps:
+            pairs = PairSet(*self.pairs)
 
             def say(share: float, line: str) -> None:
                 if self.resume and not steps.done:
                     steps.resume(round(1000 * share))
                 steps.step(round(1000 * share) - steps.done, line)
 
-            with stopped_saying(lambda: "the same command with --resume goes on from here"):
+            with stopped_saying(partial(resumed, self.output / "checkpoint.pt")):
                 weights = train(
                     pairs,
                     self.output,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
@@ -25,7 +26,7 @@ from scenes.options import (
     Time,
     TimeOrAll,
 )
-from scenes.stops import stopped_saying
+from scenes.stops import resumed, stopped_saying
 
 if TYPE_CHECKING:
     from scenes import Asset
@@ -75,14 +76,9 @@ class Recon:
         check_device(self.device)
         if self.size is not None:
             check_size(self.size)  # before photos are placed, which takes long
-
-        def fix() -> str:
-            begun = checkpoint_path(self.output).exists()
-            return "the same command with --resume goes on from here" if begun else "nothing was fitted yet; give the command again"
-
         with sole(self.output):
             log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
-            with stopped_saying(fix):
+            with stopped_saying(partial(resumed, checkpoint_path(self.output))):
                 reconstruct(
                     log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
                     size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,

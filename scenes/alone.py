@@ -11,6 +11,9 @@ from pathlib import Path
 _HELD: set[tuple[int, int, int]] = set()
 """Device and number of the folders that are held, and by which thread."""
 
+WRITTEN = "is being written by another command that runs on it; wait until it is done"
+"""What is said of what `sole` holds."""
+
 
 @contextmanager
 def alone(folder: str | os.PathLike) -> Iterator[None]:
@@ -47,22 +50,23 @@ def alone(folder: str | os.PathLike) -> Iterator[None]:
 @contextmanager
 def sole(path: str | os.PathLike) -> Iterator[None]:
     """Write a file or folder for minutes or hours, in a block: FileExistsError, at once, where another process does. A hidden empty file
-    beside it, which a kill may leave, is held meanwhile. Nothing is held where the disk knows no locks."""
+    beside it, which a kill may leave, is held meanwhile. Nothing is held where no file can be made there, or the disk knows no locks."""
     try:
         import fcntl
     except ImportError:  # Windows
         yield
         return
-    whole = Path(path).absolute()
-    busy = whole.with_name(f".{whole.name}.busy")
+    busy = _busy(path)
+    if not os.access(busy.parent, os.W_OK | os.X_OK):  # who may write a folder that is there need not be able to make others beside it
+        yield
+        return
     while True:
         handle = os.open(busy, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                fix = "wait until it is done, stop it, or give another name with -o"
-                raise FileExistsError(f"{path} is being written by another command that runs on it; {fix}") from None
+                raise FileExistsError(f"{path} {WRITTEN}, stop it, or give another name with -o") from None
             except OSError:
                 pass
             if not _is_at(os.fstat(handle), busy):
@@ -74,6 +78,31 @@ def sole(path: str | os.PathLike) -> Iterator[None]:
             return
         finally:
             os.close(handle)
+
+
+def check_still(path: str | os.PathLike) -> None:
+    """FileExistsError where another process writes a file or folder that is to be read, and holds it by `sole`."""
+    busy = _busy(path)
+    try:
+        import fcntl
+
+        handle = os.open(busy, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows; nobody does, or nobody could say so
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise FileExistsError(f"{path} {WRITTEN}, or stop it") from None
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+def _busy(path: str | os.PathLike) -> Path:
+    """The file that says that a file or folder is being written: beside it, also where a link leads to it."""
+    whole = Path(os.path.realpath(path))
+    return whole.with_name(f".{whole.name}.busy")
 
 
 def _is_at(about: os.stat_result, path: str | os.PathLike) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from scenes.atomic import atomic_file
+from scenes.atomic import FULL, atomic_file
 
 
 def load_state(path: Path) -> dict:
@@ -24,9 +24,14 @@ def load_state(path: Path) -> dict:
 def save_state(path: Path, state: dict) -> None:
     """Write a state; the former file stays until this one is whole.
 
-    OSError that names `path` where the disk is full.
+    OSError that names `path` where the disk is full, with a note of how much room it takes beside the former file.
     """
     whole = BytesIO()  # written by Python, which says that the disk is full; torch's own writer says "unexpected pos"
     torch.save(state, whole)
-    with atomic_file(path) as half, open(half, "wb") as file:
-        file.write(whole.getbuffer())
+    try:
+        with atomic_file(path) as half, open(half, "wb") as file:
+            file.write(whole.getbuffer())
+    except OSError as error:
+        if error.errno in FULL:
+            error.add_note(f"it takes {whole.tell() / 1e6:.1f} MB")
+        raise

@@ -7,7 +7,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+from scenes.atomic import FULL
 from scenes.warnings import warn
 
 
@@ -55,13 +57,23 @@ class Stops:
             self.end()  # what was asked for after the last step, too
 
 
+def resumed(checkpoint: Path) -> str:
+    """How work goes on that keeps a checkpoint there, for `stopped_saying`."""
+    return "the same command with --resume goes on from here" if checkpoint.exists() else "nothing was kept yet; give the command again"
+
+
 @contextmanager
 def stopped_saying(how: Callable[[], str]) -> Iterator[None]:
-    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM, which ends with a code of its own."""
+    """Who stops what happens within is told how it goes on, by Ctrl-C or by SIGTERM, which ends with a code of its own; so is whose disk
+    has no room for it, by a note of the error."""
     try:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {how()}") from None
     except SystemExit:
         warn([f"stopped; {how()}"])
+        raise
+    except OSError as error:
+        if error.errno in FULL:
+            error.add_note(how())
         raise

@@ -133,6 +133,18 @@ def test_a_scene_that_another_command_reconstructs_is_left_to_it(door, tmp_path)
     assert "not a known layout" in door(words, 1)[1]
 
 
+def test_pairs_and_trainings_under_way_are_left_alone(door, tmp_path):
+    """Pairs are not trained on before all are there: a checkpoint that knows some could not go on with more."""
+    pairs, training = tmp_path / "new" / "pairs", tmp_path / "new" / "training"
+    (pairs / "s1").mkdir(parents=True)
+    make, train = ["pairs", "street", "--data", str(tmp_path), "-o", str(pairs)], ["train", str(pairs), "-o", str(training)]
+    for held, words in ((pairs, make), (training, train), (pairs, train), (pairs / "s1", train)):
+        with sole(held):
+            assert f"{held} is being written by another command" in door(words, 1)[1]
+    assert not training.exists()
+    assert "not a known layout" in door(make, 1)[1]
+
+
 DEVICE_TAKERS = [
     SHOOT, ["recon", "drive", "-o", "new"], ["pairs", "s1", "--data", "drive", "-o", "pairs"],
     ["enhance", "clip.mp4", "-o", "x.mp4"], ["train", "pairs", "-o", "x"],

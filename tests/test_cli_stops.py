@@ -1,5 +1,6 @@
 """Commands that are stopped, or run out of disk, leave nothing half done."""
 
+import errno
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ import street as made
 from front_door import environment
 
 from scenes import load, save
+from scenes.stops import stopped_saying
 
 
 def begin(folder: Path, desk: Path) -> subprocess.Popen:
@@ -66,6 +68,16 @@ def test_a_full_disk_leaves_no_half_file_and_is_told(desk, tmp_path, words, told
     assert run.returncode == 1, run.stderr
     assert "Traceback" not in run.stderr and f"sidestep: {told}" in run.stderr
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(("code", "fix"), [(errno.ENOSPC, "; make room there"), (errno.EDQUOT, "; make room there"), (errno.EFBIG, "")])
+def test_the_fix_of_a_full_disk_is_told_with_how_it_goes_on(door, tmp_path, monkeypatch, code, fix):
+    def full(*_, **__):
+        with stopped_saying(lambda: "give the command again"):
+            raise OSError(code, os.strerror(code), "s1.fit")
+
+    monkeypatch.setattr("scenes.commands.Info.run", full)
+    assert door(["info", "street"], 1)[1] == f"sidestep: s1.fit: {os.strerror(code)}{fix}; give the command again\n"
 
 
 @pytest.mark.parametrize(

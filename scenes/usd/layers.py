@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
-from scenes.atomic import atomic_file
+from scenes.atomic import FULL, atomic_file
 from scenes.poses import quat_from_matrix, unturned
 from scenes.usd.crate import check_crate
 
@@ -40,7 +40,9 @@ def new_stage(path: Path, default_prim: str) -> Iterator[Usd.Stage]:
             stage.GetRootLayer().Save()
         except Tf.ErrorException as error:
             # with the file's name apart: where it stands in a folder that is not whole yet, that gives its own
-            raise OSError(errno.EIO, first_line(error), str(path)) from error
+            said = first_line(error)
+            full = next((code for code in FULL if os.strerror(code) in said), None)
+            raise OSError(full or errno.EIO, os.strerror(full) if full else said, str(path)) from error
 
 
 @contextmanager

@@ -249,6 +249,8 @@ def test_a_disk_that_fills_while_it_is_written_to_is_called_that_and_the_file_na
     with pytest.raises(OSError, match="No space left") as full:
         train(pairs, trained, steps=3, config=QUICK, net=SMALL, resume=True)
     assert full.value.errno == 28 and full.value.filename == str(trained / "checkpoint.pt")
+    (note,) = full.value.__notes__
+    assert note == f"it takes {(trained / 'checkpoint.pt').stat().st_size / 1e6:.1f} MB"
 
 
 @pytest.mark.parametrize("spoil", [lambda b: b[: len(b) // 2], lambda b: b"not a checkpoint", lambda b: b""])

@@ -245,7 +245,7 @@ def test_who_is_stopped_by_sigterm_is_told_how_it_goes_on(drive, tmp_path, monke
     monkeypatch.setattr("recon.reconstruct", lambda *_, **__: sys.exit(143))
     with pytest.raises(SystemExit) as stop:
         Recon(drive, tmp_path / "scene").run()
-    assert stop.value.code == 143 and "stopped; nothing was fitted yet; give the command again" in capsys.readouterr().err
+    assert stop.value.code == 143 and "stopped; nothing was kept yet; give the command again" in capsys.readouterr().err
 
 
 def test_an_existing_output_and_a_missing_folder_are_refused_before_any_work(drive, tmp_path):

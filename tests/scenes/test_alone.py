@@ -8,7 +8,7 @@ import pytest
 from street import car
 
 from scenes import Databank, load, save
-from scenes.alone import alone, sole
+from scenes.alone import alone, check_still, sole
 from scenes.edit import Edit
 from scenes.usd.edit import add_change
 from scenes.usd.undo import undone
@@ -131,3 +131,25 @@ def test_what_one_command_writes_for_hours_no_other_begins(tmp_path):
     with pytest.raises(KeyError), sole(tmp_path / "s"):
         raise KeyError
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_being_written_is_not_to_be_read_by_any_name(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path / "pairs")
+    with sole(tmp_path / "link"):
+        for name in ("pairs", "link"):
+            with pytest.raises(FileExistsError, match=f"{name} is being written .* until it is done, or stop it"):
+                check_still(tmp_path / name)
+            with pytest.raises(FileExistsError, match=f"{name} is being written"), sole(tmp_path / name):
+                pass
+        check_still(tmp_path / "other")
+    check_still(tmp_path / "pairs")
+    (tmp_path / ".pairs.busy").touch()  # a killed one left it
+    check_still(tmp_path / "pairs")
+
+
+def test_a_folder_that_may_be_written_beside_which_nothing_may_is_held_by_nothing(tmp_path, monkeypatch):
+    """As the root of a disk of one's own."""
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # root may write anywhere
+    with sole(tmp_path / "disk"):
+        assert [p.name for p in tmp_path.iterdir()] == ["disk"]

@@ -1,11 +1,12 @@
 """What asks work to end is heard between its steps, and only there."""
 
+import errno
 import os
 import signal
 
 import pytest
 
-from scenes.stops import Stops, stopped_saying
+from scenes.stops import Stops, resumed, stopped_saying
 
 
 @pytest.mark.parametrize(("number", "ends"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
@@ -47,3 +48,15 @@ def test_who_stops_is_told_how_it_goes_on(stop, told, capsys):
     with pytest.raises(stop) as end, stopped_saying(lambda: "give the command again"):
         raise stop
     assert f"{told}; give the command again" in str(end.value) + capsys.readouterr().err
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.ENOENT])
+def test_whose_disk_is_full_is_told_how_it_goes_on_from_what_was_kept(code, tmp_path):
+    checkpoint, notes = tmp_path / "s1.fit", []
+    for _ in range(2):
+        with pytest.raises(OSError) as end, stopped_saying(lambda: resumed(checkpoint)):
+            raise OSError(code, os.strerror(code), str(checkpoint))
+        notes += getattr(end.value, "__notes__", [])
+        checkpoint.touch()
+    told = ["nothing was kept yet; give the command again", "the same command with --resume goes on from here"]
+    assert notes == (told if code != errno.ENOENT else [])
