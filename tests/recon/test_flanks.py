@@ -52,9 +52,18 @@ def test_an_end_is_drawn_along_both_sides_in_its_paint_and_glass(end):
 @pytest.mark.parametrize(("label", "end", "bonnet"), [("car", -1, True), ("car", 1, False), ("truck", -1, False)])
 def test_a_car_seen_from_behind_ends_in_a_bonnet(label, end, bonnet):
     at = flanks(an_end(2.2 * end), BOX, label).means.numpy()
-    farthest = [(-end * at[(at[:, 2] > low) & (at[:, 2] < high), 0]).max() for low, high in ((0.3, 0.9), (1.35, 1.6))]
-    assert farthest[0] > 1.8
+    farthest = [(-end * at[(at[:, 2] > low) & (at[:, 2] < high), 0]).max() for low, high in ((0.75, 0.9), (1.35, 1.6))]
+    assert farthest[0] > 1.8, "up to where a bonnet begins"
     assert farthest[1] < BONNET[1][0] * BOX[0] if bonnet else farthest[1] > 1.8
+
+
+def test_where_an_end_is_not_known_a_side_has_the_colour_above_or_below_whatever_stands_within():
+    end = an_end(-2.2)
+    end = end.select((end.means[:, 2] < 0.6) | (end.means[:, 2] > SILL + 0.05))  # neither paint nor lamps between
+    within = solid(np.random.default_rng(0).uniform([-0.5, -0.3, 0.6], [0.5, 0.3, 1.1], (200, 3)), 0.5)
+    made = flanks(Gaussians.cat([end, within]), BOX, "van")
+    rgb = rgb_from_sh(made.sh[(made.means[:, 2] > 0.75) & (made.means[:, 2] < 0.95), 0])
+    assert len(rgb) and bool(((rgb - PAINT).abs() < 0.01).logical_or((rgb - GLASS).abs() < 0.01).all())
 
 
 def test_a_side_that_is_known_is_left_and_one_that_is_not_is_made():

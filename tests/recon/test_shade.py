@@ -1,5 +1,7 @@
 """What a mover keeps from the ground goes along with it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,12 +17,14 @@ from recon.log import Track
 from recon.objects.tracks import LIMBED
 from recon.seeds.shade import ABOVE, BESIDE, shade
 from render import rasterize
+from scenes.asset import Asset
 from scenes.camera import Camera
 from scenes.gaussians import Gaussians, Placed
 from scenes.ground import Ground
 from scenes.harmonics import sh_from_rgb
 from scenes.lenses import Pinhole
 from scenes.poses import translation
+from scenes.shade import has_shade
 
 FLAT = Ground(torch.full((41, 41), 2.0), (-20.0, -20.0), 1.0)
 
@@ -37,6 +41,13 @@ def test_it_lies_on_the_ground_under_the_box_and_beside_it():
     assert made.means[:, 2].numpy() == pytest.approx(ABOVE - 0.3, abs=1e-5), "where most boxes have the ground"
     assert made.means[:, :2].abs().amax(0).tolist() == pytest.approx([2.0 + BESIDE, 1.0 + BESIDE])
     assert made.sh.shape[1] == 4 and torch.sigmoid(made.logit_opacities).max() < 0.15
+
+
+def test_an_asset_brings_it_where_it_lies_beside_the_box_and_not_by_being_black():
+    """Else a black car that is put in elsewhere would cast no shadow."""
+    laid, size = shade(driving(0.0), FLAT, 1), torch.tensor([4.0, 2.0, 1.5])
+    assert has_shade(Asset(laid, size, "car"))
+    assert not has_shade(Asset(replace(laid, means=laid.means / 3 * torch.tensor([1.0, 1.0, 0.0])), size, "car"))
 
 
 def test_it_is_road_where_an_asset_is_cut_out():

@@ -83,6 +83,24 @@ def test_a_folder_or_a_link_to_one_is_replaced_at_one_go_where_the_disk_can(tmp_
     assert listing(tmp_path) == ["first"] * link + ["s1"] and listing(target) == ["new"] and not target.is_symlink()
 
 
+def test_a_folder_whose_new_one_cannot_take_its_name_is_put_back(tmp_path, monkeypatch):
+    """Where a disk cannot exchange two names, the old folder is put aside for a moment."""
+    target, rename = tmp_path / "s1", os.rename
+    with atomic_folder(target) as partial:
+        (partial / "old").write_text("old")
+
+    def failing(one, other):
+        if (Path(one) / "new").exists():
+            raise OSError("no")
+        rename(one, other)
+
+    monkeypatch.setattr("scenes.atomic._swapped", lambda *_: False)
+    monkeypatch.setattr(os, "rename", failing)
+    with pytest.raises(OSError, match="no"), atomic_folder(target, replace=True) as partial:
+        (partial / "new").write_text("new")
+    assert listing(tmp_path) == ["s1"] and listing(target) == ["old"]
+
+
 def test_a_killed_process_leaves_nothing_under_the_final_names(tmp_path):
     code = f"""
 import os, signal

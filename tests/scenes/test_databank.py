@@ -165,3 +165,18 @@ def test_splats_that_are_not_finite_are_not_added(bank):
     with pytest.raises(ValueError, match="asset 'Car': splat 3 has inf in means"):
         bank.add(bad)
     assert len(bank.entries()) == 3
+
+
+def test_the_original_of_what_a_scene_holds_is_of_its_id_class_and_size(bank, tmp_path):
+    """Another databank's asset of that id is another thing."""
+    mine = bank.load("car/0002")
+    found = bank.original(replace(mine, gaussians=mine.gaussians.select(torch.arange(2))))
+    assert found is not None and len(found.gaussians) == 6, "with all its detail"
+    others = [
+        replace(mine, label="Truck"),
+        replace(mine, size=mine.size * 1.1),
+        replace(mine, meta={"id": "car/3"}),
+        replace(mine, meta={}),
+    ]
+    assert [bank.original(other) for other in others] == [None] * 4
+    assert Databank(tmp_path / "none").original(mine) is None

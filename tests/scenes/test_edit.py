@@ -161,6 +161,12 @@ def test_another_asset_takes_on_the_light_of_the_place_as_an_inserted_one_does(s
     same(load(saved), busy())
 
 
+def test_what_was_put_in_is_still_known_for_it_when_it_is_shifted_with_all_the_detail_of_its_databank():
+    new = insert(busy(), VAN, Placement("van/0001", 15.0, 5.0))
+    after = Edit(shift={new.actor.track: (1.0, 0.0)}, originals={new.actor.track: VAN}).apply(new.actor, new.scene)
+    assert after.asset.meta["inserted"] and not after.recorded
+
+
 @pytest.mark.parametrize("brought", ["inserted", "replacing", "retimed"])
 def test_an_inserted_or_replacing_asset_takes_on_the_light_of_where_it_is_shifted_or_retimed_to(tmp_path, brought):
     """The street is half as bright from x = 40 on."""

@@ -58,6 +58,7 @@ def test_assets_follow_the_lane_and_oncoming_ones_come_back(street):
     for turn, way in ((0.0, 1), (math.pi, -1)):
         path = insert(scene, car(), Placement("car", 20, 3.5, turn, 8.0, "lane"), START_US).actor.trajectory
         now, later = path.at(START_US), path.at(START_US + 1_000_000)
+        assert now[:2, 3].tolist() == pytest.approx([20, 3.5], abs=0.2)  # from where it was put
         moved = later[:2, 3] - now[:2, 3]
         assert float(moved.norm()) == pytest.approx(8, rel=0.02)
         assert float(moved @ now[:2, 0]) > 7  # it goes where it faces

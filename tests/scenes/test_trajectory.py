@@ -91,3 +91,15 @@ def test_times_that_are_no_whole_microseconds_are_refused_and_not_cut():
     with pytest.raises(ValueError, match="a time must be whole microseconds, got 50.7"):
         path.at(50.7)
     assert torch.equal(path.at(50.0), path.at(50))
+
+
+@pytest.mark.parametrize(
+    ("span", "kept"), [((150, 250), [100, 200, 300]), ((100, 300), [100, 200, 300]), ((-50, 50), [0, 100]), ((350, 900), [300, 400])]
+)
+def test_a_part_of_a_path_has_its_poses_and_one_on_either_side(span, kept):
+    """So that it is as the whole path is at all moments of the span."""
+    path = Trajectory(torch.arange(5) * 100, torch.stack([translation(float(x), 0) for x in range(5)]))
+    part = path.within(span)
+    assert part.times_us.tolist() == kept
+    inside = torch.arange(max(span[0], 0), min(span[1], 400), 30)
+    assert torch.equal(part.at_each(inside), path.at_each(inside))
