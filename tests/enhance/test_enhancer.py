@@ -1,5 +1,7 @@
 """The enhancer as it is called."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_net import SMALL, stirred
@@ -214,6 +216,29 @@ def test_what_gained_too_little_in_training_is_left_out(enhancer, monkeypatch):
     assert Enhancer(stirred(), {REPAIR_GAIN: [0.0, 0.0]}, repair=True).repairs == (True, True)
 
 
+@pytest.mark.parametrize("gains", [[WORTH, 0.0], [0.0, WORTH]])
+def test_frames_without_and_with_photos_are_repaired_by_what_was_gained_on_such(gains):
+    enhancer, rgb = Enhancer(stirred(), {REPAIR_GAIN: gains}), picture(64, 96)
+    plain, _ = enhancer.step(frame(rgb))
+    beside, _ = enhancer.step(frame(rgb, reference=rgb, trust=torch.ones(64, 96)))
+    assert [not torch.equal(plain, rgb), not torch.equal(beside, rgb)] == [gain >= WORTH for gain in gains]
+
+
+def test_a_shorter_history_is_of_the_last_frames():
+    enhancer, memory = Enhancer(stirred(), history=1), None
+    for i in range(2):
+        _, memory = enhancer.step(picture(64, 96) + 0.01 * i, memory)
+    past = memory.past
+
+    def without(k):
+        known = past.latents.clone()
+        known[:, k] = 0
+        return enhancer.step(picture(64, 96), replace(memory, past=replace(past, latents=known)))[0]
+
+    shown, _ = enhancer.step(picture(64, 96), memory)
+    assert torch.equal(without(1), shown) and not torch.equal(without(0), shown)
+
+
 def test_without_repair_a_frame_of_which_nothing_is_told_comes_back_as_it_was(monkeypatch):
     rests, rgb = resting(stirred(), monkeypatch), picture(64, 96)
     better, memory = rests.step(rgb)
@@ -273,6 +298,13 @@ def told(seed, hue=(1.0, 1.0, 1.0), shift=0):
     instance[30:70, 60 + shift : 110 + shift] = 1
     rgb = torch.where(instance[..., None] == 1, (street * torch.tensor(hue)).clamp(0, 1), street)
     return frame(rgb, instance=instance)
+
+
+def test_an_object_keeps_its_colours_where_there_is_no_need():
+    wrong, need = told(1, (0.5, 1.4, 0.5)), torch.zeros(96, 160)
+    need[:, :96] = 1
+    better, _ = Enhancer.load().step(replace(wrong, need=need))
+    assert torch.equal(better[:, 96:], wrong.rgb[:, 96:]) and not torch.equal(better[30:70, 60:96], wrong.rgb[30:70, 60:96])
 
 
 def test_after_a_cut_objects_begin_anew():

@@ -18,6 +18,7 @@ def test_shrunk_flow_is_the_mean_in_blocks():
     flow[..., 8:, 8:] = torch.inf
     small = shrink_flow(flow, (2, 2))
     assert torch.allclose(small[0, :, 0, 0], torch.tensor([1.0, 2.0])) and torch.isnan(small[0, :, 1, 1]).all()
+    assert shrink_flow(constant_flow(8, 16, 16, 32), (2, 2))[0, :, 0, 0].tolist() == [0.5, 2.0], "in cells, which are wider than high"
 
 
 def a_past(h=24, w=24):
@@ -32,6 +33,14 @@ def test_all_of_the_past_moves_by_whole_cells_and_what_left_the_image_is_forgott
     assert torch.allclose(moved.rgb[..., :-8], past.rgb[..., 8:], atol=1e-5)
     assert moved.valid[..., :-1].min() == 1 and moved.valid[..., -1].max() == 0
     assert moved.seen[..., :-8].min() == 1 and moved.seen[..., -8:].max() == 0
+
+
+def test_what_was_forgotten_stays_so_where_it_moves_to():
+    past = a_past()
+    past.valid[..., 1], past.seen[..., 8:16] = 0, 0
+    moved = past.moved(constant_flow(8, 0, 24, 24))
+    assert moved.valid[..., 0].max() == 0 and moved.valid[..., 1].min() == 1
+    assert moved.seen[..., :8].max() == 0 and moved.seen[..., 8:16].min() == 1
 
 
 def test_unknown_flow_forgets_the_past_there():

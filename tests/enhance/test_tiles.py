@@ -1,5 +1,7 @@
 """Tiles: where there is nothing to do, nothing is done."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_net import stirred
@@ -101,6 +103,20 @@ def test_frames_that_need_nothing_are_made_up_for_by_their_flow(enhancer):
     moved, _ = enhancer.step(frame(rgb.roll(24, 1), flow_prev=flow), memory)
     at_once, _ = enhancer.step(frame(rgb.roll(24, 1), flow_prev=3 * flow), enhancer.step(frame(rgb))[1])
     assert (moved - at_once)[:, 30:].abs().max() < 0.02
+
+
+def test_flows_of_skipped_frames_are_followed_in_their_order(enhancer):
+    """What a flow does not know of is forgotten where it is then, and moves on with the next flow."""
+    rgb, none = picture(), torch.zeros(H, W)
+    hole, on = torch.zeros(H, W, 2), torch.zeros(H, W, 2)
+    hole[:, 32:64], on[..., 0] = torch.nan, -64
+    memory = enhancer.step(frame(rgb))[1]
+    for flow in (hole, on):
+        _, memory = enhancer.step(frame(rgb, need=none, flow_prev=flow), memory)
+    past = memory.past.moved(memory.since[0]).moved(memory.since[1])
+    assert not past.seen[..., 96:128].any() and past.seen[..., :H, 130:300].all()
+    now = frame(rgb.roll(64, 1), flow_prev=torch.zeros(H, W, 2))
+    assert torch.equal(enhancer.step(now, memory)[0], enhancer.step(now, replace(memory, past=past, since=()))[0])
 
 
 def test_after_many_frames_that_need_nothing_there_is_no_past(enhancer):

@@ -9,7 +9,7 @@ import torch
 import render.cull as cull
 from render import rasterize
 from render.bands import without_zero_bands
-from render.cull import bounds, in_sight
+from render.cull import bounds, differentiated, in_sight
 from render.kernels.types import ITEM
 from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.poses import pose_from, translation
@@ -70,6 +70,26 @@ def test_what_needs_gradients_is_not_culled():
     behind = [Placed(g, translation(0, 0, -9))]
     rasterize(behind, CAMERA).rgb.sum().backward()
     assert g.means.grad.abs().max() == 0
+
+
+@pytest.mark.parametrize("asked", ["world_from_cam", "world_from_cam_end", "world_from_local", "world_from_local_end", "sh"])
+def test_gradients_of_any_one_thing_are_asked_for(asked):
+    """Of a pose at a readout's end alone, too."""
+    placed, camera = (
+        Placed(random_splats(3, 2), STILL, world_from_local_end=STILL),
+        replace(CAMERA, shutter="rows", world_from_cam_end=STILL),
+    )
+    assert not differentiated([placed], camera)
+    traced = STILL.clone().requires_grad_()
+    if asked == "sh":
+        placed = replace(placed, gaussians=replace(placed.gaussians, sh=placed.gaussians.sh.clone().requires_grad_()))
+    elif asked.startswith("world_from_cam"):
+        camera = replace(camera, **{asked: traced})
+    else:
+        placed = replace(placed, **{asked: traced})
+    assert differentiated([placed], camera)
+    with torch.no_grad():
+        assert not differentiated([placed], camera)
 
 
 @pytest.mark.parametrize(("stored", "used"), [(16, 16), (16, 9), (16, 4), (16, 1), (9, 4), (4, 1)])

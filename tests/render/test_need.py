@@ -35,6 +35,21 @@ def test_a_surface_is_far_from_the_photos_where_they_saw_it_from_the_side(street
     assert far_from_photos(street, camera_of(street), torch.full((54, 96), 4.0)).max() == 0
 
 
+def test_a_photo_from_nearer_shows_a_surface_from_elsewhere_and_one_from_farther_does_not(street):
+    """From a metre aside, of what is 10 metres ahead: a photo from 8 metres nearer sees it 27 degrees elsewhere, from farther 3."""
+    times, needs = street.frame_times("front_camera"), []
+    for time, forward in ((times[0], -8.0), (times[-1], 8.0)):
+        camera = street.camera("front_camera", int(time), street.ego.shifted(lateral=1.0, forward=forward))
+        needs.append(far_from_photos(street, camera, torch.full((54, 96), 10.0))[24:30, 44:52])
+    assert needs[0].min() > 0.6 and needs[1].max() < 0.1
+
+
+def test_sky_needs_nothing_and_a_hole_without_a_sky_everything(street):
+    with_sky, without = (render_frame(s, camera_of(street), ("need", "alpha")) for s in (street, replace(street, sky=None)))
+    empty = with_sky.alpha < 1e-3
+    assert empty.sum() > 100 and with_sky.need[empty].max() < 0.01 and without.need[empty].min() > 0.99
+
+
 def test_a_panorama_is_supported_where_photos_look_only(street):
     camera = replace(camera_of(street), lens=Equirectangular.whole(96, 54))
     need = far_from_photos(street, camera, torch.full((54, 96), 10.0))

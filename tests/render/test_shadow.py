@@ -210,6 +210,14 @@ def test_assets_out_of_view_cost_nothing(street):
     assert (x1 - x0) * (y1 - y0) < 96 * 54 / 4
 
 
+def test_an_asset_that_is_not_there_yet_casts_no_shadow(street):
+    scene = insert(street, CAR, Placement("car", 14, 0, speed=5.0)).scene
+    new, camera = scene.actors[-1], street.camera("front_camera", START_US)
+    later = replace(new, trajectory=replace(new.trajectory, times_us=new.trajectory.times_us + 10_000_000))
+    assert len(shadow_casters(scene, camera)) == 1
+    assert shadow_casters(replace(scene, actors=(*scene.actors[:-1], later)), camera) == []
+
+
 def test_an_asset_across_the_camera_plane_may_shade_the_whole_image(street):
     beside = insert(street, CAR, Placement("car", 1.5, 2.5)).scene
     (caster,) = shadow_casters(beside, street.camera("front_camera", START_US))

@@ -1,5 +1,8 @@
 """Moving images by flow."""
 
+import math
+
+import pytest
 import torch
 
 from render.warp import visible, warp
@@ -22,9 +25,10 @@ def test_zero_flow_changes_nothing():
     assert torch.allclose(moved, previous, atol=1e-6) and inside.min() == 1
 
 
-def test_unknown_flow_spreads_nothing():
+@pytest.mark.parametrize("unknown", [math.nan, math.inf, -math.inf])
+def test_unknown_flow_spreads_nothing(unknown):
     flow = constant_flow(0, 0)
-    flow[..., 4, 5] = torch.nan
+    flow[..., 4, 5] = unknown
     moved, inside = warp(torch.ones(1, 1, 10, 14), flow)
     assert torch.isfinite(moved).all() and inside[0, 0, 4, 5] == 0 and moved[0, 0, 4, 5] == 0 and inside.sum() == 139
 
