@@ -6,6 +6,8 @@ import torch
 from small_net import SMALL, stirred
 
 from enhance.network.net import Net, photos_of
+from enhance.network.weights_file import REPAIR_GAIN
+from enhance.training import train
 from enhance.training.gain import repair_gain
 
 
@@ -51,3 +53,14 @@ def test_kinds_count_alike_however_many_clips_they_have():
     told = []
     repair_gain(net, [good, bad, bad], lambda done, of: told.append((done, of)))
     assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_clips_that_are_held_out_judge_and_trained_ones_where_none_is(monkeypatch):
+    """On clips that a network was trained on it gains by knowing the place."""
+    clips = [SimpleNamespace(meta={"kind": "sparse", "split": split}) for split in ("train", "held out", "train")]
+    judged = []
+    monkeypatch.setattr(train, "repair_gain", lambda _, shards, *__: judged.append([s.meta["split"] for s in shards]) or [1.0, 1.0])
+    run = SimpleNamespace(stages=["enhancer"], average=None)
+    for some in (clips, clips[::2]):
+        assert train._gain(run, SimpleNamespace(of=lambda some=some: some), None, lambda *_: None) == {REPAIR_GAIN: [1.0, 1.0]}
+    assert judged == [["held out"], ["train", "train"]]

@@ -111,6 +111,17 @@ def test_the_map_is_steady_over_a_clip_and_found_anew_after_a_cut():
     assert later.count == 1
 
 
+def test_the_enhancer_behind_it_is_given_its_own_memory():
+    class Counting(Asis):
+        def step(self, frame, memory=None):
+            return super().step(frame)[0], (memory or 0) + 1
+
+    graded, memory = Graded(Counting(), Grade(photos(1))), None
+    for _ in range(3):
+        _, memory = graded.step(place(1), memory)
+    assert memory.inner == 3
+
+
 def test_what_is_told_to_have_been_put_in_does_not_count_and_is_graded_along():
     frame, ids = altered(place(1, 6)), torch.zeros(90, 160, dtype=torch.int64)
     ids[20:80, 40:120] = 1

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from small_net import SMALL
 
 from enhance.network.autoencoder import Encoder
+from enhance.network.net import Net
 from enhance.training.losses import PatchPerceptual, flicker, pixel_loss
+from enhance.training.run import TrainConfig
+from enhance.training.samples import Sample
+from enhance.training.stages import rollout_losses
 
 
 def test_pixel_loss_is_least_at_the_target_and_slight_damage_counts_beside_strong():
@@ -29,6 +34,16 @@ def test_flicker_is_what_the_target_has_not():
     assert flicker(now, picture, torch.zeros_like(now), torch.zeros_like(now), still, seen) > 0.1
     assert flicker(now, picture, now, picture, still, seen) < 1e-6, "the target changes just so"
     assert flicker(now, picture, now, now, still, torch.zeros_like(seen)) == 0
+
+
+def test_a_clip_that_changes_as_its_target_does_costs_no_flicker():
+    clip, some = torch.rand(1, 3, 3, 32, 32), torch.zeros(1, 3, 1, 32, 32)
+    sample = Sample(clip, clip, some, torch.zeros(1, 3, 2, 32, 32), some + 1, torch.zeros_like(clip), some)
+    net, costs = Net(SMALL), []
+    for temporal in (0.0, 1.0):
+        config = TrainConfig(crop=32, frames=3, temporal=temporal)
+        costs.append([float(cost.detach()) for cost in rollout_losses(net, sample, lambda *_: 0.0, config, np.random.default_rng(0))])
+    assert len(costs[0]) == 3 and costs[0] == costs[1]
 
 
 @pytest.mark.parametrize("size", [(32, 48), (64, 64)])

@@ -43,6 +43,13 @@ def test_what_was_forgotten_stays_so_where_it_moves_to():
     assert moved.seen[..., :8].max() == 0 and moved.seen[..., 8:16].min() == 1
 
 
+def test_the_newest_is_remembered_first_and_the_oldest_forgotten():
+    past, new = a_past(), torch.full((1, 16, 3, 3), 7.0)
+    known = torch.zeros(1, 1, 3, 3)
+    after = past.followed(torch.rand(1, 3, 24, 24), new, 2, known)
+    assert torch.equal(after.latents, torch.stack([new, past.latents[:, 0]], 1)) and torch.equal(after.valid[:, 0], known)
+
+
 def test_unknown_flow_forgets_the_past_there():
     moved = a_past().moved(torch.full((1, 2, 24, 24), torch.nan))
     assert moved.valid.max() == 0 and moved.seen.max() == 0

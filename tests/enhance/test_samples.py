@@ -35,7 +35,8 @@ def pairs(tmp_path_factory):
             "visible": torch.ones(4, 60, 80, dtype=torch.uint8), "depth": torch.ones(4, 60, 80, dtype=torch.float16),
             "reference": to_bytes(target), "trust": to_bytes(trusted),
         }  # fmt: skip
-        write_shard(folder / kind / "clip.safetensors", tensors, {"kind": kind, "split": "train"})
+        for split in ("train", "held out"):
+            write_shard(folder / kind / f"{split}.safetensors", tensors, {"kind": kind, "split": split})
     return PairSet(folder)
 
 
@@ -84,6 +85,18 @@ def test_photos_to_train_on_stay_on_the_disk_as_they_are(tmp_path):
     while isinstance(base.base, np.ndarray):
         base = base.base
     assert isinstance(base.base, mmap.mmap) and sum(map(np.size, frames)) == base.size
+
+
+def test_what_is_held_out_is_not_drawn(sampler):
+    assert {str(s.meta["split"]) for kind in ("sparse", "underfit") for s in sampler.shards[kind]} == {"train"}
+
+
+def test_beyond_a_clip_that_is_smaller_than_a_crop_nothing_is_known(sampler):
+    """What is repeated there moves nowhere."""
+    for step in range(4):
+        s = sampler.batch(step, 1, 2, 96)  # of 60 x 80
+        assert torch.isnan(s.flow[..., 60:, :]).all() and not s.visible[..., 60:, :].any() and not (s.mask[..., 60:, :] > 0).any()
+        assert torch.isfinite(s.flow[:, 1, :, :60, 16:80]).all() and torch.isfinite(s.input).all()
 
 
 def test_flipping_turns_the_flow_too():

@@ -76,6 +76,12 @@ def test_what_needs_everything_is_the_frame_without_a_need_map(enhancer):
     assert torch.equal(whole, same)
 
 
+def test_where_nobody_knows_there_may_be_need(enhancer):
+    whole, _ = enhancer.step(frame(picture()))
+    same, _ = enhancer.step(frame(picture(), need=torch.full((H, W), torch.nan)))
+    assert torch.equal(whole, same)
+
+
 def test_a_tile_is_about_as_the_whole_frame_has_it(enhancer):
     rgb, need = picture(), need_at((40, 100), (70, 160))
     memory = enhancer.step(frame(rgb))[1]
