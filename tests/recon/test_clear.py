@@ -8,7 +8,7 @@ import pytest
 import torch
 from made_sweeps import drive, standing
 
-from recon.fit.clear import LOOKS, Clear
+from recon.fit.clear import ABOVE, FAR, LOOKS, Clear
 from scenes.ground import Ground
 from tests.recon.test_swept import splats
 
@@ -68,3 +68,9 @@ def test_what_some_sweeps_struck_is_clear_where_ten_times_as_many_looked_through
         for vote in told
     ]
     assert Clear(images, FLAT).holds(splats((5.0, 0.0, 1.0))).tolist() == [clear]
+
+
+def test_along_the_road_and_far_away_lidar_is_not_asked():
+    image = SimpleNamespace(middle=np.zeros(3), votes_with_silence=lambda xyz: np.tile([[True], [False]], len(xyz)))
+    places = (5.0, 0.0, ABOVE - 0.1), (5.0, 0.0, ABOVE + 0.1), (FAR - 1, 0.0, 1.0), (FAR + 1, 0.0, 1.0)
+    assert Clear([image] * LOOKS, FLAT).holds(splats(*places)).tolist() == [False, True, True, False]

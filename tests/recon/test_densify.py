@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.fit.densify import Growth, grow, kept, shade_of
+from recon.fit.densify import BOX_MARGIN, Growth, grow, kept, shade_of
 from recon.fit.model import Splats
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
@@ -74,6 +74,18 @@ def test_splats_of_an_actor_that_leave_its_box_are_dropped_and_the_background_is
     s.fields["means"][0], s.fields["means"][55] = torch.tensor([500.0, 0, -9]), torch.tensor([5.0, 0, 0])
     after, _ = grow(s, {}, Growth.none(len(s)), 80, 1, BOXES)
     assert after.sizes == [50, 19, 10]
+
+
+def test_splats_of_an_actor_below_its_box_are_the_roads():
+    s = splats()
+    s.fields["means"][50], s.fields["means"][51] = torch.tensor([0.0, 0, -BOX_MARGIN - 0.1]), torch.tensor([0.0, 0, -BOX_MARGIN + 0.1])
+    after, _ = grow(s, {}, Growth.none(len(s)), 80, 1, BOXES)
+    assert after.sizes == [50, 19, 10] and (after.fields["means"] == s.fields["means"][51]).all(1).any()
+
+
+def test_the_budget_lasts_for_the_rounds_that_are_left():
+    s = splats()
+    assert [sum(grow(s, {}, wrong(s), 100, rounds, BOXES)[0].sizes) for rounds in (1, 4)] == [100, 85]
 
 
 def test_the_shade_of_an_actor_reaches_farther_than_it_does():

@@ -107,6 +107,8 @@ def test_a_parked_car_stays_where_another_passed_through_its_box():
     moving = car([0, 700_000], (-10.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     parked = replace(car([800_000], (0.0, 0.0, 0.0)), moving=False)
     assert held([moving, parked], (-8, 0, 1), (0, 0, 1), (0, 0.9, 1), (1.9, 0, 1.5)) == [True, False, False, False]
+    beside = replace(car([800_000], (0.0, 1.6, 0.0)), moving=False)  # its box may be drawn too small
+    assert held([moving, beside], (-8, 0.5, 1), (0, 0.5, 1), (0, 0.1, 1)) == [True, False, True]
 
 
 def test_what_lidar_saw_standing_there_at_another_time_stays():
