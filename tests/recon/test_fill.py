@@ -75,6 +75,8 @@ def test_the_upper_part_of_a_house_stands_where_its_foot_stands():
     eaves = (cloud.xyz[:, 2] > cloud.xyz[:, 2].max() - 1e-6) & (np.abs(cloud.xyz[:, 1]) < 2)  # a row of their pixels is sky
     assert eaves.any()
     np.testing.assert_allclose(cloud.rgb[eaves], np.broadcast_to(np.array([150, 120, 90]) / 255, (eaves.sum(), 3)), atol=1e-6)
+    gain = np.array([2.0, 1.0, 0.5])  # of a camera that shows red twice as bright as it is
+    np.testing.assert_allclose(unexplained(view, camera(), alpha, depth, sky, gain, DEEP, [])[0].rgb, cloud.rgb / gain, atol=1e-6)
     nothing = unexplained(view, camera(), np.zeros((60, 80)), np.full((60, 80), np.inf), sky, np.ones(3), DEEP, [])[0]
     up = nothing.xyz[:, 2] > 0
     assert np.abs(nothing.xyz[up, 0] - FAR).max() < 1e-6 and np.abs(nothing.xyz[:, 2].min() + 40) < 1e-6
