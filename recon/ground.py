@@ -33,9 +33,12 @@ NOISE, TELLING = 0.1, 4
 GROUND, BARE = 1, 2
 """What is known of a cell (`shown_ground`)."""
 
-LEAST, MOST_OFF, STRAY = 0.15, 1.5, 0.02
-"""Metres off the ground between which nothing is above it where it is bare, and below it where it is known: at a step it is neither. And
-how many points are there all the same, in parts of those that lie on it."""
+LEAST, MOST_OFF = 0.15, 1.5
+"""Metres off the ground between which nothing is above it where it is bare, and below it where it is known: at a step it is neither."""
+
+STRAY, STRAY_IN_PICTURES = 0.02, 0.3
+"""How many points are there all the same, in parts of those that lie on it: of lidar's, and of those on which pictures agree, which are a
+decimetre off a road."""
 
 STEEPEST = 0.2
 """Metres by which ground may rise or fall with every metre away from the path."""
@@ -73,9 +76,10 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     return replace(ground, heights=ground.heights + _noise_under(points, place, ground)) if len(points) else ground
 
 
-def shown_ground(points: np.ndarray, ground: Ground) -> torch.Tensor:
+def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> torch.Tensor:
     """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it and next to none
-    below, `BARE` where besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess."""
+    below, `BARE` where besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess. stray:
+    how many next to none are, in parts of those that lie on it."""
     at = (points[:, :2] - np.array(ground.origin)) / ground.cell
     column, row = np.round(at).astype(np.int64).T
     rows, columns = ground.heights.shape
@@ -89,8 +93,8 @@ def shown_ground(points: np.ndarray, ground: Ground) -> torch.Tensor:
     lying, standing, below = (
         count(which) for which in (np.abs(off) < NOISE, (off > LEAST) & (off < MOST_OFF), (-off > LEAST) & (-off < MOST_OFF))
     )
-    stands = ndimage.binary_dilation(standing > STRAY * lying, np.ones((3, 3)))
-    known = (lying >= TELLING) & (below <= STRAY * lying)
+    stands = ndimage.binary_dilation(standing > stray * lying, np.ones((3, 3)))
+    known = (lying >= TELLING) & (below <= stray * lying)
     return torch.from_numpy(np.where(known, np.where(stands, GROUND, BARE), 0).astype(np.uint8))
 
 

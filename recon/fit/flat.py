@@ -31,7 +31,7 @@ ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
 
 UNDER, OVER = 1.0, 0.3
-"""`ON`, but below the ground where lidar shows it, and above where it shows it bare (`recon.ground.shown_ground`): nothing else is there,
+"""`ON`, but below the ground where points show it, and above where they show it bare (`recon.ground.shown_ground`): nothing else is there,
 however thick. What pictures of a straight drive leave there is a sixth of what they show of the road, and from 2 m aside as far off as it
 is deep."""
 

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from recon.ground import BARE, GROUND, MOST, estimate_ground, shown_ground
+from recon.ground import BARE, GROUND, MOST, STRAY_IN_PICTURES, estimate_ground, shown_ground
 from scenes.ground import Ground
 from scenes.poses import translation
 from scenes.trajectory import Trajectory
@@ -69,6 +69,14 @@ def test_beside_a_step_nothing_is_known_of_the_ground():
     rows = [round((height + 8) / 0.5) for height in (0.0, 3.0, 3.5, 6.0)]
     assert [set(shown[row, 1:-1].tolist()) <= {BARE} for row in rows] == [True, False, False, True]
     assert 0 in shown[rows[2], 1:-1].tolist() + shown[rows[1], 1:-1].tolist()
+
+
+def test_points_that_pictures_agree_on_show_a_street_though_they_are_a_decimetre_off():
+    generator = np.random.default_rng(6)
+    points = np.column_stack([generator.uniform([-10, -10], [10, 10], (100_000, 2)), generator.normal(0, 0.1, 100_000)])
+    ground = Ground(torch.zeros(33, 33), (-8.0, -8.0), 0.5)
+    assert (shown_ground(points, ground, STRAY_IN_PICTURES) == BARE).float().mean() > 0.9
+    assert (shown_ground(points, ground) == 0).float().mean() > 0.9
 
 
 def test_of_no_points_nothing_is_known():
