@@ -6,6 +6,7 @@ from), 2 usage: words that are wrong whatever the data, 130 interrupted, 143 sto
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -24,7 +25,6 @@ from enhance.demo import Demo
 from enhance.doctor import Doctor
 from recon.commands import ACTIONS, Assets, Recon
 from render.outputs import check_scene_outputs
-from scenes.atomic import FULL
 from scenes.commands import Convert, Edit, Info, Validate
 from scenes.names import unknown
 from scenes.opening import UsageError, check_device, fresh, open_scene, open_view
@@ -280,7 +280,7 @@ def told(error: Exception) -> str:
     """What an error says, where, and with its notes; of a disk that is full, also the fix."""
     if not isinstance(error, OSError) or not error.strerror:
         return str(error)
-    fix = ["make room there"] * (error.errno in FULL)
+    fix = ["make room there"] * (error.errno in (errno.ENOSPC, errno.EDQUOT))
     return "; ".join([f"{error.filename or 'the disk'}: {error.strerror}", *fix, *getattr(error, "__notes__", [])])
 
 
