@@ -7,6 +7,7 @@ from), 2 usage: words that are wrong whatever the data, 130 interrupted, 143 sto
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import sys
@@ -50,7 +51,7 @@ from scenes.options import (
     written,
 )
 from scenes.placement import Placement
-from scenes.warnings import warn
+from scenes.warnings import Undisturbed, warn
 
 if TYPE_CHECKING:
     from render.record import Stages
@@ -248,10 +249,13 @@ def _version() -> str:
 
 def _open_streams() -> None:
     """Open what the caller closed of the standard streams, as `2>&-` does, to nowhere: the next files to be opened would get their numbers,
-    and what libraries write there."""
+    and what libraries write there. Nor does a stderr that takes no words, as a log on a full disk, cost the work that they tell of."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the process runs
+    if (said := sys.__stderr__) and said is sys.stderr:  # and nobody's who called `main`
+        raw: Any = getattr(said.buffer, "raw", said.buffer)  # Python's -u knows no buffer
+        sys.stderr = io.TextIOWrapper(io.BufferedWriter(Undisturbed(raw)), said.encoding, said.errors, line_buffering=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -223,7 +223,7 @@ def test_the_version_is_told(door):
     assert re.fullmatch(r"sidestep (\d+\.\d+\.\d+|unknown: .*)\n", door(["--version"])[0])
 
 
-def test_streams_that_the_caller_closed_stop_nothing(desk, tmp_path):
+def test_streams_that_the_caller_closed_or_that_lie_on_a_full_disk_stop_nothing(desk, tmp_path):
     words = [
         sys.executable,
         "-m",
@@ -242,6 +242,9 @@ def test_streams_that_the_caller_closed_stop_nothing(desk, tmp_path):
     assert run.returncode == 0 and sorted(os.listdir(tmp_path)) == ["a.json", "a.mp4"], run.stdout
     run = subprocess.run(f"{line} >&- 2>&-", shell=True, env=environment(), stdout=subprocess.PIPE, text=True)
     assert run.returncode == 1 and not run.stdout  # a.mp4 exists, which nobody hears
+    if os.path.exists("/dev/full"):
+        run = subprocess.run(f"{line} -w 2>/dev/full", shell=True, env=environment(), stdout=subprocess.PIPE, text=True)
+        assert (run.returncode, run.stdout) == (0, f"wrote {tmp_path / 'a.mp4'}, {tmp_path / 'a.json'}\n")
 
 
 def test_existing_outputs_are_replaced_with_w(door, tmp_path):
