@@ -59,20 +59,23 @@ def at_place(asset: Asset, scene: Scene, path: Trajectory, moment_us: int) -> As
 
 
 def matched(asset: Asset, scene: Scene, xy: torch.Tensor) -> Asset:
-    """The asset in the light of a place `[2]` of a scene; as it is where either ground is unknown. What it was multiplied by is its
-    `meta["light_gain"]`, and what that would be without `LIMIT`, where this tells, `meta["light_wanted"]`."""
-    there, here = asset.meta.get("ground_linear"), ground_linear(scene, xy)
+    """The asset in the light of a place `[2]` of a scene; as it is where either ground is unknown. What it is multiplied by, in all since
+    it was cut out on a ground of `meta["cut_out_linear"]`, is its `meta["light_gain"]`, and what that would be without `LIMIT`, where this
+    tells, `meta["light_wanted"]`."""
+    there, here = asset.meta.get("cut_out_linear", asset.meta.get("ground_linear")), ground_linear(scene, xy)
     if there is None or here is None:
         return asset
+    before = torch.tensor(asset.meta["light_gain"] if "cut_out_linear" in asset.meta else [1.0, 1.0, 1.0])  # at the places where it was
     wanted = here / torch.tensor(there).clamp_min(1e-3)
     gain = wanted.clamp(1 / LIMIT, LIMIT)
-    if float((gain - 1).abs().max()) < 0.02:
+    held = not torch.equal(gain, wanted)
+    if not held and "light_wanted" not in asset.meta and float((gain / before - 1).abs().max()) < 0.02:
         return asset
-    meta = {**asset.meta, "ground_linear": here.tolist(), "light_gain": [round(g, 4) for g in gain.tolist()]}
-    meta.pop("light_wanted", None)
-    if not torch.equal(gain, wanted):
+    told = {"cut_out_linear": there, "ground_linear": here.tolist(), "light_gain": [round(g, 4) for g in gain.tolist()]}
+    meta = {key: value for key, value in asset.meta.items() if key != "light_wanted"} | told
+    if held:
         meta["light_wanted"] = [round(g, 4) for g in wanted.tolist()]
-    return replace(asset, gaussians=relit(asset.gaussians, gain), meta=meta)
+    return replace(asset, gaussians=relit(asset.gaussians, gain / before), meta=meta)
 
 
 def light_held(name: str, asset: Asset, scene: Scene) -> list[str]:

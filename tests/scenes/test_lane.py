@@ -146,6 +146,21 @@ def test_an_asset_that_would_have_to_be_more_than_four_times_as_bright_says_so(s
     assert not any("as bright" in w for w in calm.warnings) and "light_wanted" not in calm.actor.asset.meta
 
 
+def test_an_asset_that_is_moved_from_light_to_light_is_four_times_as_bright_in_all(street):
+    """And comes back as it was, though no databank holds it."""
+    lamp = torch.tensor([2.0, 2.0, 2.0])
+    lit = replace(street, background=replace(street.background, gaussians=relit(street.background.gaussians, lamp)))
+    place = torch.tensor([12.0, 0.0])
+    night = replace(car(), meta={"ground_linear": (ground_linear(street, place) * torch.tensor([0.1, 0.5, 1.0])).tolist()})
+    once, straight = matched(night, street, place), matched(night, lit, place)
+    assert straight.meta["light_gain"] == pytest.approx([4.0, 4.0, 2.0], rel=0.02) and straight.meta["light_wanted"][0] > 19
+    for scene, as_if in ((lit, straight), (street, once), (lit, straight)):
+        moved = matched(once, scene, place)
+        assert moved.meta == as_if.meta
+        torch.testing.assert_close(rgb_from_sh(moved.gaussians.sh), rgb_from_sh(as_if.gaussians.sh), atol=0.01, rtol=0)
+        once = moved
+
+
 def test_an_asset_whose_light_is_unknown_is_left_as_it_is(street):
     assert matched(car(), street, torch.tensor([12.0, 0.0])).gaussians is not None
     assert "light_gain" not in insert(street, car(), Placement("car", 12, 0)).actor.asset.meta
