@@ -166,8 +166,9 @@ class Train:
         _check_seed(self.seed)
         _check_there(*self.photos)
         check_device(self.device)
-        for folder in self.pairs:
-            for part in (folder, *folder.glob("*")):  # a training could not go on with more pairs than it was begun with
+        for folder in self.pairs:  # a training could not go on with more pairs than it was begun with
+            # and a run for several scenes holds the folder above
+            for part in (folder, folder.resolve().parent, *folder.glob("*")):
                 check_still(part)
         _with_shelf(self.output)
         with sole(self.output), Progress("train", 1000) as steps:

@@ -138,7 +138,8 @@ def test_pairs_and_trainings_under_way_are_left_alone(door, tmp_path):
     pairs, training = tmp_path / "new" / "pairs", tmp_path / "new" / "training"
     (pairs / "s1").mkdir(parents=True)
     make, train = ["pairs", "street", "--data", str(tmp_path), "-o", str(pairs)], ["train", str(pairs), "-o", str(training)]
-    for held, words in ((pairs, make), (training, train), (pairs, train), (pairs / "s1", train)):
+    train_one = ["train", str(pairs / "s1"), "-o", str(training)]  # of several scenes' pairs, which one command makes
+    for held, words in ((pairs, make), (training, train), (pairs, train), (pairs / "s1", train), (pairs, train_one)):
         with sole(held):
             assert f"{held} is being written by another command" in door(words, 1)[1]
     assert not training.exists()
