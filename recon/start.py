@@ -13,7 +13,7 @@ from recon.body_path import body_path
 from recon.fit.model import Splats, draw
 from recon.fit.reach import reach_at, reach_of, spanned
 from recon.fit.swept import Swept
-from recon.ground import STRAY, STRAY_IN_PICTURES, estimate_ground, shown_ground
+from recon.ground import STRAY_IN_PICTURES, estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
 from recon.movers.traffic import traffic
 from recon.objects.actors import Split, split_points
@@ -149,8 +149,7 @@ def prepare(
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
     of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
-    lies = (split.static, STRAY) if sparse is None else (street.points.xyz, STRAY_IN_PICTURES)
-    ground_shown = shown_ground(lies[0], ground, lies[1])
+    ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(street.points.xyz, ground, STRAY_IN_PICTURES)
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(street.measured), swept, *of_views)
 
 

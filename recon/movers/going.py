@@ -10,6 +10,7 @@ import torch
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.sighting import Sighting
+from recon.objects.actors import CORNERS
 from recon.objects.tracks import upright
 from recon.seeds.stereo import Plate
 from scenes.ground import Ground
@@ -80,6 +81,5 @@ def _in_lane(thing: Sequence[Sighting], eyes: np.ndarray, stamps: np.ndarray, la
 
 def _leaves(pose: np.ndarray, size: np.ndarray, plate: Plate) -> bool:
     """Whether a box `[4, 4]` of a size is cut by the picture's border, or beside the camera."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * size
-    *_, z, inside = plate.shown(corners @ pose[:3, :3].T + pose[:3, 3])
+    *_, z, inside = plate.shown(CORNERS * size @ pose[:3, :3].T + pose[:3, 3])
     return bool(z.max() > 0 and not inside.all())

@@ -56,6 +56,10 @@ class Split:
         return np.concatenate(placed)
 
 
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)])
+"""Those of a box of a metre whose base centre is the origin, `[8, 3]`."""
+
+
 def box_skin(size: np.ndarray, step: float) -> np.ndarray:
     """Points on sides and top of a box `[length, width, height]` whose base centre is the origin."""
     axes = [np.linspace(-s / 2, s / 2, max(2, int(s / step) + 1)) for s in size]

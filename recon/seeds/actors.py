@@ -56,12 +56,12 @@ def _actor(
     """Seeds of a mover in its box frame, about `most`: its own lidar points, of sweeps at these times `[N]`, and where they are few, the
     skin of its box."""
     trajectory = track.trajectory()
-    if len(points) < 100:
-        skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
-        moment = _shown_best(log, frames, track, skin)
-        points, taken_us = np.concatenate([points, skin]), np.concatenate([taken_us, np.full(len(skin), moment)])
     times = sorted({v.time_us for v in frames.training() if trajectory.covers(v.time_us)})
     poses = dict(zip(times, trajectory.at_each(torch.tensor(times, dtype=torch.int64)), strict=True))
+    if len(points) < 100:
+        skin = box_skin(track.size, max(0.15, float(track.size[:2].min()) / 6))
+        moment = _shown_best(log, frames, poses, skin)
+        points, taken_us = np.concatenate([points, skin]), np.concatenate([taken_us, np.full(len(skin), moment)])
     seen = colours(log, frames, points, taken_us, [], lambda view: poses.get(view.time_us))
     rgb = merged_colours(seen, gains)
     known = np.isfinite(rgb[:, 0])
@@ -71,15 +71,14 @@ def _actor(
     return splats_from(cloud, sides, sh_count, 0.15)
 
 
-def _shown_best(log: Log, frames: Frames, track: Track, skin: np.ndarray) -> int:
+def _shown_best(log: Log, frames: Frames, poses: dict[int, torch.Tensor], skin: np.ndarray) -> int:
     """Time of the training picture from nearest by of those that show nearly as much of a box's skin, points `[N, 3]` on it, as any does;
-    0 where none shows any of it. From nearest by of all it may be beside the camera."""
-    trajectory, shown = track.trajectory(), []
-    for view in frames.training():
-        if trajectory.covers(view.time_us):
-            camera = frames.camera(log, view)
-            placed = inverse(camera.world_from_cam) @ trajectory.at(view.time_us)
-            shown.append((int(project(skin, placed.numpy(), camera)[3].sum()), float(placed[:3, 3].norm()), view.time_us))
+    0 where none shows any of it. From nearest by of all it may be beside the camera. poses: of the box at pictures' times."""
+    shown = []
+    for view in (v for v in frames.training() if v.time_us in poses):
+        camera = frames.camera(log, view)
+        placed = inverse(camera.world_from_cam) @ poses[view.time_us]
+        shown.append((int(project(skin, placed.numpy(), camera)[3].sum()), float(placed[:3, 3].norm()), view.time_us))
     most = max((count for count, *_ in shown), default=0)
     return min(((away, time) for count, away, time in shown if count and count >= NEARLY * most), default=(0.0, 0))[1]
 

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from recon.log import Log, Track
+from recon.objects.actors import CORNERS
 from recon.views.frames import Frames
 from recon.views.project import project
 from scenes.camera import Camera
@@ -89,7 +90,7 @@ def nearest_box(camera: Camera, tracks: list[Track]) -> np.ndarray:
         return depth
     poses = (inverse(camera.world_from_cam) @ torch.stack(all_at([paths[i] for i in there], camera.time_us))).numpy()
     sizes = np.array([tracks[i].size for i in there])
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * sizes[:, None]
+    corners = CORNERS * sizes[:, None]
     local = corners @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     before = local[..., 2].max(1) >= 0.2
     poses, sizes, local = poses[before], sizes[before], local[before]
