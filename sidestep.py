@@ -35,7 +35,7 @@ from scenes.options import (
     FileOrNone,
     Flag,
     Insertion,
-    Length,
+    Lateral,
     OneOfRig,
     Output,
     Overwrite,
@@ -54,7 +54,11 @@ from scenes.placement import Placement
 from scenes.warnings import Undisturbed, warn
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from render.record import Stages
+    from scenes.scene import Scene
+    from scenes.trajectory import Trajectory
 
 Outputs = Annotated[tuple[str, ...], written(lambda text: check_scene_outputs(names(text)), "NAME,NAME", "none")]
 
@@ -124,8 +128,12 @@ class Render:
     up: Axis = None
     """Up axis of a splat file: x, -x, y, ...; by default y for .glb and .spz, what a USD file says, else z. Splats trained from photos
     mostly have -y."""
-    lateral_shift: Length = 0.0
-    """Metres to the left of the recorded path, as 2m; -2m is to the right."""
+    lateral_shift: Lateral = 0.0
+    """Metres to the left of the recorded path, as 2m; -2m is to the right. 0m@2s,3.5m@5s changes lane from 2 to 5 seconds after the clip's
+    first frame."""
+    trajectory: FileOrNone = None
+    """CSV file with the header time_s,x_m,y_m[,yaw_deg]: a path of its own for the recording car, in seconds from the clip's first frame,
+    and metres forward and left of the recorded car there."""
     insert: UseAppendAction[tuple[Insertion, ...]] = ()
     """An asset to insert for this clip, as car/0003@12m,3.5m,yaw=5deg,speed=8m/s or car/0003@trajectory=t.csv; metres forward and left
     of the recording car at the clip's first frame."""
@@ -164,7 +172,9 @@ class Render:
             fresh(path, self.overwrite)
         if self.weights != "builtin" and not self.enhance:
             raise UsageError(f"--weights {self.weights} have no effect without --enhance; add it, or leave out --weights")
-        from render.aside import shift_warning
+        if self.trajectory is not None and self.lateral_shift:
+            raise UsageError("--trajectory is the whole path; leave out --lateral-shift, or add it to the file's y_m")
+        from render.aside import path_warning
         from render.clip import clip_cameras, clip_times, cut_warning
         from render.record import record, stale_warning
         from scenes import Databank
@@ -178,14 +188,16 @@ class Render:
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
-        cameras = clip_cameras(scene, camera, self.lateral_shift, times)
+        way, said, notes = self._path(scene, times)
+        cameras = clip_cameras(scene, camera, way, times)
+        warnings += notes
         warnings += cut_warning(scene, camera, self.start, self.duration)
         put_in: set[str] = set()
         for placement in self.insert:
             result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
             scene, warnings = result.scene, [*warnings, *result.warnings]
             put_in.add(result.actor.track)
-        warnings += shift_warning(scene, clip_cameras(scene, camera, 0.0, times), self.lateral_shift)
+        warnings += path_warning(scene, clip_cameras(scene, camera, 0.0, times), way, said)
         for actor in (a for a in scene.actors if not a.recorded):  # those of edits too: a shift may show another side of them
             witnesses = seeing(actor, cameras)
             warnings += absence_warning(actor, cameras, witnesses) if actor.track in put_in else []
@@ -197,7 +209,7 @@ class Render:
         stages: Stages = {}
         needs: tuple[str, ...] = ()
         scene = scene.to(self.device)
-        facts: dict[str, object] = {"scene": str(self.scene), "enhanced": self.weights if self.enhance else None}
+        facts: dict[str, object] = {"scene": str(self.scene), "path": said, "enhanced": self.weights if self.enhance else None}
         if self.enhance:
             from enhance.clip import enhancement
             from render.album import references_of
@@ -206,11 +218,26 @@ class Render:
             stages, needs = enhancement(self.weights, self.device, references, scene)
             facts["photos"] = len(references.shots) if references else 0
         record(
-            scene, camera, self.output, shift=self.lateral_shift, times_us=times, width=width, height=height, keep=self.outputs,
+            scene, camera, self.output, shift=way, times_us=times, width=width, height=height, keep=self.outputs,
             shadows=not self.no_shadows, stages=stages, needs=needs, facts=facts, warnings=warnings,
         )  # fmt: skip
         written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")
+
+    def _path(self, scene: Scene, times: Tensor) -> tuple[float | Trajectory, str, list[str]]:
+        """The recording car's path for a clip, as `render_clip` takes it, what asked for it, and what to tell of it."""
+        from scenes.ego_path import changing_lane, driven
+        from scenes.metres import require_metres
+
+        if self.trajectory is not None:
+            path, notes = driven(scene, self.trajectory, int(times[0]), int(times[-1]))
+            return path, f"--trajectory {self.trajectory}", notes
+        if isinstance(self.lateral_shift, float):
+            return self.lateral_shift, f"--lateral-shift {self.lateral_shift:g}m" if self.lateral_shift else "as recorded", []
+        require_metres(scene, "a lateral shift")
+        said = ",".join(f"{k.left:g}m@{k.time_us / 1e6:g}s" for k in self.lateral_shift)
+        path, notes = changing_lane(scene.ego, self.lateral_shift, int(times[0]))
+        return path, f"--lateral-shift {said}", notes
 
 
 DESCRIPTION = (

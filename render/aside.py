@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -12,9 +13,10 @@ from render.frame_types import Frame
 from render.rasterize import rasterize
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera
-from scenes.collide import HALF, into, met
+from scenes.collide import into, met
+from scenes.ego_path import CAR, nearest
 from scenes.lenses import Pinhole
-from scenes.poses import yaw_of
+from scenes.poses import inverse, yaw_of
 from scenes.scene import Scene
 from scenes.spread import spread
 from scenes.standing import outside_ground, standing_pose
@@ -28,9 +30,6 @@ PIXELS, WIDE = 16, math.radians(10)
 
 BEFORE = 0.5
 """Metres before what stands there that a camera can still go: nearer, it is between the splats of it."""
-
-CAR = (3.0, 2 * HALF, 1.6)
-"""Length, width and height in metres about a body's origin that are the recording car, wherever on it that lies."""
 
 STEP = 0.5
 """Metres, of which the largest shift is told in whole ones: it is measured no better."""
@@ -55,53 +54,74 @@ def room_aside(scene: Scene, camera: Camera, world_from_body: torch.Tensor, left
     return room
 
 
-def shift_warning(scene: Scene, recorded: Sequence[Camera], shift: float) -> list[str]:
-    """What to tell of a clip that is shifted to where nothing was recorded, or where no car can drive: a sentence each, or nothing.
-    recorded: its cameras, unshifted."""
-    if not shift:
+def path_warning(scene: Scene, recorded: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
+    """What to tell of a clip from where nothing was recorded, or where no car can drive: a sentence each, or nothing. recorded: its
+    cameras, unshifted; path: metres to the left of the recorded path, or any other path of the body; said: what asked for it."""
+    if isinstance(path, float | int) and not path:
         return []
     looks = spread(recorded, LOOKS)
-    return _beyond(scene, looks, shift) or _in_the_way(scene, looks, shift)
+    return _beyond(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
 
 
-def _beyond(scene: Scene, looks: Sequence[Camera], shift: float) -> list[str]:
-    room = [room_aside(scene, camera, scene.ego.at(camera.time_us), shift > 0, abs(shift)) for camera in looks]
-    least = min(room)
-    if least >= abs(shift):
+def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
+    asides = [_aside(scene, path, camera.time_us) for camera in looks]
+    lacks = []
+    for camera, (body, left) in zip(looks, asides, strict=True):
+        there = replace(camera, world_from_cam=body @ inverse(scene.ego.at(camera.time_us)) @ camera.world_from_cam)
+        lacks.append(abs(left) - room_aside(scene, there, body, left > 0, abs(left)))
+    most = max(lacks)
+    if most <= 0:
         return []
-    after, side = _after(looks, looks[room.index(least)].time_us), "left" if shift > 0 else "right"
-    whole = STEP * math.floor(least / STEP)
-    fix = f"the largest shift that makes sense there is {math.copysign(whole, shift):g}m" if whole else "no shift to that side makes sense"
+    first = lacks.index(most)
+    left = asides[first][1]
+    room, side, after = abs(left) - most, "left" if left > 0 else "right", _after(looks, looks[first].time_us)
+    if isinstance(path, Trajectory):
+        ends = f"it is {abs(left):.1f} m to the {side} of the recorded path, but {room + BEFORE:.1f} m from that something stands"
+        fix = "stay nearer to the recorded path there"
+        return [f"{said} goes beyond what was recorded: {after} {ends}, or the known ground ends, and what is behind is a guess; {fix}"]
+    whole = STEP * math.floor(room / STEP)
+    fix = f"the largest shift that makes sense there is {math.copysign(whole, path):g}m" if whole else "no shift to that side makes sense"
     return [
-        f"--lateral-shift {shift:g}m goes beyond what was recorded: {after} something stands, or the known ground ends, "
-        f"{least + BEFORE:.1f} m to the {side} of the path, and what is behind is a guess; {fix}"
+        f"{said} goes beyond what was recorded: {after} something stands, or the known ground ends, "
+        f"{room + BEFORE:.1f} m to the {side} of the path, and what is behind is a guess; {fix}"
     ]
 
 
-def _in_the_way(scene: Scene, looks: Sequence[Camera], shift: float) -> list[str]:
+def _in_the_way(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
     """Told by the car's box, since its camera may look over the roofs of what stands there."""
-    hit = _struck(scene, looks, shift) if scene.ground is not None else None
+    hit = _struck(scene, looks, path) if scene.ground is not None else None
     if hit is None:
         return []
-    less = math.ceil(abs(shift) / STEP) - 1
-    while less > 0 and _struck(scene, looks, math.copysign(less * STEP, shift)):
+    runs = f"{said} takes the recording car through {hit[0]}, {_after(looks, hit[1])}"
+    if isinstance(path, Trajectory):
+        return [f"{runs}; lead it past there"]
+    less = math.ceil(abs(path) / STEP) - 1
+    while less > 0 and _struck(scene, looks, math.copysign(less * STEP, path)):
         less -= 1
-    fix = f"at {math.copysign(less * STEP, shift):g}m its way is free" if less else "no shift to that side is free"
-    return [f"--lateral-shift {shift:g}m takes the recording car through {hit[0]}, {_after(looks, hit[1])}; {fix}"]
+    fix = f"at {math.copysign(less * STEP, path):g}m its way is free" if less else "no shift to that side is free"
+    return [f"{runs}; {fix}"]
 
 
-def _struck(scene: Scene, looks: Sequence[Camera], shift: float) -> tuple[str, int] | None:
-    """What the recording car runs into first beside its path, and when; None where its way is free."""
+def _struck(scene: Scene, looks: Sequence[Camera], path: float | Trajectory) -> tuple[str, int] | None:
+    """What the recording car runs into first on a path, and when; None where its way is free."""
     size, times = torch.tensor(CAR, dtype=torch.float64), sorted({camera.time_us for camera in looks})
-    poses = []
-    for body in (scene.ego.at(t) for t in times):
-        poses.append(standing_pose(scene, body[:2, 3] + shift * body[:2, 1], float(yaw_of(body)), size))
+    ego = path if isinstance(path, Trajectory) else scene.ego.shifted(lateral=path)
+    poses = [standing_pose(scene, body[:2, 3], float(yaw_of(body)), size) for body in map(ego.at, times)]
     nothing = scene.background.gaussians.select(torch.zeros(0, dtype=torch.int64))
     car = Actor(Asset(nothing, size, "Car"), Trajectory(torch.tensor(times), torch.stack(poses)), "")
     found = [(f"{other.track} ({other.asset.label})", t) for other, t in met(scene, car, times)]
     if standing := into(scene, car, times):
         found.append(("what stands there, as a parked car or a pole", standing[0]))
     return min(found, key=lambda hit: hit[1], default=None)
+
+
+def _aside(scene: Scene, path: float | Trajectory, time_us: int) -> tuple[torch.Tensor, float]:
+    """The recorded body's pose `[4, 4]` that a path is beside at a time, and how many metres to the left of it."""
+    if not isinstance(path, Trajectory):
+        return scene.ego.at(time_us), path
+    body = path.at(time_us)
+    recorded = nearest(scene.ego, body[:2, 3])
+    return recorded, float((inverse(recorded) @ body)[1, 3])
 
 
 def _after(looks: Sequence[Camera], time_us: int) -> str:

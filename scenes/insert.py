@@ -15,16 +15,12 @@ from scenes.edit import named
 from scenes.lane import Lane
 from scenes.match import at_place, light_held, other_model
 from scenes.metres import require_metres
-from scenes.placement import Placement, Waypoint, read_waypoints
+from scenes.placement import Placement
 from scenes.poses import yaw_of
 from scenes.scene import Scene
 from scenes.standing import outside_ground, standing_pose
 from scenes.trajectory import Trajectory
-
-STEP_US = 100_000  # moving assets get a pose at least this often, so that they follow the ground
-LONGEST_US = 3_600_000_000  # from the clip's first frame: no drive lasts longer, and each pose takes a look at the ground
-SIDEWAYS = 30  # degrees from its way by which what goes may be turned: beyond, no wheel drives so
-SLIDES = 0.5  # metres so from which it is told: what hardly moves shakes on the spot
+from scenes.waypoints import SIDEWAYS, STEP_US, Way, ahead_and_left, sliding_warning, way_of
 
 
 @dataclass(frozen=True)
@@ -52,15 +48,13 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
         raise ValueError(f"{placement.asset} cannot be placed {after:g}s after the drive's first moment; the drive lasts {lasts:.3g}s")
     body = scene.ego.at(start_us)
     if placement.trajectory is not None:
-        points = read_waypoints(placement.trajectory)
-        _check_times(placement.trajectory, points)
-        times, xy, headings = _along(points, body, start_us)
+        way = way_of(placement.trajectory, body, start_us)
     elif placement.path == "lane":
-        times, xy, headings = _in_lane(scene, placement, body, start_us)
+        way = _in_lane(scene, placement, body, start_us)
     else:
-        times, xy, headings = _straight(scene, placement, body, start_us)
+        way = _straight(scene, placement, body, start_us)
 
-    poses, warnings = [], []
+    times, poses, warnings = way.times_us, [], []
     if len(times) > 1 and (times[-1] < scene.ego.times_us[0] or times[0] > scene.ego.times_us[-1]):
         first, last = ((int(t) - start_us) / 1e6 for t in (times[0], times[-1]))
         warnings.append(f"{placement.asset} is there from {first:g}s to {last:g}s only, and never during the drive")
@@ -69,12 +63,11 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
             f"{placement.asset} is turned by {math.degrees(placement.yaw):g}deg from the lane that it goes along, so it slides sideways"
         )
         warnings.append(f"{turned}; give a yaw of 0deg or 180deg, or the path straight, to go where it faces")
-    if placement.trajectory is not None and (slid := _sliding(xy, headings)) is not None:
-        where = f"{placement.asset} slides sideways {(int(times[slid]) - start_us) / 1e6:g}s after the clip's first frame"
-        warnings.append(f"{where}; say in {placement.trajectory} by yaw_deg where it faces, or give more points where it turns")
-    for point, heading in zip(xy, headings, strict=True):
+    if placement.trajectory is not None:
+        warnings += sliding_warning(placement.asset, way, placement.trajectory, start_us)
+    for point, heading in zip(way.xy, way.headings, strict=True):
         poses.append(standing_pose(scene, point, float(heading), asset.size))
-    beyond = max(outside_ground(scene, point) for point in xy)
+    beyond = max(outside_ground(scene, point) for point in way.xy)
     if scene.ground is None:
         warnings.append(f"{placement.asset}: the scene has no ground, so its height is that of the lowest splats around it")
     elif beyond > 0:
@@ -89,26 +82,26 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
 
 
-def _straight(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Times, world points `[T, 2]` and headings `[T]` of an asset that stands, or goes straight on over the whole drive."""
+def _straight(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> Way:
+    """The way of an asset that stands, or goes straight on over the whole drive."""
     heading = yaw_of(body) + placement.yaw
-    origin = _world(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))
+    origin = ahead_and_left(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))
     if placement.speed == 0:
-        return torch.tensor([start_us]), origin, heading[None]
+        return Way(torch.tensor([start_us]), origin, heading[None])
     times = _drive_times(scene)
     gone = placement.speed * (times - start_us).double() / 1e6
     xy = origin + gone[:, None] * torch.stack([torch.cos(heading), torch.sin(heading)])
-    return times, xy, heading.expand(len(times))
+    return Way(times, xy, heading.expand(len(times)))
 
 
-def _in_lane(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Times, world points and headings of an asset that keeps its distance to the recorded path, ahead or, turned round, against it."""
+def _in_lane(scene: Scene, placement: Placement, body: torch.Tensor, start_us: int) -> Way:
+    """The way of an asset that keeps its distance to the recorded path, ahead or, turned round, against it."""
     lane = Lane(scene.ego)
-    along, left = lane.of(_world(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))[0])
+    along, left = lane.of(ahead_and_left(body, torch.tensor([[placement.x, placement.y]], dtype=torch.float64))[0])
     times = _drive_times(scene) if placement.speed else torch.tensor([start_us])
     way = 1.0 if math.cos(placement.yaw) >= 0 else -1.0
     xy, headings = lane.at(lane.gone(along, left, way * placement.speed * (times - start_us).double() / 1e6), left)
-    return times, xy, headings + placement.yaw
+    return Way(times, xy, headings + placement.yaw)
 
 
 def _drive_times(scene: Scene) -> torch.Tensor:
@@ -116,70 +109,6 @@ def _drive_times(scene: Scene) -> torch.Tensor:
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     count = max(2, -(-(last - first) // STEP_US) + 1)
     return torch.linspace(first, max(last, first + STEP_US), count, dtype=torch.float64).round().long()
-
-
-def _check_times(path: Path, points: list[Waypoint]) -> None:
-    """ValueError where a trajectory's times are no seconds of a drive."""
-    far = max(points, key=lambda p: abs(p.time_us))
-    if abs(far.time_us) > LONGEST_US:
-        told = f"{path} has the time_s {far.time_us / 1e6:g}, which is more than an hour from the clip's first frame"
-        raise ValueError(f"{told}; time_s counts seconds from there, no milliseconds, and not since 1970")
-
-
-def _along(points: list[Waypoint], body: torch.Tensor, start_us: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Times, world points and headings along waypoints, with poses between them at most STEP_US apart."""
-    t = torch.tensor([p.time_us for p in points], dtype=torch.float64)
-    xy = torch.tensor([[p.x, p.y] for p in points], dtype=torch.float64)
-    yaws = [p.yaw for p in points if p.yaw is not None]
-    turn = torch.tensor(yaws, dtype=torch.float64) if yaws else _direction(xy)
-    shorter = (turn.diff() + torch.pi) % (2 * torch.pi) - torch.pi
-    turn = torch.cat([turn[:1], turn[0] + shorter.cumsum(0)])
-
-    at = [torch.tensor([len(points) - 1.0], dtype=torch.float64)]
-    for i, step in enumerate(t.diff().tolist()):
-        count = math.ceil(step / STEP_US)
-        at.insert(-1, i + torch.arange(count, dtype=torch.float64) / count)
-    where = torch.cat(at)
-    low = where.floor().long().clamp_max(len(points) - 2)
-    u = where - low
-
-    def between(values: torch.Tensor) -> torch.Tensor:
-        return torch.lerp(values[low], values[low + 1], u if values.ndim == 1 else u[:, None])
-
-    return start_us + between(t).round().long(), _world(body, between(xy)), yaw_of(body) + between(turn)
-
-
-def _sliding(xy: torch.Tensor, headings: torch.Tensor) -> int | None:
-    """The first of points `[T, 2]` from which what has these headings `[T]` goes sideways; None where that is not for `SLIDES` metres."""
-    step = xy.diff(dim=0)
-    along = step[:, 0] * headings[:-1].cos() + step[:, 1] * headings[:-1].sin()
-    sideways = along.abs() < math.cos(math.radians(SIDEWAYS)) * step.norm(dim=1)
-    return int(sideways.nonzero()[0]) if float(step[sideways].norm(dim=1).sum()) > SLIDES else None
-
-
-def _direction(xy: torch.Tensor) -> torch.Tensor:
-    """Where the path goes at each point `[T, 2]`, radians; where it stands, the last direction it had (at first, the first it gets): what
-    stops turns as it drives on, not on the spot."""
-    ahead = torch.cat([xy.diff(dim=0), torch.zeros(1, 2, dtype=torch.float64)])
-    behind = ahead.roll(1, 0)
-    step = ahead + behind
-    angles = torch.atan2(step[:, 1], step[:, 0])
-    moving = step.norm(dim=-1) > 1e-3
-    last = angles[moving][0] if moving.any() else torch.zeros((), dtype=torch.float64)
-    moving[1:-1] &= behind[1:-1].norm(dim=-1) > 1e-3
-    kept = []
-    for angle, moves in zip(angles, moving, strict=True):
-        last = angle if moves else last
-        kept.append(last)
-    return torch.stack(kept)
-
-
-def _world(body: torch.Tensor, xy: torch.Tensor) -> torch.Tensor:
-    """World points `[N, 2]` of points forward and left of a body, level with the world: its pitch and roll do not tilt the street."""
-    heading = yaw_of(body)
-    forward = torch.stack([torch.cos(heading), torch.sin(heading)])
-    left = torch.stack([-forward[1], forward[0]])
-    return body[:2, 3] + xy[:, :1] * forward + xy[:, 1:] * left
 
 
 def _track(scene: Scene, asset: str) -> str:

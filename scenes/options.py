@@ -11,6 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from scenes import units
 from scenes.axes import AXES
+from scenes.lateral import Keyframe, parse_lateral
 from scenes.opening import scene_folder
 from scenes.placement import Placement, parse_at, parse_path, parse_placement
 
@@ -78,7 +79,7 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-Length = Annotated[float, written(units.length, "LENGTH", "0m")]
+Lateral = Annotated[float | tuple[Keyframe, ...], written(parse_lateral, "LENGTH[@TIME,...]", "0m")]
 LengthOrNone = Annotated[float | None, written(units.length, "LENGTH", "none")]
 Ratio = Annotated[float | None, written(_ratio, "NUMBER", "none")]
 AngleOrNone = Annotated[float | None, written(units.angle, "ANGLE", "none")]

@@ -35,6 +35,24 @@ def test_the_main_job_makes_a_video_and_a_report(desk, tmp_path):
     assert {2, 3} <= set(np.unique(seen))
 
 
+def test_the_recording_car_changes_lane_or_drives_a_path_of_its_own(door, tmp_path):
+    words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "-w"]
+
+    def middle(*told):
+        """Metres to the left at the clip's fourth frame, and what the report calls the path."""
+        _, errors = door([*words, *told])
+        report = json.loads((tmp_path / "out.json").read_text())
+        recorded = made.street().camera("front_camera", report["frames"][3]["time_us"]).world_from_cam
+        return report["frames"][3]["world_from_cam"][1][3] - float(recorded[1, 3]), report["path"], errors
+
+    left, path, errors = middle("--lateral-shift", "-1m@0s,1m@600ms")
+    assert abs(left) < 0.4 and path == "--lateral-shift -1m@0s,1m@0.6s" and "slides sideways; give it more time" in errors
+    (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n0,0,0.5\n0.8,4,0.5\n")
+    left, path, errors = middle("--trajectory", str(tmp_path / "t.csv"))
+    assert left == pytest.approx(0.5, abs=1e-6) and path == f"--trajectory {tmp_path / 't.csv'}" and not errors.count("warning")
+    assert middle()[:2] == (0, "as recorded")
+
+
 def test_an_asset_that_nobody_sees_is_said(door, tmp_path):
     words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "--duration", "100ms", "--databank", "bank"]
     _, errors = door([*words, "--insert", "car/0001@-7m,0m"])

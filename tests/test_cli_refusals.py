@@ -22,6 +22,8 @@ USAGE = [
     (["rendr"], 'command "rendr" is not in sidestep; it has recon, assets,', "Did you mean render?"),
     ([*SHOOT, "--lateral-shift", "2"], "--lateral-shift", '"2" has no unit; write 2m (metres) or 200cm'),
     ([*SHOOT, "--lateral-shift", "2deg"], "--lateral-shift", "an angle, not a length"),
+    ([*SHOOT, "--lateral-shift", "0m,2m@5s"], "--lateral-shift", "write it as 0m@2s,3.5m@5s"),
+    ([*SHOOT, "--lateral-shift", "2m", "--trajectory", "t.csv"], "--trajectory is the whole path", "leave out --lateral-shift"),
     ([*SHOOT, "--start", "3"], "--start", '"3" has no unit; write 3s (seconds) or 3000ms'),
     ([*SHOOT, "--size", "640"], "--size", "as 640x360"),
     ([*SHOOT, "--outputs", "dept"], "--outputs", "Did you mean depth?"),

@@ -4,7 +4,7 @@ import pytest
 import torch
 from street import START_US, box, car
 
-from render.aside import room_aside, shift_warning
+from render.aside import path_warning, room_aside
 from render.clip import clip_cameras
 from scenes import Actor, Asset, Gaussians, Trajectory
 from scenes.poses import translation
@@ -17,7 +17,7 @@ def room(scene, left, reach=500.0):
 
 
 def told(scene, shift):
-    return shift_warning(scene, clip_cameras(scene, CAMERA), shift)
+    return path_warning(scene, clip_cameras(scene, CAMERA), shift, f"--lateral-shift {shift:g}m")
 
 
 def test_a_camera_can_go_aside_up_to_the_houses(street):
@@ -75,3 +75,21 @@ def test_an_actor_is_in_the_cars_way_as_long_as_it_is_there(street):
         trajectory=Trajectory(street.ego.times_us[-1:] + torch.tensor([10**7, 2 * 10**7]), translation(6.0, 2.5, 0.0).repeat(2, 1, 1)),
     )
     assert not told(replace(street, actors=(away,)), 2.5)
+
+
+def test_a_path_of_its_own_is_told_where_it_meets_something(street):
+    """Like a shift, but of the moment: it goes over to a parked car's place, or past the houses, halfway."""
+    ego, cameras = street.ego, clip_cameras(street, CAMERA)
+    beside = Actor(car(), Trajectory(torch.zeros(1, dtype=torch.int64), translation(6.0, 2.5, 0.0)[None]), "t")
+
+    def driving(left):
+        """Along the recorded path, and so far to the left in the second half of it."""
+        poses = ego.world_from_body.clone()
+        poses[len(ego) // 2 :, 1, 3] += left
+        return Trajectory(ego.times_us, poses)
+
+    (said,) = path_warning(replace(street, actors=(beside,)), cameras, driving(2.5), "--trajectory t.csv")
+    assert said.startswith("--trajectory t.csv takes the recording car through t (car), 0.") and said.endswith("lead it past there")
+    (said,) = path_warning(street, cameras, driving(12.0), "--trajectory t.csv")
+    assert "goes beyond what was recorded: 0." in said and "it is 12.0 m to the left of the recorded path, but 8." in said
+    assert not path_warning(street, cameras, driving(2.5), "--trajectory t.csv")
