@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from recon.fit.fit import Fit
+from recon.fit.inpaint import background
 from recon.fit.model import MODEL
 from recon.log import Log, Track
 from recon.start import Start
@@ -22,7 +23,7 @@ from scenes.space_order import space_order
 
 def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Scene:
     """The scene that a fit's present state stands for, on the host."""
-    groups = [g.detach().to("cpu") for g in fit.splats.groups(fit.sh_count())]
+    movers = [g.detach().to("cpu") for g in fit.splats.groups(fit.sh_count())[1:]]
     rig = {}
     for c, name in enumerate(fit.frames.names):
         mount, times = fit.motion.mounted(c, [v.time_us for v in fit.frames.views if v.camera == c])
@@ -32,7 +33,7 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         rig[name] = RigCamera(r.lens, r.width, r.height, mount, exposure, times, gains=torch.stack(gains) if gains else None)
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
-    for i, (track, gaussians) in enumerate(zip(start.tracks, groups[1:], strict=True)):
+    for i, (track, gaussians) in enumerate(zip(start.tracks, movers, strict=True)):
         trajectory = fit.motion.trajectory(i)
         meta = {**share, "track": track.name}
         deformation = fit.limbs.of[i + 1].deformation() if i + 1 in fit.limbs.of else None
@@ -44,10 +45,11 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         if not t.moving and t.name.startswith("veh")
     ]
     sky = Sky(linear_from_srgb(fit.sky.detach().cpu().clamp(0, brightest(rig.values()))))
-    background = Placed(groups[0].select(space_order(groups[0].means)), torch.eye(4, dtype=torch.float64))
-    movers = {"movers": "found in pictures"} if actors and not log.tracks else {}
-    meta = {**log.meta, **movers, "parked": parked, **(extra or {})}
-    scene = Scene(background, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
+    splats = background(fit)
+    street = Placed(splats.select(space_order(splats.means)), torch.eye(4, dtype=torch.float64))
+    found = {"movers": "found in pictures"} if actors and not log.tracks else {}
+    meta = {**log.meta, **found, "parked": parked, **(extra or {})}
+    scene = Scene(street, tuple(actors), sky, fit.motion.path(), rig, MODEL, start.ground, meta)
     return replace(scene, sky=seen_sky(scene.to(fit.device), fit.openings.hidden))
 
 

@@ -3,7 +3,7 @@ ground is pressed flat besides."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import torch
@@ -15,7 +15,7 @@ from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
 from recon.fit.motion import Shot
-from recon.fit.openings import Openings
+from recon.fit.openings import ASIDE, Openings
 from recon.fit.population import Population
 from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
@@ -131,7 +131,8 @@ class Fit:
         camera, target = shot.camera, self.targets.picture(view, self.shrink())
         aside = None
         if self.step_count % ASIDE_EVERY == 0:
-            beside = self.openings.aside(view, camera, self.generator).resized(*self.targets.size(view, 2 * self.shrink()))
+            metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
+            beside = self.openings.aside(view, camera, metres).resized(*self.targets.size(view, 2 * self.shrink()))
             aside = self.motion.beside(shot, beside)
         rates = self._rates()
         which = self._in_sight(shot) if aside is None else self._in_sight(shot, aside)
@@ -276,7 +277,7 @@ class Fit:
         if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
             self._refill()
         if self.population.guessed is None and self.progress >= GUESSED_FROM:
-            self.population.guess(self._shown)
+            self.population.guess(self.shown)
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""
@@ -298,15 +299,22 @@ class Fit:
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 there.add(more, path)
 
+    def shown(self) -> Shown:
+        """What the pictures show of each splat."""
+        return self.shown_by(self.coarse(view).at_once() for view in self.training)
+
+    def coarse(self, view: View) -> Shot:
+        """A training view, a quarter as large."""
+        return self.motion.shot(view, self.targets.size(view, 4))
+
     @torch.no_grad()
-    def _shown(self) -> Shown:
-        """What the pictures, a quarter as large, show of each splat."""
+    def shown_by(self, shots: Iterable[Shot]) -> Shown:
+        """What these show of each splat."""
         shown = Shown.none(len(self.splats), self.device)
-        for view in self.training:
-            shot = self.motion.shot(view, self.targets.size(view, 4)).at_once()
-            which = self._in_sight(shot)
-            placed, camera = self._placed(self.splats.select(which, 1), shot), shot.camera
-            shown.add(which, placed, camera, self.openings.beside_sky(view, camera), scale_of(view, camera))
+        for shot in shots:
+            which, camera = self._in_sight(shot), shot.camera
+            placed = self._placed(self.splats.select(which, 1), shot)
+            shown.add(which, placed, camera, self.openings.beside_sky(shot.view, camera), scale_of(shot.view, camera))
         return shown
 
     # ---- checkpoints

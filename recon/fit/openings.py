@@ -86,9 +86,8 @@ class Openings:
         sky = self.sky[view.camera, view.index][None].float()
         return F.max_pool2d(F.adaptive_max_pool2d(sky, (camera.height, camera.width)), 3, 1, 1)[0]
 
-    def aside(self, view: View, camera: Camera, generator: torch.Generator) -> Camera:
-        """A view's camera, up to `ASIDE` metres farther left or right."""
-        metres = ASIDE * (2 * float(torch.rand((), generator=generator)) - 1)
+    def aside(self, view: View, camera: Camera, metres: float) -> Camera:
+        """A view's camera, so many metres farther left, or right below 0."""
         pose = camera.world_from_cam.detach().clone()
         pose[:3, 3] += metres * self.motion.left(view)
         return replace(camera, world_from_cam=pose)

@@ -8,6 +8,7 @@ from render.kernels.types import OPTIONS, pixel_of, pixels_of
 wp.set_module_options(OPTIONS)
 
 SHARPNESS = wp.constant(-0.75)  # of the cubic: as torch's and OpenCV's
+RIM = wp.constant(1.0 / 16.0)  # of a photo's longer side: so far from its border its sky fades, which else would end in an edge
 
 
 @wp.struct
@@ -70,6 +71,16 @@ def looked_up(other: Other, here: Here, row: int, column: int, hides: float):
     return found, known
 
 
+@wp.func
+def from_border(other: Other, at: wp.vec2d):
+    """0 at another view's border, and 1 farther from it than its rim."""
+    height = float(other.depth.shape[0])
+    width = float(other.depth.shape[1])
+    across = wp.min(float(at[0]), width - float(at[0]))
+    down = wp.min(float(at[1]), height - float(at[1]))
+    return wp.smoothstep(0.0, RIM * wp.max(width, height), wp.min(across, down))
+
+
 @wp.kernel
 def carry_over(other: Other, here: Here, hides: float, keep: float, detail: wp.array2d[wp.vec4], stretch: int, first: int):
     """Of the detail of the view before, `keep` is kept, where it is known."""
@@ -94,10 +105,11 @@ def add_photo(
         row, column = pixel_of(item, depth.shape[1])
         found, known = looked_up(other, here, row, column, hides)
         if known > 0.0:
-            noisy = noise
+            sure = share / noise
             if here.instance[row, column] >= 0:
-                noisy += parallax / (depth[row, column] * wp.length(rays[row, column]))
-            sure = share / noisy
+                sure = share / (noise + parallax / (depth[row, column] * wp.length(rays[row, column])))
+            else:
+                sure *= from_border(other, here.pixels[row, column])
             sums[row, column] = sums[row, column] + sure * wp.vec4(found[0], found[1], found[2], 1.0)
             square = (found[0] * found[0] + found[1] * found[1] + found[2] * found[2]) / 3.0
             squares[row, column] = squares[row, column] + sure * square

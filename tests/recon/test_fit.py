@@ -227,7 +227,7 @@ def test_from_aside_nothing_may_be_open_where_the_sky_is_never_seen(drive):
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, CONFIG, 4)
     view = fit.training[0]
-    camera = fit.openings.aside(view, fit.motion.camera(view), fit.generator)
+    camera = fit.openings.aside(view, fit.motion.camera(view), 2.0)
     nothing = torch.zeros(camera.height, camera.width)
     below = float((world_directions(camera)[..., 2] < HORIZON).float().mean())
     open_ = float(fit.openings.gaps(nothing, camera)) / ASIDE_WEIGHT

@@ -16,7 +16,7 @@ from render.video import to_bytes
 from scenes.edit import Edit
 from scenes.files import load, save
 from scenes.lenses import Fisheye
-from scenes.poses import translation
+from scenes.poses import CAM_FROM_FLU, translation, yaw
 from scenes.scene import Scene
 from scenes.usd.edit import add_change
 
@@ -200,3 +200,16 @@ def test_a_scene_folder_keeps_its_photos_and_knows_what_was_edited(street, tmp_p
     with pytest.raises(ValueError, match="photo is done without"):
         for shot in references.shots:
             shot.read(96, 54)
+
+
+def test_a_photos_sky_fades_towards_its_border(street):
+    """A photo that is brighter than the sky that a scene shows, seen by a camera turned away by half of its view: no edge stands there."""
+    nothing = replace(street.background, gaussians=street.background.gaussians.select(torch.zeros(0, dtype=torch.int64)))
+    open_ = replace(street, background=nothing, actors=())
+    camera = street.camera(CAMERA, int(street.frame_times(CAMERA)[3])).resized(320, 180)
+    brighter = Shot(camera, lambda w, h: to_bytes((render_frame(open_, camera.resized(w, h)).rgb + 0.1).clamp(0, 1)))
+    turned = replace(camera, world_from_cam=camera.world_from_cam @ CAM_FROM_FLU @ yaw(0.4) @ CAM_FROM_FLU.mT)
+    (found,) = References([brighter], open_).along([render_frame(open_, turned, READS)])
+    added = (better(found) - found.rgb.clamp(0, 1)).amax(-1)[80]
+    assert added.max() > 0.07 and added.min() == 0, "the photo shows a part of it"
+    assert added.diff().abs().max() < 0.02

@@ -1,0 +1,91 @@
+"""What pictures never show, by example: the wall behind a tree, which only a camera beside the path looks at.
+
+There a fit has few and large splats, in the mean colour of what is around (`recon/fit/unseen.py`): a blur between sharp things. Each is
+replaced by copies of splats beside it that pictures do show, as inpainting copies patches of a picture (Criminisi et al. 2004), so that
+leaves go on as leaves and a wall as a wall. That is plausible, not true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from scipy.spatial import cKDTree
+
+from recon.fit.fit import Fit
+from recon.fit.motion import Shot
+from recon.fit.openings import ASIDE
+from recon.fit.unseen import LOW, SEEN, off_ground
+from scenes.gaussians import Gaussians
+from scenes.poses import matrix_from_quat
+from scenes.spread import spread
+
+LOOKS, BESIDE = 10, (-1.0, -0.5, 0.5, 1.0)
+"""Pictures of each camera that are taken again from beside the path, and where: in parts of `ASIDE` to the left."""
+
+KNOWN = 0.2
+"""Part of a splat that a picture must show for it to be an example."""
+
+COARSER = 3.0
+"""Times as large as what is around a splat must be to be a blur there."""
+
+AROUND, NEAR = 12, 3.0
+"""Splats around one, whose middle size is that of what is there, and metres within which the first of them must be."""
+
+FILLED, MOST = 1.5, 24
+"""Size of its copies together, as a part of a splat's own, and how many these are at most."""
+
+AMONG = 4
+"""Nearest to its own place, of which a copy is any one: of the nearest alone there would be rows of the same."""
+
+WITHIN = 1.6
+"""Standard deviations of the splat within which its copies lie."""
+
+
+def background(fit: Fit) -> Gaussians:
+    """A fit's splats of the background by now, on the host; of one that is done with what only cameras beside the path see, by example."""
+    splats = fit.splats.groups(fit.sh_count())[0].detach().to("cpu")
+    if fit.progress < 1:
+        return splats
+    path, aside = fit.shown().part, fit.shown_by(_looks(fit)).part
+    stands = off_ground(fit.splats, fit.population.ground) > LOW
+    hidden, known = (path < SEEN) & (aside >= SEEN) & stands, (path >= KNOWN) & stands
+    return inpainted(splats, hidden[: len(splats)].cpu(), known[: len(splats)].cpu(), fit.config.seed)
+
+
+def _looks(fit: Fit) -> Iterator[Shot]:
+    for c in range(len(fit.frames.names)):
+        for view in spread([v for v in fit.training if v.camera == c], LOOKS):
+            shot = fit.coarse(view)
+            for part in BESIDE:
+                yield fit.motion.beside(shot, fit.openings.aside(view, shot.camera, part * ASIDE))
+
+
+def inpainted(splats: Gaussians, hidden: torch.Tensor, known: torch.Tensor, seed: int) -> Gaussians:
+    """The splats `[N]`, those `hidden` that are coarser than what is `known` around them, bool `[N]` both, replaced by copies of that.
+
+    Copies keep size, rotation and opacity, and of their colour what does not turn with the view.
+    """
+    examples = known.nonzero()[:, 0]
+    which = hidden.nonzero()[:, 0]
+    if len(examples) < AROUND or not len(which):
+        return splats
+    tree = cKDTree(splats.means[examples].numpy())
+    away, around = tree.query(splats.means[which].numpy(), AROUND)
+    large = splats.log_scales.topk(2, 1).values.sum(1).exp()  # as seen from where it is widest, but for a constant
+    ratio = large[which] / large[examples][torch.from_numpy(around)].median(1).values
+    blurs = (ratio > COARSER) & torch.from_numpy(away[:, 0] < NEAR)
+    which, ratio = which[blurs], ratio[blurs]
+
+    generator = torch.Generator().manual_seed(seed)
+    copies = which.repeat_interleave((FILLED * ratio).clamp_max(MOST).round().long())
+    spread = splats.log_scales[copies].exp() * torch.randn(len(copies), 3, generator=generator).clamp(-WITHIN, WITHIN)
+    means = splats.means[copies] + (matrix_from_quat(splats.quats[copies]) @ spread[:, :, None])[:, :, 0]
+    _, nearest = tree.query(means.numpy(), range(1, AMONG + 1))
+    any_one = torch.randint(0, AMONG, (len(copies), 1), generator=generator)
+    like = splats.select(examples[torch.from_numpy(nearest).gather(1, any_one)[:, 0]])
+    steady = torch.cat([like.sh[:, :1], torch.zeros_like(like.sh[:, 1:])], 1)
+    stays = torch.ones(len(splats), dtype=torch.bool)
+    stays[which] = False
+    return Gaussians.cat([splats.select(stays.nonzero()[:, 0]), replace(like, means=means, sh=steady)])
