@@ -72,7 +72,8 @@ def hull_of_end(splats: Gaussians, size: np.ndarray, end: float, seen: bool = Fa
         points, solid = points[donors], solid.select(torch.from_numpy(donors))
     if not len(surface) or not len(points):
         return Gaussians.empty(splats.sh.shape[1])
-    return in_colours_of(solid, surface * [end, 1, 1], np.abs(points), np.abs(surface))
+    # of either side; the other end has other colours, tail lamps' where this one's are a grille's
+    return in_colours_of(solid, surface * [end, 1, 1], _on_left(points), _on_left(surface))
 
 
 def lets_through(splats: Gaussians, size: np.ndarray, end: float, points: np.ndarray) -> np.ndarray:
@@ -82,6 +83,11 @@ def lets_through(splats: Gaussians, size: np.ndarray, end: float, points: np.nda
     pose, rows, columns = camera.world_from_cam, camera.height, camera.width
     column, row = camera.lens.project((torch.from_numpy(points) - pose[:3, 3]) @ pose[:3, :3]).floor().long().unbind(1)
     return (frame.alpha[row.clamp(0, rows - 1), column.clamp(0, columns - 1)] < OPAQUE).numpy()
+
+
+def _on_left(points: np.ndarray) -> np.ndarray:
+    """Points `[N, 3]` of both sides on the left one."""
+    return np.stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]], 1)
 
 
 def _ruled(heights: np.ndarray, ahead: np.ndarray, beside: np.ndarray) -> np.ndarray:

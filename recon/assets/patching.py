@@ -62,7 +62,8 @@ def _patch(splats: Gaussians, size: np.ndarray, side: float) -> tuple[Gaussians,
     camera, frame = shown_alone(splats, size, 1, side)
     assert frame.alpha is not None and frame.median_depth is not None
     alpha, depth = frame.alpha.numpy(), frame.median_depth.numpy()
-    rows = size[2] - (np.arange(len(alpha)) + 0.5) * PIXEL  # heights
+    high, long = alpha.shape
+    rows = (high - np.arange(high) - 0.5) * PIXEL  # heights
     holes = _holes(alpha >= OPAQUE, rows > CLEARANCE)
     if not holes.any():
         return Gaussians.empty(splats.sh.shape[1]), 0.0
@@ -73,7 +74,7 @@ def _patch(splats: Gaussians, size: np.ndarray, side: float) -> tuple[Gaussians,
     surface = _through(np.where(np.isfinite(depth), depth, 0.0), (alpha >= OPAQUE) & np.isfinite(depth), at)
     row, column = np.nonzero(at)
     y = side * (size[1] - surface[row, column] - DEEPER)
-    points = np.stack([side * (size[0] / 2 - (column + 0.5) * PIXEL), y, rows[row]], 1)
+    points = np.stack([side * (long / 2 - column - 0.5) * PIXEL, y, rows[row]], 1)
     half = splats.select((torch.sigmoid(splats.logit_opacities) > SOLID) & (splats.means[:, 1] * side > 0))
     return in_colours_of(half, points, half.means.double().numpy(), points), float(holes.sum()) * PIXEL**2
 

@@ -112,6 +112,16 @@ def test_a_front_does_not_get_the_colour_of_tail_lamps():
     assert (rgb_from_sh(made.gaussians.sh[len(car.gaussians) :, 0])[:, 0] < 0.5).all()
 
 
+def test_a_hole_in_a_front_that_photos_show_does_not_get_the_colours_of_the_rear():
+    car = two_tailed()
+    x, y, z = car.gaussians.means.unbind(1)
+    sh = car.gaussians.sh.clone()
+    sh[x < -1.9, 0] = sh_from_rgb(torch.tensor([1.0, 0.0, 0.0]))
+    seen = replace(car.gaussians, sh=sh).select(~((x > 2.1) & (y.abs() < 0.5) & (z < 0.75)))
+    patch, _ = added_to(replace(car, gaussians=seen))
+    assert len(patch) > 100 and (patch.means[:, 0] > 2).all() and (rgb_from_sh(patch.sh[:, 0])[:, 0] < 0.5).all()
+
+
 def saloon(without=None) -> tuple[Asset, Gaussians]:
     """A dense car that was seen from everywhere, and with a hole where `without` of x, y, z says; and what stood in the hole."""
     whole = two_tailed().gaussians
@@ -137,6 +147,18 @@ def test_a_hole_in_a_side_is_closed_behind_its_surface_in_the_colour_around_it()
     camera, frame = shown_alone(made.gaussians, SIZE.numpy(), 1, 1.0)
     column, row = camera.lens.project((gone.means.double() - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3]).long().unbind(1)
     assert (frame.alpha[row, column] > 0.8).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_what_closes_a_side_stands_where_its_hole_was_seen(side):
+    """At the middle of pixels, also of a car whose length and height are no whole numbers of them."""
+    holed, _ = saloon(lambda x, y, z: (x > -0.6) & (x < 0.5) & (z > 0.35) & (z < 0.75))
+    size = SIZE.numpy() + [0.011, 0.0, 0.009]
+    patch, _ = patched(holed.gaussians, size)
+    camera, _ = shown_alone(holed.gaussians, size, 1, side)
+    points = patch.means[patch.means[:, 1] * side > 0].double()
+    pixels = camera.lens.project((points - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3])
+    assert len(points) > 50 and (pixels.frac() - 0.5).abs().max() < 0.01
 
 
 def test_a_mirrored_side_is_closed_as_the_side_that_was_seen():
