@@ -5,6 +5,7 @@ A scene that was moved to another machine, or whose recording is gone, still has
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -49,7 +50,7 @@ def shots_in(folder: Path, scene: Scene) -> list[Shot]:
         Shot(scene.camera(name, int(file.stem)), partial(_read, file))
         for name in scene.rig
         for file in sorted((folder / FOLDER / name).glob("*.jpg"))
-        if file.stem.isdecimal()
+        if re.fullmatch(r"-?\d+", file.stem)  # of a clock that begins at 0 a camera may turn out to be early
     ]
 
 

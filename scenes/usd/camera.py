@@ -46,6 +46,7 @@ def load_camera(stage: Usd.Stage, entry: dict, name: str) -> RigCamera:
         raise ValueError(f"camera {name} has a {kind} lens; this Sidestep knows {', '.join(LENSES)}")
     exposure = torch.tensor(entry["exposure"], dtype=torch.float32)
     times = torch.tensor(entry["times_us"], dtype=torch.int64)
-    shutter = entry.get("shutter", "global"), entry.get("readout_us", 0)  # absent from scenes of before
+    shutter = entry.get("shutter", "global"), entry.get("readout_us", 0)  # absent from scenes of before, as what follows
     gains = None if entry.get("gains") is None else torch.tensor(entry["gains"], dtype=torch.float32)
-    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], local_pose(prim) @ _FLIP, exposure, times, *shutter, gains)
+    taken, mount = (exposure, times, *shutter, gains, entry.get("fitted", True)), local_pose(prim) @ _FLIP
+    return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], mount, *taken)

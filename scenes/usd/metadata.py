@@ -56,6 +56,7 @@ def metadata_text(scene: Scene, cameras: dict[str, str], origin: int) -> str:
             "shutter": c.shutter,
             "readout_us": c.readout_us,
             "gains": None if c.gains is None else c.gains.detach().cpu().tolist(),
+            "fitted": c.fitted,
         }
         for name, c in scene.rig.items()
     }

@@ -6,9 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from render import render_frame
-from render.album import keep_photos, references_of
+from render.album import keep_photos, references_of, shots_in
 from render.compare import psnr
 from render.rays import camera_rays
 from render.references import GONE, READS, References, Shot
@@ -61,6 +62,36 @@ def test_photos_bring_views_nearer_to_the_truth(street, unclear, shift):
     found = list(References(shots(street), unclear).along(views(unclear, times, shift)))
     truth = [f.rgb for f in views(street, times, shift)]
     assert all(psnr(better(f), t) > psnr(f.rgb, t) + 1 for f, t in zip(found, truth, strict=True))
+
+
+def snow(width: int, height: int) -> np.ndarray:
+    """A photo that has a colour of its own in every pixel, and shrunk the means of these."""
+    pixels = np.random.default_rng(5).integers(60, 180, (54, 96, 3)).astype(np.uint8)
+    return np.array(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_from_where_a_photo_was_taken_it_is_seen_pixel_by_pixel(street, shrink):
+    camera = street.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+    frame = render_frame(street, camera.resized(96 // shrink, 54 // shrink), READS)
+    (found,) = References([Shot(camera, snow)], street).along([frame])
+    told, photo = found.trust > 0, torch.from_numpy(snow(96 // shrink, 54 // shrink)) / 255
+    assert told[frame.instance == -1].any() and told[frame.instance == 1].any() and told.float().mean() > 0.5
+    assert (found.reference - photo)[told].abs().max() < 1e-3
+
+
+def test_the_sky_of_a_photo_is_that_behind_a_haze(street):
+    """Splats too faint to be what stands there do not bring the sky near."""
+    g = street.background.gaussians
+    haze = g.select(torch.zeros(1, dtype=torch.int64))
+    scale = torch.full((1, 3), 3.0)
+    haze = replace(haze, means=torch.tensor([[60.0, 0.0, 25.0]]), log_scales=scale, logit_opacities=torch.tensor([-1.7]))
+    hazy = replace(street, background=replace(street.background, gaussians=type(g).cat([g, haze])))
+    camera = hazy.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+    frame = render_frame(hazy, camera, READS)
+    faint = (frame.instance == -1) & (frame.alpha > 0.05) & (frame.alpha < 0.25) & frame.depth.isfinite()
+    (found,) = References([Shot(camera, snow)], hazy).along([frame])
+    assert faint.sum() > 100 and found.trust[faint].float().mean() > 0.5
 
 
 def test_a_predicted_frames_photo_and_those_to_come_are_not_looked_at(street, unclear):
@@ -183,6 +214,13 @@ def test_an_actors_detail_moves_with_it(street, unclear):
     (truth,) = views(aside(street), street.frame_times(CAMERA)[7:8])
     car = frame.instance == 1
     assert psnr(better(frame), truth.rgb, car) > psnr(frame.rgb, truth.rgb, car) + 0.5
+
+
+def test_a_photo_from_before_the_drives_first_moment_is_kept(street, tmp_path):
+    """Of a clock that begins at 0, by which one camera turned out to be early."""
+    path = replace(street.ego, times_us=street.ego.times_us - street.ego.times_us[0])
+    keep_photos(tmp_path, [(CAMERA, time_us, torch.rand(54, 96, 3)) for time_us in (-3000, 97_000)])
+    assert sorted(shot.camera.time_us for shot in shots_in(tmp_path, replace(street, ego=path))) == [-3000, 97_000]
 
 
 def test_a_scene_folder_keeps_its_photos_and_knows_what_was_edited(street, tmp_path):

@@ -40,6 +40,8 @@ def same(a: Scene, b: Scene, sky=True) -> None:
         y = b.rig[name]
         assert (x.lens, x.width, x.height) == (y.lens, y.width, y.height)
         assert torch.equal(x.exposure, y.exposure) and torch.equal(x.times_us, y.times_us)
+        assert (x.shutter, x.readout_us, x.fitted) == (y.shutter, y.readout_us, y.fitted)
+        assert y.gains is None if x.gains is None else torch.equal(x.gains, y.gains)
         assert largest(x.body_from_cam, y.body_from_cam) < 1e-12
     assert (a.model, a.meta) == (b.model, b.meta)
     if a.ground is None:
@@ -55,6 +57,14 @@ def same(a: Scene, b: Scene, sky=True) -> None:
 
 def test_a_scene_returns(saved):
     same(scene(), load(saved))
+
+
+def test_how_a_camera_reads_out_and_exposes_returns(tmp_path):
+    made, gains = scene((), sky=False, ground=False), torch.tensor([[0.5, 0.6, 0.7], [1.5, 1.4, 1.3]])
+    read = {"shutter": "rows", "readout_us": -30_000, "times_us": made.ego.times_us[:2], "gains": gains, "fitted": False}
+    made = replace(made, rig={**made.rig, "left": replace(made.rig["left"], **read)})
+    save(made, tmp_path / "s1")
+    same(made, load(tmp_path / "s1"))
 
 
 def test_saving_what_was_loaded_writes_the_same_files(saved, tmp_path):
