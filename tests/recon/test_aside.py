@@ -44,6 +44,11 @@ def test_a_wall_past_the_border_is_taken_in_the_colours_beside_it():
     np.testing.assert_allclose(got[:, 3:], [RED, GREY])
 
 
+def test_cameras_are_moved_aside_not_ahead():
+    left, right = [38.0, 40.0, 1.5], [38.0, -40.0, 1.5]  # in view from 3 m aside of the first; 3 m behind it they are too far off
+    assert len(found(left, right)) == 2
+
+
 def test_what_pictures_show_and_what_no_view_from_aside_sees_is_left_to_others():
     shown, behind, beside = [6.0, 2.0, 1.5], [-5.0, 0.0, 1.5], [4.0, 12.0, 1.5]
     road, far, parked = [5.0, 6.0, 0.1], [FARTHEST + 6, FARTHEST + 8, 1.5], [2.0, 3.0, 1.0]

@@ -1,11 +1,19 @@
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 import torch
 
+from recon.fit.config import FitConfig
 from recon.fit.densify import BOX_MARGIN, Growth, grow, kept, shade_of
 from recon.fit.model import Splats
+from recon.fit.population import Population
+from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
+from scenes.lenses import Pinhole
 from scenes.shade import BLACK
+from scenes.trajectory import Trajectory
 
 
 def some(count, seed=0, spread=0.5):
@@ -134,3 +142,16 @@ def test_those_are_split_that_are_most_in_need_in_the_mean_picture():
     assert first.sizes == [51, 20, 10]
     both, _ = grow(s, {}, growth, 99, 1, BOXES)
     assert both.sizes == [51, 21, 10], "nothing is wrong with the others, or nothing pulls at them"
+
+
+@pytest.mark.parametrize(("budget", "room"), [(200, 30), (92, 12), (80, 0), (70, 0)])
+def test_what_is_added_to_the_background_takes_no_more_room_than_there_is(budget, room):
+    standing = Trajectory(torch.zeros(1, dtype=torch.int64), torch.eye(4, dtype=torch.float64)[None])
+    motion = SimpleNamespace(rig=[RigCamera(Pinhole(100.0, 100.0, 50.0, 50.0), 100, 100, torch.eye(4))], tracks=[])
+    nobody = SimpleNamespace(to=lambda device: None)
+    there = Population(splats(), motion, FitConfig(budget=budget), SimpleNamespace(ground=None), nobody, None)
+    more = some(30, 4)
+    there.add(more, standing)
+    assert there.splats.sizes == [50 + room, 20, 10] and len(there.growth.errors) == len(there.splats) == 80 + room
+    more, some_of = more.log_scales, there.splats.fields["log_scales"][50 : 50 + room]
+    assert not room or float(some_of.mean() - more.mean()) == pytest.approx(np.log(30 / room) / 2, abs=0.2), "wider, as they are fewer"

@@ -74,6 +74,23 @@ def test_photos_of_an_asset_bring_it_nearer_to_the_truth_wherever_it_is_put(stre
     assert not found.trust[~mine].any() and torch.equal(better(found)[~mine], found.rgb.clamp(0, 1)[~mine])
 
 
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_from_where_a_photo_was_taken_its_detail_is_seen_pixel_by_pixel(street, shrink):
+    taken = photographed(car(), 160)
+    camera, pixels = taken.camera, taken.read().astype(np.int64)
+    height, width = camera.height // shrink, camera.width // shrink
+    snow = np.random.default_rng(3).integers(-40, 40, (camera.height, camera.width, 1))
+    pixels[..., :3] = (pixels[..., :3] + snow).clip(0, 255) * (pixels[..., 3:] > 0)
+    scene = standing(street, replace(car(), photos=(AssetPhoto(camera, lambda: pixels.astype(np.uint8)),)))
+    there = replace(camera, world_from_cam=scene.actors[1].trajectory.world_from_body[0] @ camera.world_from_cam)
+    frame = render_frame(scene, there.resized(width, height), READS)
+    (found,) = References([], scene).along([frame])
+    told = found.trust > 0.5
+    added = (found.reference - frame.rgb)[told].mean(-1)
+    wanted = torch.from_numpy(snow.reshape(height, shrink, width, shrink).mean((1, 3))).float()[told]
+    assert told.sum() > 300 and torch.corrcoef(torch.stack([added, wanted]))[0, 1] > 0.9
+
+
 def test_exposure_and_light_of_the_photo_stay_behind(street):
     alike, truth, mine = seen(street, [photographed(painted(), d) for d in REAR])
     darker, _, _ = seen(street, [photographed(painted(), d, gain=0.6) for d in REAR])
