@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import torch
 import warp as wp
@@ -21,8 +21,10 @@ from render.kernels.detail import add_photo
 from render.rasterize import rasterize
 from render.seen import GONE, NOISE, PARALLAX, Part, Seen, faded, run_over
 from scenes.asset import Actor, AssetPhoto
+from scenes.camera import Camera
 from scenes.gaussians import Placed, SplatModel
 from scenes.poses import inverse
+from scenes.scene import Scene
 
 NEAR = 0.1
 """Radians between two directions, seen from the asset, that are near."""
@@ -41,10 +43,11 @@ KEPT = 8
 
 
 class Portraits:
-    """The photos of an actor's asset, for the frames that show it as `instance`; `model` is that of their scene."""
+    """The photos of an actor's asset, for the frames that show it as `instance`; `model_for` gives the model of a camera's pictures of
+    their scene."""
 
-    def __init__(self, actor: Actor, instance: int, model: SplatModel):
-        self.asset, self.instance, self.model = actor.asset, instance, model
+    def __init__(self, actor: Actor, instance: int, model_for: Callable[[Camera], SplatModel]):
+        self.asset, self.instance, self.model_for = actor.asset, instance, model_for
         self.photos = actor.asset.photos
         self.centre = torch.tensor([0.0, 0.0, float(actor.asset.size[2]) / 2], dtype=torch.float64)
         self.eyes = torch.stack([p.camera.world_from_cam[:3, 3] for p in self.photos]) - self.centre
@@ -98,7 +101,7 @@ class Portraits:
         camera = photo.camera
         camera = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
         placed = Placed(self.asset.gaussians, torch.eye(4, dtype=torch.float64), instance=self.instance)
-        frame = rasterize(placed, camera, ("rgb", "alpha", "depth", "instance"), model=self.model.at_scale(shrink))
+        frame = rasterize(placed, camera, ("rgb", "alpha", "depth", "instance"), model=self.model_for(camera))
         assert isinstance(frame, Frame) and frame.rgb is not None and frame.alpha is not None and frame.instance is not None
         rgba = torch.from_numpy(photo.read()).to(frame.rgb).permute(2, 0, 1)[None] / 255
         rgba = torch.cat([rgba[:, :3] * rgba[:, 3:], rgba[:, 3:]], 1)  # of what is not the asset no colour counts
@@ -113,9 +116,9 @@ class Portraits:
         return Seen.of(frame, F.pad(differs, (0, 1)), instance, [placed])
 
 
-def portraits_of(actors: tuple[Actor, ...], model: SplatModel) -> list[Portraits]:
+def portraits_of(scene: Scene) -> list[Portraits]:
     """The photos of those actors of a scene whose assets have any."""
-    return [Portraits(actor, i + 1, model) for i, actor in enumerate(actors) if actor.asset.photos]
+    return [Portraits(actor, i + 1, scene.model_for) for i, actor in enumerate(scene.actors) if actor.asset.photos]
 
 
 def _detail(differs: torch.Tensor, shows: torch.Tensor) -> torch.Tensor:

@@ -99,7 +99,7 @@ class References:
                 self.spare[i] = self._off(shots[i].camera)[last] < SPACING
                 last = last if self.spare[i] else i
         self.kept: OrderedDict[tuple[int, int], Seen] = OrderedDict()
-        self.portraits = portraits_of(self.shown.actors, self.shown.model)
+        self.portraits = portraits_of(self.shown)
 
     @torch.no_grad()
     def along(self, frames: Iterable[Frame], predicted: Sequence[Camera] = ()) -> Iterator[Frame]:

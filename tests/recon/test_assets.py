@@ -1,10 +1,13 @@
+import io
 import math
 from collections import Counter
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from street import box, car, rig
 
 from recon import extract_assets
@@ -94,11 +97,6 @@ def test_a_tail_has_less_silhouette_than_a_car():
 
 
 def test_a_thumbnail_shows_the_asset_on_grey():
-    import io
-
-    import numpy as np
-    from PIL import Image
-
     pixels = np.asarray(Image.open(io.BytesIO(thumbnail(Asset(body(), SIZE, "car")))))
     assert pixels.shape == (240, 320, 3) and tuple(pixels[0, 0]) == (184, 186, 191) and pixels.std() > 5
 
@@ -171,6 +169,20 @@ def test_assets_keep_photos_of_themselves_alone(sharp_street):
             lit = (2 * alone.rgb).clamp(0, 1)[both] - pixels[..., :3][both].float() / 255
             assert lit.abs().mean() < 0.06, track
             assert (pixels[..., :3][~shows] == 0).all()
+
+
+def test_a_photo_that_is_shrunk_averages_its_pixels(sharp_street, monkeypatch):
+    """A chessboard is grey from afar, not one of its fields or the other."""
+    monkeypatch.setattr("recon.assets.photos.MOST_PIXELS", 24)
+
+    def read(width, height):
+        board = Image.fromarray((np.indices((216, 384)).sum(0) % 2 * 255).astype(np.uint8)).convert("RGB")
+        return np.asarray(board.resize((width, height), Image.Resampling.BOX))
+
+    (mover,) = [c for c in candidates(sharp_street) if c.track == "veh_1"]
+    photos = mover.photos(sharp_street, [replace(s, read=read) for s in _shots(sharp_street)])
+    shown = np.concatenate([pixels[..., :3][pixels[..., 3] == 255] for pixels in (photo.read() for photo in photos)])
+    assert len(shown) > 50 and abs(shown.mean() - 127) < 15 and shown.std() < 30
 
 
 def test_photos_of_one_direction_are_few_and_apart(parked_street):

@@ -91,6 +91,21 @@ def test_from_where_a_photo_was_taken_its_detail_is_seen_pixel_by_pixel(street, 
     assert told.sum() > 300 and torch.corrcoef(torch.stack([added, wanted]))[0, 1] > 0.9
 
 
+def test_a_photo_that_splats_explain_adds_nothing_whatever_its_size(street):
+    """Half as large as the pictures that they were fitted to, in which their pixels hide half as much."""
+    large = replace(street, rig={CAMERA: street.rig[CAMERA].resized(384, 216)})
+    taken = photographed(car(), 160).camera.resized(48, 36)
+    frame = rasterize(car().gaussians, taken, ("rgb", "alpha"), model=large.model_for(taken))
+    rgba = torch.cat([frame.rgb / frame.alpha.clamp_min(1e-6)[..., None], (frame.alpha > 0.5).float()[..., None]], -1)
+    pixels = (rgba.clamp(0, 1) * rgba[..., 3:] * 255).round().to(torch.uint8).numpy()
+    scene = standing(large, replace(car(), photos=(AssetPhoto(taken, lambda: pixels),)))
+    there = replace(taken, world_from_cam=scene.actors[1].trajectory.world_from_body[0] @ taken.world_from_cam)
+    frame = render_frame(scene, there, READS)
+    (found,) = References([], scene).along([frame])
+    assert (found.trust > 0.5).sum() > 100
+    assert (better(found) - frame.rgb.clamp(0, 1)).abs().max() < 2 / 255
+
+
 def test_exposure_and_light_of_the_photo_stay_behind(street):
     alike, truth, mine = seen(street, [photographed(painted(), d) for d in REAR])
     darker, _, _ = seen(street, [photographed(painted(), d, gain=0.6) for d in REAR])
@@ -123,7 +138,7 @@ def test_what_an_asset_hides_behind_takes_nothing_of_it(street):
 
 def test_shares_of_photos_change_little_along_a_path(street):
     scene = standing(street, replace(painted(), photos=tuple(photographed(painted(), d) for d in range(120, 240, 12))))
-    portraits = Portraits(scene.actors[1], 2, scene.model)
+    portraits = Portraits(scene.actors[1], 2, scene.model_for)
     shares = []
     for i in range(200):
         turn = np.radians(150 + 0.3 * i)
