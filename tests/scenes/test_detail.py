@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,11 +8,12 @@ from street import box, car, street
 
 from render import rasterize
 from render.compare import psnr
-from scenes import Camera, Gaussians, Pinhole, Placed
-from scenes.detail import coarser
+from scenes import Camera, Gaussians, Pinhole, Placed, Trajectory
+from scenes.detail import ASIDE, coarser, finest_pixel
 from scenes.edit import Edit, coarse, edited
 from scenes.insert import insert
 from scenes.placement import Placement
+from scenes.poses import matrix_from_quat, translation
 
 
 def fine_car() -> Gaussians:
@@ -39,6 +41,26 @@ def test_merging_keeps_mean_covariance_and_colour():
     spread = (g.means - g.means.mean(0)).T @ (g.means - g.means.mean(0)) / 40
     wide = one.log_scales.exp().square().sum()
     torch.testing.assert_close(wide, spread.trace() + 3 * torch.tensor(-6.0).exp(), atol=1e-6, rtol=1e-4)
+
+
+def test_merged_splats_lie_as_their_parts_did():
+    g = gaussians(400)
+    g = replace(g, means=(torch.arange(400) // 8)[:, None] + 0.4 * torch.rand(400, 3, generator=torch.Generator().manual_seed(1)) + 0.3)
+    merged = coarser(replace(g, logit_opacities=torch.zeros(400), log_scales=torch.full((400, 3), -4.0)), 1.0)
+    axes = matrix_from_quat(merged.quats.double()) * merged.log_scales.double().exp()[:, None]
+    off = (g.means.view(50, 8, 3) - g.means.view(50, 8, 3).mean(1, keepdim=True)).double()
+    spread = off.mT @ off / 8 + torch.eye(3) * math.exp(-8)
+    torch.testing.assert_close(axes @ axes.mT, spread, atol=1e-6, rtol=1e-3)
+
+
+def test_detail_is_that_of_where_the_drive_comes_nearest():
+    scene = street()
+    ego = Trajectory(scene.ego.times_us[:3], torch.stack([translation(x) for x in (0.0, 100.0, 200.0)]))
+    stands = Trajectory(torch.tensor([0]), translation(110.0)[None])
+    along = Trajectory(ego.times_us[1:], torch.stack([translation(130.0), translation(300.0)]))
+    focal = max(max(c.lens.focal()) for c in scene.rig.values())
+    pixels = [finest_pixel(replace(scene, ego=ego), path) * focal for path in (stands, along)]
+    assert pixels == pytest.approx([10 - ASIDE, 30 - ASIDE])
 
 
 def test_of_two_merged_splats_each_counts_as_much_as_it_covers():

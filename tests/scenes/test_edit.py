@@ -10,13 +10,14 @@ from edited_street import ALL, VAN, busy, parking, same, shown
 from pxr import Sdf, Usd, UsdGeom, UsdVol, Vt
 from street import START_US, car, street
 
-from scenes import Actor, Ground, Trajectory, load, save, validate
+from scenes import Actor, Ground, Scene, Trajectory, load, save, validate
 from scenes.astray import astray, meeting
 from scenes.edit import HIDDEN, Edit, absences, edited
 from scenes.harmonics import rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
+from scenes.match import ground_linear
 from scenes.placement import Placement
-from scenes.poses import translation
+from scenes.poses import inverse, translation, yaw
 from scenes.seen import SECTORS
 from scenes.standing import standing_pose
 from scenes.usd.edit import add_change, add_edit
@@ -84,6 +85,45 @@ def test_removing_an_actor_leaves_no_ghost_and_harms_nothing_else():
     assert (means[hidden][:, 2] > 0.2).all()
 
 
+def test_what_a_fast_actor_left_between_two_of_its_poses_goes_too():
+    scene = busy()
+    fast = Trajectory(START_US + 1_000_000 * torch.arange(2), torch.stack([translation(5.0, -3.0), translation(15.0, -3.0)]))
+    (actor,) = [a for a in scene.actors if a.track == "veh_2"]
+    scene = replace(scene, actors=(replace(actor, trajectory=fast),))
+    logits = edited(scene, Edit(remove=("veh_2",))).background.gaussians.logit_opacities
+    assert (logits[len(street().background.gaussians) :] == HIDDEN).all()
+
+
+def elsewhere(scene: Scene) -> Scene:
+    """The same with a background that stands in a frame of its own."""
+    pose, g = translation(40.0, -7.0, 1.0) @ yaw(2.0), scene.background.gaussians
+    back = inverse(pose)
+    means = (g.means.double() @ back[:3, :3].T + back[:3, 3]).float()
+    return replace(scene, background=replace(scene.background, gaussians=replace(g, means=means), world_from_local=pose))
+
+
+def test_it_does_not_matter_in_which_frame_the_background_stands():
+    """What lies behind the parked car, as seen from the path's end, is red, which does not tell how it looks below it."""
+    scene = parking()
+    g, passed = scene.background.gaussians, scene.ego.world_from_body[-1, :3, 3].float()
+    behind = (g.means - passed).norm(dim=1) > (torch.tensor([20.0, -7.0, 0.0]) - passed).norm()
+    sh = torch.where(behind[:, None, None], sh_from_rgb(torch.tensor([1.0, 0.0, 0.0])), g.sh)
+    scene = replace(scene, background=replace(scene.background, gaussians=replace(g, sh=sh)))
+    edit = Edit(remove=("veh_2", "veh_7"))
+    here, there = (edited(s, edit).background.gaussians for s in (scene, elsewhere(scene)))
+    hidden = here.logit_opacities == HIDDEN
+    assert hidden.sum() > 200 and (hidden ^ (there.logit_opacities == HIDDEN)).sum() < 0.02 * hidden.sum()
+    painted = (here.sh != sh).flatten(1).any(1) & (there.sh != sh).flatten(1).any(1)
+    assert painted.sum() > 10 and (here.sh - there.sh)[painted].abs().max() < 0.2
+    rgb = rgb_from_sh(there.sh[painted, 0])
+    assert (rgb[:, 0] - rgb[:, 1]).abs().max() < 0.1
+    place = torch.tensor([12.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(ground_linear(elsewhere(scene), place), ground_linear(scene, place), atol=1e-3, rtol=0)
+    driven = insert(scene, car(), Placement("car/0001", 14.0, -7.0, speed=8.0))
+    assert "stands in something" in driven.warnings[-1]
+    assert insert(elsewhere(scene), car(), Placement("car/0001", 14.0, -7.0, speed=8.0)).warnings == driven.warnings
+
+
 @pytest.mark.parametrize("edit", [Edit(remove=("veh_1",)), Edit(shift={"inserted_car_0001": (0.0, 3.0)})], ids=["shifted", "inserted"])
 def test_where_an_actor_only_virtually_stood_nothing_is_hidden(edit):
     """Both stand where veh_2 left its ghost, which is as real as a wall to them."""
@@ -128,13 +168,15 @@ def test_the_street_below_a_removed_parked_vehicle_looks_as_beside_it(tmp_path):
     g = scene.background.gaussians
     at = g.means - torch.tensor([20.0, -7.0, 0.0])
     street_there = (at[:, 0].abs() < 2.1) & (at[:, 1].abs() < 0.9) & (at[:, 2].abs() < 0.05)
-    sh = g.sh.clone()
+    sh = g.with_sh_count(4).sh.clone()
+    sh[:, 1:] = 0.1
     sh[street_there, 0] = sh_from_rgb(torch.tensor([1.0, 0.0, 0.0]))
     scene = replace(scene, background=replace(scene.background, gaussians=replace(g, sh=sh)))
     save(scene, tmp_path / "s1")
     add_change(tmp_path / "s1", "mine", load(tmp_path / "s1"), Edit(remove=("veh_7",)), {})
     after = edited(scene, Edit(remove=("veh_7",)))
     same(load(tmp_path / "s1"), after)
+    torch.testing.assert_close(load(tmp_path / "s1").background.gaussians.sh, after.background.gaussians.sh)
     rgb = rgb_from_sh(after.background.gaussians.sh[:, 0])
     assert street_there.sum() > 10 and (rgb[street_there] - rgb[street_there].mean(1, keepdim=True)).abs().max() < 0.05
     changed = (after.background.gaussians.sh != sh).flatten(1).any(1)

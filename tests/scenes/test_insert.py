@@ -8,7 +8,7 @@ from street import START_US, STEP_US, car
 from scenes import Ground, Trajectory
 from scenes.insert import insert
 from scenes.placement import Placement
-from scenes.poses import translation, yaw, yaw_of
+from scenes.poses import pose_from, translation, yaw, yaw_of
 from scenes.standing import standing_pose
 
 
@@ -129,6 +129,19 @@ def test_a_trajectory_file_is_followed(street, tmp_path):
     headings = [float(yaw_of(path.at(START_US + t))) for t in (0, 300_000, 600_000)]
     assert headings == pytest.approx([0, math.pi / 4, math.pi / 2])
     assert not path.covers(START_US + 800_000)
+
+
+def test_a_body_that_is_turned_and_tilted_says_where_forward_and_left_are(street, tmp_path):
+    """On the level: what it leans does not bring nearer what stands to its left."""
+    leaning = pose_from([math.cos(0.2), math.sin(0.2), 0.0, 0.0], [0.0, 0.0, 0.0])
+    ego = Trajectory(street.ego.times_us, translation(5, 1, 0) @ yaw(math.pi / 2) @ street.ego.world_from_body @ leaning)
+    turned = replace(street, ego=ego)
+    for actor in (
+        on_way(turned, tmp_path / "t.csv", "0,10,2\n1,14,2\n").actor,
+        insert(turned, car(), Placement("car", 10, 2), start_us=START_US).actor,
+    ):
+        pose = actor.trajectory.at(START_US)
+        assert pose[:2, 3].tolist() == pytest.approx([3, 11]) and float(yaw_of(pose)) == pytest.approx(math.pi / 2)
 
 
 def test_yaw_goes_the_shorter_way_round(street, tmp_path):

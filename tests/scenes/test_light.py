@@ -12,7 +12,7 @@ from scenes.edit import unparked
 from scenes.harmonics import sh_from_rgb
 from scenes.hdr import load_hdr
 from scenes.light import COUNT, clear_sky_share, clearness, disc, light_of, shadows_beside_parked, solar_position, sun_of_sky
-from scenes.poses import translation
+from scenes.poses import translation, yaw
 from scenes.sky import srgb_from_linear
 
 
@@ -129,6 +129,22 @@ def test_parked_cars_tell_whether_the_sun_reaches_the_street(street):
     assert told[0] is not None and told[1] is None, "a sun that casts no shadows is behind houses that nobody saw"
     assert shadows_beside_parked(street, sun) is None
     assert shadows_beside_parked(replace(scene, meta={"parked": parked[:2]}), sun) is None
+
+
+def test_shadows_are_looked_for_past_the_end_of_a_car_that_points_at_the_sun(street):
+    """Cars at an angle across the road, and the sun behind their tails: 2 m of shade before their noses."""
+    way = torch.tensor([math.sqrt(0.5), math.sqrt(0.5)])
+    boxes = [translation(float(x), y) @ yaw(math.pi / 4) for x in (5, 15, 25) for y in (-4.0, 4.0)]
+    parked = [{"track": "veh", "label": "car", "size": [4.2, 1.8, 1.5], "world_from_box": b.tolist()} for b in boxes]
+    ground = street.background.gaussians.select(street.background.gaussians.means[:, 2] == 0)
+    off = ground.means[:, None, :2] - torch.stack([b[:2, 3] for b in boxes]).float()
+    along, aside = off @ way, off @ torch.stack([-way[1], way[0]])
+    shaded = ((along > 2.1) & (along < 4.1) & (aside.abs() < 1)).any(1)
+    colour = srgb_from_linear(torch.where(shaded[:, None], 0.08, 0.2)).expand(-1, 3)
+    splats = Placed(replace(ground, sh=sh_from_rgb(colour)[:, None].contiguous()), street.background.world_from_local)
+    scene = replace(street, meta={**street.meta, "parked": parked}, background=splats)
+    sun = torch.tensor([*(-0.8 * way), 0.6], dtype=torch.float64)
+    assert shadows_beside_parked(scene, sun) == pytest.approx(0.6, abs=0.05)
 
 
 @pytest.mark.parametrize(("sun_share", "least", "most"), [(0.0, 0.0, 0.0), (0.6, 0.1, 0.6)])

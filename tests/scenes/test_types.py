@@ -130,6 +130,12 @@ def test_the_ground_is_bilinear_inside_and_level_beyond():
     assert corners.tolist() == [0.0, 2.0 * 5 - 3.0 * 4]
 
 
+def test_ground_that_is_no_plane_is_bilinear_between_its_points():
+    ground = Ground(torch.tensor([[0.0, 1, 0], [0, 0, 4], [8, 0, 0]]), (10.0, 20.0), 2.0)
+    at = torch.tensor([[11.2, 20.0], [13.5, 20.0], [13.5, 21.0], [10.0, 22.5], [14.0, 24.0]])
+    assert ground.height(at).tolist() == pytest.approx([0.6, 0.25, 1.625, 2.0, 0.0])
+
+
 def test_the_sky_is_up_above_and_turns_left_from_its_centre():
     linear = torch.zeros(8, 16, 3)
     linear[0], linear[-1] = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 1, 0])
