@@ -127,6 +127,12 @@ def test_a_date_is_smoothed_by_those_of_neighbours_in_time(split):
     assert (_retimed(often, often.times_us + late, 0.0)[1] - often.times_us)[2] == -30_000
 
 
+def test_a_track_without_points_is_scanned_as_late_as_others_are(split):
+    track = next(t for t in split[0].tracks if t.moving)
+    later, times = _retimed(track, track.times_us.astype(np.float64), 30_000.0)
+    assert (times == track.times_us + 30_000).all() and (later.times_us == times).all()
+
+
 def test_boxes_scanned_out_of_turn_are_left_out(split):
     """However late one was, those that follow it come later than it, too."""
     mover = next(t for t in split[0].tracks if t.moving)

@@ -10,14 +10,16 @@ from PIL import Image
 
 from recon import FitConfig, open_log, reconstruct
 from recon.log import Log, LogCamera, Packed
-from recon.views.egomask import ego_mask, with_ego_masks
+from recon.views.egomask import DOWN as FALLING
+from recon.views.egomask import _ways, ego_mask, with_ego_masks
 from recon.views.frames import load_frames
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
 from render.rays import camera_rays
+from scenes.camera import Camera
 from scenes.lenses import Fisheye, Pinhole
-from scenes.poses import CAM_FROM_FLU, inverse
+from scenes.poses import CAM_FROM_FLU, inverse, small_poses
 from scenes.trajectory import Trajectory
 
 SIZE = W, H = 320, 180
@@ -72,6 +74,19 @@ def test_a_bonnet_is_found_and_little_else(lens, turn):
     assert mask is not None and mask.shape == (H, W)
     assert mask[BONNET].mean() > 0.99
     assert mask[~BONNET].mean() < 0.06
+
+
+@pytest.mark.parametrize("turn", [(-0.3, 0, 0), (0, 1.5, 0), (0.2, 0.7, 0.3)], ids=["down", "aside", "askew"])
+def test_what_stands_moves_away_from_where_the_camera_goes_whichever_way_it_looks(turn):
+    mount = inverse(CAM_FROM_FLU) @ small_poses(torch.tensor([*turn, 0, 0, 0]))
+    view, travel = Camera(Pinhole(30.0, 30.0, 24.0, 16.0), 48, 32, mount), torch.tensor([0.01, 0.0, 0.0], dtype=torch.float64)
+    ways, below = _ways(view, travel)
+    points = 7 * camera_rays(view).double() @ mount[:3, :3].T
+    later = view.lens.project((points - travel) @ mount[:3, :3])
+    moved = torch.nn.functional.normalize(later - view.pixel_centres(), dim=-1)
+    assert float((moved * torch.from_numpy(ways)).sum(-1).median()) > 0.999
+    falls = torch.nn.functional.normalize(points, dim=-1)[..., 2]
+    assert (torch.from_numpy(below) == (falls < -FALLING)).all() and below.any()
 
 
 def test_a_narrow_bonnet_begins_at_the_lower_edge():

@@ -34,6 +34,14 @@ def test_a_sky_of_which_hardly_anything_was_seen_takes_that_everywhere():
     np.testing.assert_allclose(sky.picture(), np.broadcast_to(np.float32([0.2, 0.4, 0.6]), (64, 128, 3)), atol=1e-4)
 
 
+def test_a_sky_spreads_across_the_seam_behind():
+    sky = SkyPicture(64, GREY)
+    for column, rgb in ((1, (1.0, 0.0, 0.0)), (64, (0.0, 0.0, 1.0))):
+        sky.count[20, column], sky.sum[20, column] = 1, rgb
+    red, _, blue = sky.picture()[20, 124]
+    assert red > 0.9 and blue < 0.1
+
+
 def test_sky_is_what_is_smooth_and_blue_down_from_the_top():
     image = house_under_sky()
     mask = sky_mask(image)

@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -13,10 +14,10 @@ from recon.fit.config import FitConfig
 from recon.log import LidarPoints, Log, LogCamera, Packed, SparsePoints, Sweep
 from recon.views.frames import Frames, load_frames, size_like
 from recon.views.skies import fine_sky, like_sky
-from recon.views.sky_told import under_their_sky
+from recon.views.sky_told import _cells, under_their_sky
 from recon.views.view import View
 from scenes.lenses import Pinhole
-from scenes.poses import CAM_FROM_FLU, inverse
+from scenes.poses import CAM_FROM_FLU, inverse, small_poses
 from scenes.trajectory import Trajectory
 
 ALL = (0, 2**62)
@@ -85,6 +86,35 @@ def test_a_sky_is_looked_for_where_it_may_be_and_no_farther_down():
 def test_a_sky_of_any_colour_is_told_by_lidar_from_a_white_wall(sky):
     for mask in _skies(_log(sky, strikes=True)):
         assert mask[3:40, 5:115].mean() > 0.95 and mask[:, 140:].mean() < 0.02 and mask[60:].mean() < 0.02
+
+
+def _cells_of(log: Log, time_us: int):
+    view = View(0, 0, time_us, torch.zeros(120, 240, 3, dtype=torch.uint8), False, torch.zeros(120, 240, dtype=torch.bool))
+    return _cells(log, ["front"], [view], None)[0]
+
+
+def test_the_horizon_is_where_the_camera_has_it():
+    """Of one that looks 20 degrees up, and of one that looks aside, lying on its side."""
+    log = _log((9, 8, 11), strikes=True)
+    camera = log.camera("front")
+    up, side = (small_poses(torch.tensor(turn)) for turn in ([math.radians(20), 0, 0, 0, 0, 0], [0, 0, math.pi / 2, 0, 0, 0]))
+    above = [
+        _cells_of(replace(log, cameras={"front": replace(camera, world_from_cam=camera.world_from_cam @ t)}), 0).above for t in (up, side)
+    ]
+    assert above[0][:100].all() and not above[0][105:].any()
+    assert above[1].any() and not above[1].all() and (above[1] == above[1][:1]).all()
+
+
+def test_what_stands_there_is_told_by_the_nearest_sweeps():
+    log = _log((9, 8, 11), strikes=True)
+
+    def sweep(time_us: int, y: float) -> Sweep:
+        sweep = log.sweeps[0]
+        return replace(sweep, time_us=time_us, read=lambda: replace(sweep.read(), xyz=sweep.read().xyz + [0.0, y, 0.0]))
+
+    moved = replace(log, sweeps=tuple(sweep(t, 10.0 if t < 250_000 else 0.0) for t in range(200_000, 600_000, 100_000)))
+    struck = _cells_of(moved, 400_000).struck
+    assert struck[:, 140:].any() and not struck[:, :100].any()
 
 
 def test_without_lidar_or_points_only_blue_is_sky():

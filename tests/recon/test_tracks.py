@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from recon.log import Track
-from recon.objects.tracks import Boxes, facing, named, tracks_of, upright
+from recon.objects.tracks import Boxes, _steady, facing, named, tracks_of, upright
 from scenes.trajectory import Trajectory
 
 
@@ -66,3 +66,15 @@ def test_what_has_time_to_turn_round_may():
         torch.testing.assert_close(facing(track).world_from_box, track.world_from_box)
     one = _track([0.3], 1)
     torch.testing.assert_close(facing(one).world_from_box, one.world_from_box)
+
+
+def test_the_ends_of_a_way_are_where_those_beside_them_would_take_it():
+    """Tukey's rule: the median of the end, the one beside it, and the line through the smoothed two beside it, drawn on."""
+    way = torch.tensor([[0.0, 0], [4, 1], [6, 1], [9, 1], [3, 5]])
+    assert _steady(way).tolist() == [[0.0, 1], [4, 1], [6, 1], [6, 1], [6, 1]]
+
+
+def test_a_track_has_the_middle_size_of_its_boxes():
+    boxes = _boxes(np.arange(3) * 3.0)
+    (track,) = tracks_of([replace(boxes, sizes=boxes.sizes * [[0.5], [1.0], [1.1]])], EGO, "here")
+    assert track.size.tolist() == [4.0, 2.0, 1.5]

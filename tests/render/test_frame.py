@@ -7,6 +7,7 @@ from street import START_US, car
 from render import rasterize, render_frame
 from render.rays import world_directions
 from scenes import Gaussians, Placed, Scene
+from scenes.harmonics import rgb_from_sh
 from scenes.insert import insert
 from scenes.placement import Placement
 
@@ -65,6 +66,19 @@ def test_actors_stand_where_they_are_at_that_time(street):
     early = render_frame(street, street.camera("front_camera", START_US), ("instance",)).instance
     late = render_frame(street, street.camera("front_camera", START_US + 700_000), ("instance",)).instance
     assert 0 < (early == 1).sum() < (late == 1).sum()  # it comes nearer
+
+
+def test_light_follows_what_was_recorded_and_not_what_was_put_in(street):
+    """One camera of two exposed a frame four times as much: in the mean twice."""
+    rig = {name: replace(c, gains=None) for name, c in street.rig.items()}
+    gains = torch.ones(len(rig["front_camera"].times_us), 3)
+    gains[0] = 4.0
+    scene = insert(replace(street, rig=rig), car(), Placement("car", 20, 5)).scene
+    lit = replace(scene, rig={**rig, "front_camera": replace(rig["front_camera"], gains=gains)})
+    torch.testing.assert_close(lit.followed(START_US), torch.full((3,), 2.0))
+    (_, *before), (_, *after) = (s.placed(START_US) for s in (scene, lit))
+    assert not torch.equal(before[0].gaussians.sh, after[0].gaussians.sh) and torch.equal(before[1].gaussians.sh, after[1].gaussians.sh)
+    torch.testing.assert_close(rgb_from_sh(after[0].gaussians.sh[:, 0]), rgb_from_sh(before[0].gaussians.sh[:, 0]) / 2)
 
 
 def test_flow_needs_the_other_camera(street, camera):

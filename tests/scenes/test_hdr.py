@@ -25,6 +25,13 @@ def test_a_pixel_returns_within_a_256th_of_its_largest_channel(tmp_path, size):
     assert torch.equal(load_hdr(tmp_path / "b.hdr"), after)
 
 
+def test_what_an_image_was_multiplied_by_is_taken_out(tmp_path):
+    save_hdr(tmp_path / "a.hdr", torch.full((2, 3, 3), 0.5))
+    data = (tmp_path / "a.hdr").read_bytes()
+    (tmp_path / "a.hdr").write_bytes(data.replace(b"FORMAT", b"EXPOSURE=4\nEXPOSURE=0.5\nFORMAT", 1))
+    assert (load_hdr(tmp_path / "a.hdr") == 0.25).all()
+
+
 @settings(max_examples=40)
 @given(st.lists(st.sampled_from([0.0, 0.5, 0.75, 1.0, 3.0]), min_size=8, max_size=700))
 def test_runs_of_any_length_return(tmp_path_factory, row):

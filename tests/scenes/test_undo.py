@@ -39,6 +39,9 @@ def test_undoing_says_which_later_edits_go_on_from_where_it_put_an_actor(saved):
     add_change(saved, "shift", load(saved), Edit(shift={"veh_2": (0.0, 1.0), "veh_3": (1.0, 0.0)}), {})
     add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
     add_change(saved, "gone", load(saved), Edit(remove=("veh_3",)), {})
+    with pytest.raises(KeyError), undone(saved, ["retime"]) as (edit,):
+        assert edit.held == {}, "what it went on from does not go on from it"
+        raise KeyError
     with undone(saved, ["shift"]) as (edit,):
         assert edit.held == {"retime": ["veh_2"]}
     assert float(load(saved).actors[1].trajectory.world_from_body[0, 1, 3]) == pytest.approx(-2.0)
@@ -52,6 +55,14 @@ def test_an_edit_that_goes_with_a_later_one_leaves_nothing_of_it(saved):
     add_change(saved, "retime", load(saved), Edit(retime={"veh_2": 100_000}), {})
     with undone(saved, ["shift", "retime"]) as edits:
         assert [e.held for e in edits] == [{}, {}]
+    same(load(saved), busy())
+
+
+def test_an_edit_may_be_named_that_goes_with_another(saved):
+    put_in(saved)
+    add_change(saved, "aside", load(saved), Edit(shift={"new": (1.0, 0.0)}), {})
+    with undone(saved, ["new", "aside"]) as edits:
+        assert [(e.name, e.idle) for e in edits] == [("new", ("aside",))]
     same(load(saved), busy())
 
 
