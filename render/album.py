@@ -45,13 +45,12 @@ def references_of(folder: Path, scene: Scene) -> References | None:
 
 
 def shots_in(folder: Path, scene: Scene) -> list[Shot]:
-    """The photos that the folder of a `scene` keeps."""
+    """The photos that the folder of a `scene` keeps, each camera's in the order of time."""
     return [
-        Shot(scene.camera(name, int(file.stem)), partial(_read, file))
+        Shot(scene.camera(name, time_us), partial(_read, folder / FOLDER / name / f"{time_us}.jpg"))
         for name in scene.rig
-        for file in sorted((folder / FOLDER / name).glob("*.jpg"))
-        if re.fullmatch(r"-?\d+", file.stem)  # of a clock that begins at 0 a camera may turn out to be early
-    ]
+        for time_us in sorted(int(file.stem) for file in (folder / FOLDER / name).glob("*.jpg") if re.fullmatch(r"-?\d+", file.stem))
+    ]  # of a clock that begins at 0 a camera may turn out to be early
 
 
 def _read(file: Path, width: int, height: int) -> np.ndarray:

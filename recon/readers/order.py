@@ -20,9 +20,9 @@ def names_apart(taken: Mapping[int, Sequence[str]]) -> dict[int, str] | None:
     """What the names of each camera's pictures call it: their folder, else the words that all of them have and not all cameras' do, which
     one camera may lack. None where they tell no cameras apart."""
     folders = [{str(PurePosixPath(name).parent) for name in names} for names in taken.values()]
-    flat = [next(iter(some)) for some in folders if len(some) == 1]
-    if len(set(flat)) == len(taken) and "." not in flat:
-        return {key: re.sub(r"\W", "_", folder) for key, folder in zip(taken, flat, strict=True)}
+    flat = [re.sub(r"\W", "_", next(iter(some))) for some in folders if some != {"."} and len(some) == 1]
+    if len(set(flat)) == len(taken):
+        return dict(zip(taken, flat, strict=True))
     words = {key: shared_words(names) for key, names in taken.items()}
     common = set.intersection(*map(set, words.values()))
     told = {key: "_".join(word for word in some if word not in common) for key, some in words.items()}

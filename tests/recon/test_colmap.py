@@ -12,6 +12,7 @@ from recon import open_log, reconstruct
 from recon.fit.config import FitConfig
 from recon.ground import estimate_ground
 from recon.readers.gauge import find_gauge, up_from_cameras
+from recon.readers.order import names_apart
 from recon.seeds.dense import agreeing, cloud_from_pictures
 from recon.views.frames import load_frames
 from recon.views.gains import picture_gains
@@ -121,6 +122,12 @@ def test_the_front_camera_is_the_body_unless_it_lacks_most_pictures(street, tmp_
     pair = {"left": pictures_along(street, "left_camera", count=6), "front": pictures_along(street, count=6)[:registered]}
     log = open_log(write_colmap(tmp_path / "pair", street, pair), metres_per_unit=1 / UNIT)
     assert next(iter(log.cameras)) == lead and log.meta["body"].startswith(f"camera {lead},")
+
+
+def test_no_camera_takes_anothers_name():
+    """A name has no blanks and dashes: folders that differ by no more than these do not give one."""
+    assert names_apart({1: ["front-left/1.jpg", "front-left/2.jpg"], 2: ["rear/1.jpg"]}) == {1: "front_left", 2: "rear"}
+    assert names_apart({1: ["front-left/1.jpg", "front-left/2.jpg"], 2: ["front_left/1.jpg"]}) is None
 
 
 def test_names_with_a_space_in_a_text_model_are_refused_with_the_fix(own):

@@ -219,8 +219,9 @@ def test_an_actors_detail_moves_with_it(street, unclear):
 def test_a_photo_from_before_the_drives_first_moment_is_kept(street, tmp_path):
     """Of a clock that begins at 0, by which one camera turned out to be early."""
     path = replace(street.ego, times_us=street.ego.times_us - street.ego.times_us[0])
-    keep_photos(tmp_path, [(CAMERA, time_us, torch.rand(54, 96, 3)) for time_us in (-3000, 97_000)])
-    assert sorted(shot.camera.time_us for shot in shots_in(tmp_path, replace(street, ego=path))) == [-3000, 97_000]
+    times = [-3000, 97_000, 197_000, 500_000]
+    keep_photos(tmp_path, [(CAMERA, time_us, torch.rand(54, 96, 3)) for time_us in times])
+    assert [shot.camera.time_us for shot in shots_in(tmp_path, replace(street, ego=path))] == times
 
 
 def test_a_scene_folder_keeps_its_photos_and_knows_what_was_edited(street, tmp_path):
