@@ -12,8 +12,9 @@ from render import render_frame
 from render.album import keep_photos, references_of, shots_in
 from render.compare import psnr
 from render.rays import camera_rays
-from render.references import GONE, READS, References, Shot
+from render.references import COVERED, GONE, READS, RIM, References, Shot
 from render.video import to_bytes
+from scenes.camera import Camera
 from scenes.edit import Edit
 from scenes.files import load, save
 from scenes.lenses import Fisheye
@@ -72,7 +73,7 @@ def snow(width: int, height: int) -> np.ndarray:
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_from_where_a_photo_was_taken_it_is_seen_pixel_by_pixel(street, shrink):
-    camera = street.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+    camera = at_hand(street)
     frame = render_frame(street, camera.resized(96 // shrink, 54 // shrink), READS)
     (found,) = References([Shot(camera, snow)], street).along([frame])
     told, photo = found.trust > 0, torch.from_numpy(snow(96 // shrink, 54 // shrink)) / 255
@@ -87,11 +88,52 @@ def test_the_sky_of_a_photo_is_that_behind_a_haze(street):
     scale = torch.full((1, 3), 3.0)
     haze = replace(haze, means=torch.tensor([[60.0, 0.0, 25.0]]), log_scales=scale, logit_opacities=torch.tensor([-1.7]))
     hazy = replace(street, background=replace(street.background, gaussians=type(g).cat([g, haze])))
-    camera = hazy.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+    camera = at_hand(hazy)
     frame = render_frame(hazy, camera, READS)
     faint = (frame.instance == -1) & (frame.alpha > 0.05) & (frame.alpha < 0.25) & frame.depth.isfinite()
     (found,) = References([Shot(camera, snow)], hazy).along([frame])
     assert faint.sum() > 100 and found.trust[faint].float().mean() > 0.5
+
+
+def at_hand(street) -> Camera:
+    return street.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
+
+
+def aside(camera: Camera, metres: float, later_us: int = 0) -> Camera:
+    return replace(camera, world_from_cam=translation(0.0, metres, 0.0) @ camera.world_from_cam, time_us=camera.time_us + later_us)
+
+
+def test_photos_count_by_how_far_off_and_how_long_ago_they_were_taken(street):
+    camera = at_hand(street)
+    frame = render_frame(street, camera, READS)
+    shots = [Shot(aside(camera, *off), snow) for off in ((0.0, 1_000_000), (0.0, -300_000), (3.0, 0))]
+    best = References(shots, street).chosen(frame)
+    assert [index for index, _ in best] == [1, 0]
+    trusts = []
+    for metres in (0.0, 2.0):
+        (found,) = References([Shot(aside(camera, metres), snow)], street).along([frame])
+        near = (found.trust > 0) & (frame.instance == 0) & (frame.depth < 15)
+        trusts.append(float(found.trust[near].median()))
+    assert trusts[1] < 0.7 * trusts[0]
+
+
+def test_another_cameras_photo_of_a_predicted_moment_is_looked_at(street):
+    camera = at_hand(street)
+    frame = render_frame(street, camera, READS)
+    shots = [Shot(camera, snow), Shot(aside(camera, 1.0), snow), Shot(aside(camera, 0.0, 100_000), snow)]
+    assert sorted(index for index, _ in References(shots, street).chosen(frame, [camera])) == [1, 2]
+
+
+def test_sky_is_believed_where_photos_agree_and_nothing_stands_near(street):
+    camera = at_hand(street)
+    frame = render_frame(street, camera, READS)
+    later = aside(camera, 0.0, 1)
+    (alike,) = References([Shot(camera, snow), Shot(later, snow)], street).along([frame])
+    (apart,) = References([Shot(camera, snow), Shot(later, lambda w, h: snow(w, h)[::-1].copy())], street).along([frame])
+    stands = torch.nn.functional.max_pool2d((frame.alpha > COVERED).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+    sky = frame.instance < 0
+    assert (sky & stands).any() and not alike.trust[sky & stands].any() and alike.trust[sky & ~stands].min() > 0.5
+    assert apart.trust[sky].mean() < 0.5 * alike.trust[sky].mean()
 
 
 def test_a_predicted_frames_photo_and_those_to_come_are_not_looked_at(street, unclear):
