@@ -10,7 +10,7 @@ from street import car
 from recon.assets.looking import looking_at
 from render import rasterize, render_frame
 from render.compare import psnr
-from render.portraits import Portraits
+from render.portraits import Portraits, _detail
 from render.references import READS, References
 from scenes import Actor, Camera, Trajectory
 from scenes.asset import AssetPhoto
@@ -116,6 +116,21 @@ def test_exposure_and_light_of_the_photo_stay_behind(street):
 def test_photos_from_the_other_side_say_nothing(street):
     found, _, mine = seen(street, [photographed(painted(), d) for d in (-15, 0, 15)])
     assert found.trust[mine].mean() < 0.1
+
+
+def test_photos_from_another_direction_are_trusted_less(street):
+    from_here, from_aside = (seen(street, [photographed(painted(), degrees)])[0].trust for degrees in (163, 195))
+    both = (from_here > 0) & (from_aside > 0)
+    assert both.sum() > 200 and from_aside[both].median() < 0.6 * from_here[both].median()
+
+
+def test_what_is_light_all_over_an_asset_is_no_detail_at_its_rim():
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    shows = (x - 30).square() / 25**2 + (y - 20).square() / 12**2 < 1
+    light = torch.full((40, 60, 3), 0.3)
+    assert _detail(light, shows).abs().max() < 1e-5
+    spot = light + ((x - 30).abs() < 1)[..., None] * 0.2
+    assert _detail(spot, shows)[20, 30].min() > 0.1 and not _detail(spot, shows)[~shows].any()
 
 
 def test_a_photo_of_a_predicted_moment_is_not_looked_at(street):

@@ -12,9 +12,9 @@ from recon.log import Track
 from recon.seeds.shade import shade
 from render import render_frame
 from render.frame_types import Frame
-from render.occlusion import shadow_box, trace_field
-from render.shadow import GRAZING, Shade, cast, shadow_casters
-from scenes import Camera, Equirectangular, Gaussians, OpenCV, Orthographic, Placed, Sky
+from render.occlusion import shadow_box, squares, trace_field
+from render.shadow import GRAZING, TILT, TURN, Shade, _light, cast, shadow_casters
+from scenes import Actor, Camera, Equirectangular, Gaussians, Ground, OpenCV, Orthographic, Placed, Sky, Trajectory
 from scenes.edit import Edit, edited
 from scenes.formats.transform import moved
 from scenes.hdr import load_hdr
@@ -22,6 +22,8 @@ from scenes.insert import insert
 from scenes.light import disc, light_of
 from scenes.placement import Placement
 from scenes.poses import inverse, pose_from
+from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.standing import standing_pose
 
 CAR = car()
 OVERCAST = light_of(replace(made_street(), sky=None)).directions.float()
@@ -318,3 +320,40 @@ def test_an_actor_that_brought_its_shade_along_casts_no_second_shadow(street):
     moved = {"shift": {"veh_1": (0.0, 0.5)}}
     assert casters(bare, **moved) == 1 and casters(scene, **moved) == 0
     assert casters(scene, **moved, replace={"veh_1": CAR}) == 1, "its shade went with it"
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.6, -2.5])
+def test_light_comes_from_where_it_does_in_the_frame_of_what_stands_on_a_slope(street, heading):
+    along = torch.arange(60.0)[None].expand(40, -1).contiguous()
+    hill = replace(street, ground=Ground(0.2 * along, (-10.0, -20.0), 1.0))
+    pose = standing_pose(hill, torch.tensor([9.0, 1.0], dtype=torch.float64), heading, car().size)
+    of_hill = Shade(hill)
+    directions, _ = of_hill.at(Actor(car(), Trajectory(torch.tensor([0]), pose[None]), "new"), 0)
+    there = (of_hill.light.directions @ pose[:3, :3]).float()
+    assert (directions * there).sum(1).min() > math.cos(TURN + TILT)
+
+
+@pytest.mark.parametrize("bright", [0.3, 0.8])
+def test_light_is_taken_away_in_linear_light(street, bright):
+    scene = insert(street, car(), Placement("car/0001", 9.0, 1.0)).scene
+    camera = scene.camera("front_camera", START_US)
+    frame = render_frame(scene, camera, ("rgb", "depth", "instance"))
+    frame = replace(frame, rgb=torch.full_like(frame.rgb, bright))
+    (caster,) = shadow_casters(scene, camera)
+    x0, y0, x1, y1 = caster.window
+    light = _light(frame, caster, (frame.instance == caster.instance).float())
+    assert light.min() < 0.5
+    expected = srgb_from_linear(linear_from_srgb(torch.tensor(bright)) * light)[..., None].expand(-1, -1, 3)
+    torch.testing.assert_close(cast(frame, [caster])[y0:y1, x0:x1], expected, atol=1e-5, rtol=0)
+
+
+def test_fewer_splats_block_as_much_light(monkeypatch):
+    """Of more than can be traced every few, in squares as much larger."""
+
+    def area() -> float:
+        a, b, c = torch.from_numpy(squares(CAR.gaussians)).unbind(1)
+        return float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+
+    whole = area()
+    monkeypatch.setattr("render.occlusion.MOST", len(CAR.gaussians) // 4)
+    assert area() == pytest.approx(whole, rel=0.05)
