@@ -7,10 +7,14 @@ import torch
 from made_sweeps import MOUNT, Box, drive, standing
 
 from recon.log import LidarPoints, Sweep, Track
-from recon.movers.boxing import headings, smoothed
+from recon.movers.boxing import boxed, headings, smoothed
+from recon.movers.following import Cluster
 from recon.movers.freespace import range_image, tally
 from recon.movers.search import with_movers
 from recon.ready import annotated
+from scenes.ground import Ground
+from scenes.poses import translation, yaw
+from scenes.trajectory import Trajectory
 
 CAR = (4.4, 1.8, 1.5)
 WALLS = [standing(20, side * 14, (140, 1, 8)) for side in (-1, 1)]
@@ -192,3 +196,38 @@ def test_what_stands_faces_where_it_came_from_or_goes():
     way = np.array([[0.0, 0], [0, 1], [0, 2], [0, 3], [0.02, 3], [-0.02, 3.01], [0, 3], [0.01, 2.99]])
     assert np.abs(headings(way, 1.5) - np.pi / 2).max() < 0.02
     assert torch.isfinite(torch.from_numpy(headings(np.zeros((3, 2)), 1.5))).all()
+
+
+def test_what_drives_towards_where_angles_wrap_faces_ahead_between_its_sweeps():
+    """Along -x on a slope, swaying a little; a lidar beside its way sees one of its sides and its front."""
+    slope = Ground((0.1 * torch.arange(200.0))[None].expand(100, -1).contiguous(), (-100.0, -50.0), 1.0)
+    side = np.stack(np.meshgrid(np.linspace(-2.1, 2.1, 15), [-0.9], np.linspace(0.3, 1.5, 5)), -1).reshape(-1, 3)
+    front = np.stack(np.meshgrid([-2.1], np.linspace(-0.9, 0.9, 8), np.linspace(0.3, 1.5, 5)), -1).reshape(-1, 3)
+    skin, times = np.concatenate([side, front]), 100_000 * np.arange(15)
+    middles = np.stack([20.0 - np.arange(15), 6 + 0.05 * (np.arange(15) % 2)], 1)
+    found = []
+    for time, middle in zip(times.tolist(), middles, strict=True):
+        base = float(slope.height(torch.from_numpy(middle)))
+        found.append(Cluster(skin + [*middle, base], time, np.array([-40.0, -30.0, 0.0])))
+    track = boxed(found, slope, np.arange(0, 1_400_001, 50_000))
+    assert track is not None and track.label == "car" and (track.world_from_box[:, 0, 0] < -0.98).all()
+    path = track.trajectory()
+    at = np.stack([path.at(int(t))[:2, 3].numpy() for t in times])
+    assert np.abs(at - middles).max() < 0.25 and np.abs(track.size[:2] - [4.3, 1.8]).max() < 0.15
+    heights = slope.height(track.world_from_box[:, :2, 3])
+    torch.testing.assert_close(track.world_from_box[:, 2, 3], heights, atol=1e-6, rtol=0)
+
+
+def test_a_lidar_looks_from_where_it_stands_on_a_car_that_turned():
+    """Half a turn, 2 m before the body's middle: a wall in sight, and what stands before and behind it."""
+    ego = Trajectory(torch.tensor([0, 100_000]), torch.stack([translation(10.0, 3.0) @ yaw(angle) for angle in (2.0, 2.1)]))
+    mount, way = np.array([2.0, 0.0, 1.8]), np.array([np.cos(2.05), np.sin(2.05), 0.0])
+    eye = np.array([10.0, 3.0, 1.8]) + 2 * way
+    aside, up = (v.ravel() for v in np.meshgrid(np.linspace(-5, 5, 400), np.linspace(-1, 1, 40)))
+    wall = eye + 20 * way + aside[:, None] * [-way[1], way[0], 0] + up[:, None] * [0, 0, 1.0]
+    times = np.full(len(wall), 50_000)
+    times[:2] = 0, 100_000
+    image = range_image(LidarPoints(wall, times, np.zeros(len(wall), np.int64)), ego, mount)
+    np.testing.assert_allclose(image.middle, eye, atol=1e-6)
+    through, there = image.votes(np.stack([eye + far * way for far in (18.5, 20.0, 21.5)]))
+    assert through.tolist() == [True, False, False] and there.tolist() == [False, True, False]
