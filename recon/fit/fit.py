@@ -201,10 +201,10 @@ class Fit:
         shown = self.splats.select(self._in_sight(shot), self.sh_count())
         return self._render(shown, shot, partial(sample_equirect, self.sky), outputs=outputs)
 
-    def _in_sight(self, *shots: Shot) -> torch.Tensor:
+    def _in_sight(self, *shots: Shot, of: Splats | None = None) -> torch.Tensor:
         """Indices of the splats that any of the pictures may show."""
         eyes: list[Eye] = [(shot.camera, *shot.backs()) for shot in shots]
-        return in_sight(self.splats, eyes, {i for shot in shots for i in shot.near})
+        return in_sight(of or self.splats, eyes, {i for shot in shots for i in shot.near})
 
     def _render(
         self,
@@ -299,21 +299,22 @@ class Fit:
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 there.add(more, path)
 
-    def shown(self) -> Shown:
-        """What the pictures show of each splat."""
-        return self.shown_by(self.coarse(view).at_once() for view in self.training)
+    def shown(self, splats: Splats | None = None) -> Shown:
+        """What the pictures show of each splat; of others that stand in their place, where these are given."""
+        return self.shown_by((self.coarse(view).at_once() for view in self.training), splats)
 
     def coarse(self, view: View) -> Shot:
         """A training view, a quarter as large."""
         return self.motion.shot(view, self.targets.size(view, 4))
 
     @torch.no_grad()
-    def shown_by(self, shots: Iterable[Shot]) -> Shown:
+    def shown_by(self, shots: Iterable[Shot], splats: Splats | None = None) -> Shown:
         """What these show of each splat."""
-        shown = Shown.none(len(self.splats), self.device)
+        splats = splats or self.splats
+        shown = Shown.none(len(splats), self.device)
         for shot in shots:
-            which, camera = self._in_sight(shot), shot.camera
-            placed = self._placed(self.splats.select(which, 1), shot)
+            which, camera = self._in_sight(shot, of=splats), shot.camera
+            placed = self._placed(splats.select(which, 1), shot)
             shown.add(which, placed, camera, self.openings.beside_sky(shot.view, camera), scale_of(shot.view, camera))
         return shown
 

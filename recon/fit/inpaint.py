@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 from scipy.spatial import cKDTree
 
+from recon.fit.densify import joined, kept
 from recon.fit.fit import Fit
 from recon.fit.motion import Shot
 from recon.fit.openings import ASIDE
@@ -44,14 +45,28 @@ WITHIN = 1.6
 
 
 def background(fit: Fit) -> Gaussians:
-    """A fit's splats of the background by now, on the host; of one that is done with what only cameras beside the path see, by example."""
+    """A fit's splats of the background by now, on the host; of one that is done with what only cameras beside the path see, by example.
+
+    Copies of which pictures show something are left out, and a splat stays that would lose more than half of its copies so.
+    """
     splats = fit.splats.groups(fit.sh_count())[0].detach().to("cpu")
     if fit.progress < 1:
         return splats
     path, aside = fit.shown().part, fit.shown_by(_looks(fit)).part
     stands = off_ground(fit.splats, fit.population.ground) > LOW
-    hidden, known = (path < SEEN) & (aside >= SEEN) & stands, (path >= KNOWN) & stands
-    return inpainted(splats, hidden[: len(splats)].cpu(), known[: len(splats)].cpu(), fit.config.seed)
+    hidden, known = ((which & stands)[: len(splats)].cpu() for which in ((path < SEEN) & (aside >= SEEN), path >= KNOWN))
+    copies, of = by_example(splats, hidden, known, fit.config.seed)
+    if not len(copies):
+        return splats
+
+    goes = torch.zeros(len(path), dtype=torch.bool)
+    goes[of] = True
+    rest, _ = kept(fit.splats, {}, ~goes.to(path.device))
+    whole, _ = joined(rest, {}, [copies], [fit.splats.reach[of.to(path.device)].cpu()])
+    fine = (fit.shown(whole).part[rest.sizes[0] : whole.sizes[0]] < SEEN).cpu()
+    goes &= 2 * of[fine].bincount(minlength=len(path)) > of.bincount(minlength=len(path))
+    stays = (~goes[: len(splats)]).nonzero()[:, 0]
+    return Gaussians.cat([splats.select(stays), copies.select((fine & goes[of]).nonzero()[:, 0])])
 
 
 def _looks(fit: Fit) -> Iterator[Shot]:
@@ -62,30 +77,27 @@ def _looks(fit: Fit) -> Iterator[Shot]:
                 yield fit.motion.beside(shot, fit.openings.aside(view, shot.camera, part * ASIDE))
 
 
-def inpainted(splats: Gaussians, hidden: torch.Tensor, known: torch.Tensor, seed: int) -> Gaussians:
-    """The splats `[N]`, those `hidden` that are coarser than what is `known` around them, bool `[N]` both, replaced by copies of that.
+def by_example(splats: Gaussians, hidden: torch.Tensor, known: torch.Tensor, seed: int) -> tuple[Gaussians, torch.Tensor]:
+    """Copies of the splats `[N]` that are `known`, bool `[N]`, to stand for those `hidden` that are coarser than these are around them, and
+    the index of the one that each stands for.
 
     Copies keep size, rotation and opacity, and of their colour what does not turn with the view.
     """
-    examples = known.nonzero()[:, 0]
-    which = hidden.nonzero()[:, 0]
+    examples, which = known.nonzero()[:, 0], hidden.nonzero()[:, 0]
     if len(examples) < AROUND or not len(which):
-        return splats
+        return splats.select(which[:0]), which[:0]
     tree = cKDTree(splats.means[examples].numpy())
     away, around = tree.query(splats.means[which].numpy(), AROUND)
     large = splats.log_scales.topk(2, 1).values.sum(1).exp()  # as seen from where it is widest, but for a constant
     ratio = large[which] / large[examples][torch.from_numpy(around)].median(1).values
     blurs = (ratio > COARSER) & torch.from_numpy(away[:, 0] < NEAR)
-    which, ratio = which[blurs], ratio[blurs]
 
     generator = torch.Generator().manual_seed(seed)
-    copies = which.repeat_interleave((FILLED * ratio).clamp_max(MOST).round().long())
-    spread = splats.log_scales[copies].exp() * torch.randn(len(copies), 3, generator=generator).clamp(-WITHIN, WITHIN)
-    means = splats.means[copies] + (matrix_from_quat(splats.quats[copies]) @ spread[:, :, None])[:, :, 0]
+    of = which[blurs].repeat_interleave((FILLED * ratio[blurs]).clamp_max(MOST).round().long())
+    spread = splats.log_scales[of].exp() * torch.randn(len(of), 3, generator=generator).clamp(-WITHIN, WITHIN)
+    means = splats.means[of] + (matrix_from_quat(splats.quats[of]) @ spread[:, :, None])[:, :, 0]
     _, nearest = tree.query(means.numpy(), range(1, AMONG + 1))
-    any_one = torch.randint(0, AMONG, (len(copies), 1), generator=generator)
+    any_one = torch.randint(0, AMONG, (len(of), 1), generator=generator)
     like = splats.select(examples[torch.from_numpy(nearest).gather(1, any_one)[:, 0]])
     steady = torch.cat([like.sh[:, :1], torch.zeros_like(like.sh[:, 1:])], 1)
-    stays = torch.ones(len(splats), dtype=torch.bool)
-    stays[which] = False
-    return Gaussians.cat([splats.select(stays.nonzero()[:, 0]), replace(like, means=means, sh=steady)])
+    return replace(like, means=means, sh=steady), of

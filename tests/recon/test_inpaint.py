@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from quick_fit import SIZE
@@ -7,10 +9,12 @@ from recon.begin import begin
 from recon.defaults import choose
 from recon.fit import inpaint
 from recon.fit.config import FitConfig
-from recon.fit.inpaint import AMONG, NEAR, background, inpainted
+from recon.fit.inpaint import AMONG, NEAR, background, by_example
 from recon.fit.unseen import LOW, SEEN, off_ground
 from scenes import Gaussians
 from scenes.harmonics import sh_from_rgb
+
+EMPTY = torch.zeros(0, dtype=torch.int64)
 
 
 def wall(x, z, size, rgb, degree=4):
@@ -39,51 +43,81 @@ def half_hidden():
 
 def test_what_pictures_do_not_show_goes_on_like_what_is_beside_it():
     whole, hidden = half_hidden()
-    filled = inpainted(whole, hidden, ~hidden, 0)
-    copies = filled.select(torch.arange(len(whole) - 2, len(filled)))
-    assert torch.equal(filled.means[: len(whole) - 2], whole.means[:-2]), "what is known stays"
-    assert len(copies) > 20 and torch.allclose(copies.log_scales.exp().amax(1), torch.tensor(0.05))
+    copies, of = by_example(whole, hidden, ~hidden, 0)
+    assert len(copies) == len(of) > 20 and set(of.tolist()) == set(hidden.nonzero()[:, 0].tolist())
+    assert torch.allclose(copies.log_scales.exp().amax(1), torch.tensor(0.05))
     assert torch.equal(copies.logit_opacities, torch.full((len(copies),), 2.0))
-    assert (copies.means[:, 0] - 0.4).abs().max() < 0.6 and copies.means[:, 1].abs().max() < 0.06
+    away = (copies.means - whole.means[of]).abs()
+    assert away[:, ::2].max() < 0.5 and away[:, 1].max() < 0.05 and away[:, 0].max() > 0.3
     red = copies.sh[:, 0, 1] < 0
     assert red[copies.means[:, 2] < 0.6].all() and not red[copies.means[:, 2] > 1.4].any()
     assert not copies.sh[:, 1:].any(), "how others turn with the view says nothing of there"
-    assert torch.equal(filled.means, inpainted(whole, hidden, ~hidden, 0).means)
-    assert not torch.equal(filled.means, inpainted(whole, hidden, ~hidden, 1).means)
+    assert torch.equal(copies.means, by_example(whole, hidden, ~hidden, 0)[0].means)
+    assert not torch.equal(copies.means, by_example(whole, hidden, ~hidden, 1)[0].means)
 
 
-def test_as_fine_as_its_surroundings_or_far_from_all_that_is_known_it_stays():
+def test_what_is_as_fine_as_its_surroundings_or_far_from_all_that_is_known_has_no_copies():
     whole, hidden = half_hidden()
     fine = whole.log_scales.clone()
     fine[hidden] = torch.tensor([0.06, 0.006, 0.06]).log()
-    as_fine = Gaussians(whole.means, whole.quats, fine, whole.logit_opacities, whole.sh)
-    assert len(inpainted(as_fine, hidden, ~hidden, 0)) == len(whole)
     far = whole.means.clone()
     far[hidden, 0] += NEAR
-    away = Gaussians(far, whole.quats, whole.log_scales, whole.logit_opacities, whole.sh)
-    assert torch.equal(inpainted(away, hidden, ~hidden, 0).means, far)
     few = torch.arange(len(whole)) < AMONG
-    for known in (few, torch.zeros_like(few)):
-        assert len(inpainted(whole, hidden, known, 0)) == len(whole)
+    for splats, known in (
+        (replace(whole, log_scales=fine), ~hidden),
+        (replace(whole, means=far), ~hidden),
+        (whole, few),
+        (whole, torch.zeros_like(few)),
+    ):
+        copies, of = by_example(splats, hidden, known, 0)
+        assert len(copies) == len(of) == 0
 
 
-def test_only_a_finished_fit_is_filled_where_cameras_beside_the_path_look(drive, monkeypatch):
+@pytest.fixture
+def fit(drive):
     log = open_log(drive)
     names, span = choose(log)
     _, fit = begin(log, names, span, SIZE, FitConfig(steps=20, budget=2000), 4)
-    asked = []
-    monkeypatch.setattr(inpaint, "inpainted", lambda splats, hidden, known, seed: asked.append((hidden, known)) or splats)
+    return fit
+
+
+def test_only_a_finished_fit_is_filled_where_cameras_beside_the_path_look(fit, monkeypatch):
+    asked, eyes, shown_by = [], [], fit.shown_by
+    monkeypatch.setattr(
+        inpaint, "by_example", lambda splats, hidden, known, seed: asked.append((hidden, known)) or (splats.select(EMPTY), EMPTY)
+    )
     mine = fit.splats.sizes[0]
     assert len(background(fit)) == mine and not asked
     fit.step_count = fit.config.steps
-    eyes = []
-    shown_by = fit.shown_by
-    monkeypatch.setattr(fit, "shown_by", lambda shots: shown_by(eyes.append(s.camera.world_from_cam[:3, 3]) or s for s in shots))
+    monkeypatch.setattr(
+        fit, "shown_by", lambda shots, of=None: shown_by((eyes.append(s.camera.world_from_cam[:3, 3]) or s for s in shots), of)
+    )
     assert len(background(fit)) == mine
     ((hidden, known),) = asked
     assert hidden.shape == known.shape == (mine,) and hidden.any() and known.any() and not (hidden & known).any()
     assert (fit.shown().part[:mine][hidden] < SEEN).all()
     assert (off_ground(fit.splats, fit.population.ground)[:mine][hidden | known] > LOW).all()
     path = torch.stack([fit.motion.shot(v).camera.world_from_cam[:3, 3] for v in fit.training])
-    away = (torch.stack(eyes)[:, None] - path).detach().norm(dim=2).amin(1)
+    away = (torch.stack(eyes)[:, None] - path).norm(dim=2).amin(1).detach()
     assert float(away.max()) == pytest.approx(3, abs=0.2) and int((away > 1).sum()) >= 4
+
+
+def test_copies_that_pictures_show_are_left_out(fit, monkeypatch):
+    """Of three splats the first has copies where pictures look, the second where none does, the third most of them so."""
+    fit.step_count = fit.config.steps
+    splats = fit.splats.groups(1)[0].detach()
+    part = fit.shown().part[: len(splats)]
+    best, behind = int(part.argmax()), splats.means[part.argmax()] - torch.tensor([1000.0, 0, 0])
+
+    def made(splats, hidden, known, seed):
+        of = torch.tensor([5, 5, 5, 7, 7, 7, 9, 9, 9])
+        seen = torch.tensor([1, 1, 0, 0, 0, 0, 1, 0, 0]) > 0
+        copies = splats.select(torch.full((len(of),), best))
+        return replace(copies, means=torch.where(seen[:, None], copies.means, behind)), of
+
+    monkeypatch.setattr(inpaint, "by_example", made)
+    filled = background(fit)
+    assert len(filled) == len(splats) - 2 + 5
+    assert torch.equal(filled.means[-5:], behind.expand(5, 3))
+    left = {tuple(m) for m in filled.means.tolist()}
+    assert [tuple(splats.means[i].tolist()) in left for i in (5, 7, 9)] == [True, False, False]
