@@ -246,7 +246,9 @@ def _composite(pixels, lens: Lens, there, depths, mean, conic, opacity, colour, 
             keys = ray_depths(*there, lens.unproject(pixels), lens.origins(pixels)).nan_to_num()
     else:
         keys = depths.expand_as(alpha)
-    first = keys.detach().argsort(dim=1, stable=True)
+    # places that are equal, as on pixels that no ray leads to, keep the centres' order
+    by_depth = depths.detach().argsort(stable=True)
+    first = by_depth[keys.detach()[:, by_depth].argsort(dim=1, stable=True)]
     sorted_alpha = alpha.gather(1, first)
     passing = torch.cumprod(1 - sorted_alpha, 1)
     before = torch.cat([torch.ones(len(pixels), 1, dtype=torch.float64), passing[:, :-1]], 1)

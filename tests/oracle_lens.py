@@ -58,9 +58,10 @@ def readout(lens: Lens, camera: Camera, pose: PoseAt, x: torch.Tensor, shift: to
         s = torch.where(found, s, halved)
     with torch.enable_grad():
         leaf = s.detach().requires_grad_()
-        (rate,) = torch.autograd.grad(where(leaf).sum(), leaf)
+        (rate,) = torch.autograd.grad(where(leaf).sum(), leaf, allow_unused=True)
+    rate = torch.zeros_like(s) if rate is None else rate.detach()  # of what stands still while others move
     inside = (s > 0) & (s < 1)
-    return torch.where(inside, s + (where(s) - s) / (1 - rate.detach()), s)
+    return torch.where(inside, s + (where(s) - s) / (1 - rate), s)
 
 
 def pulled_back(lens: Lens, centre: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:

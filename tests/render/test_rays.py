@@ -10,7 +10,7 @@ from render import RenderConfig, rasterize
 from render.canonical import canonical_frames
 from render.kernels.types import Wanted
 from render.settings import Settings
-from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
+from scenes import Camera, Gaussians, OpenCV, Pinhole, Placed, SplatModel
 from scenes.lenses import Fisheye
 from scenes.poses import pose_from, translation
 from tests import oracle
@@ -113,6 +113,22 @@ def test_gradients_agree_with_the_oracle(way):
     model, order = WAYS[way]
     for seed in (2, 3):
         assert_gradients(two_instances(seed), CAMERA, model, order)
+
+
+def test_pixels_that_no_ray_leads_to_keep_the_centres_order():
+    """Past the fold of a lens, where footprints still reach: there no splat has a place along the ray."""
+    lens = OpenCV(17.0, 20.0, 3.0, -2.0, -0.31)
+    camera = Camera(lens, 33, 33, torch.eye(4, dtype=torch.float64))
+    dark = (lens.unproject(camera.pixel_centres()) == 0).all(-1)
+    placed = [Placed(random_splats(120, 15), translation(0.8, 0.6, 2.0))]
+    with torch.no_grad():
+        rgb, alpha, _, _, unsure = oracle.render(
+            oracle.as_oracle(placed), camera, SplatModel(), cutoff=1 / 255, alpha_max=0.999, order="pixel"
+        )
+    by_pixel, by_tile = (rasterize(placed, camera, config=RenderConfig(termination=0, order=o)).rgb for o in ("pixel", "tile"))
+    assert (alpha[dark] > 0.1).sum() > 5
+    assert largest(by_pixel, rgb, ~unsure) < 5e-6 * max(1.0, float(rgb.max()))
+    assert torch.allclose(by_pixel[dark], by_tile[dark], atol=1e-5)
 
 
 EYES = {
