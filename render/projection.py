@@ -15,6 +15,7 @@ import warp as wp
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.kernels.lenses.optics import PARAMS, Optics
 from render.kernels.lenses.optics import params as vec_params
+from render.kernels.motion import POWERS
 from render.kernels.project import project, project_backward
 from render.kernels.project_lens import POSE, lens_kernels
 from render.kernels.types import View
@@ -31,14 +32,12 @@ NEAR = 0.1
 """Metres in front of the camera within which a splat's centre is not drawn; around it, for a lens that sees all around."""
 
 LARGEST_TURN = math.radians(60)
-"""How far a pose may turn while the image is read out: beyond, its cubic (`kernels/motion.py`) is off by more than 6e-4 of a radian."""
-
-POWERS = 4
-"""Of the readout's share, with which a pose that moves is written."""
+"""How far a pose may turn while the image is read out: where camera and instance both do, against each other, what the kernels write
+their motion by (`kernels/motion.py`) is off by 1e-4 of a radian."""
 
 _NODES = torch.linspace(0, 1, POWERS, dtype=torch.float64)
-_CUBIC = torch.linalg.inv(_NODES[:, None] ** torch.arange(POWERS))
-"""Coefficients of the cubic through values at the nodes."""
+_POLYNOMIAL = torch.linalg.inv(_NODES[:, None] ** torch.arange(POWERS))
+"""Coefficients of the polynomial through values at the nodes."""
 
 
 def moves(camera: Camera, placed: Sequence[Placed]) -> bool:
@@ -54,14 +53,14 @@ def poses(camera: Camera, placed: Sequence[Placed]) -> torch.Tensor:
         return (inverse(camera.world_from_cam) @ torch.stack([p.world_from_local for p in placed]))[:, None]
     cam_from_world = inverse(_along(camera.world_from_cam, camera.world_from_cam_end))
     nodes = torch.stack([cam_from_world @ _along(p.world_from_local, p.world_from_local_end) for p in placed])
-    return torch.einsum("kn,pnij->pkij", _CUBIC.to(nodes.device), nodes)
+    return torch.einsum("kn,pnij->pkij", _POLYNOMIAL.to(nodes.device), nodes)
 
 
 def _along(start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:
-    """The pose `[4, 4, 4]` at the cubic's nodes."""
+    """The pose `[POWERS, 4, 4]` at the polynomial's nodes."""
     if end is None:
-        return start.expand(4, 4, 4)
-    return interpolate(start.expand(4, 4, 4), end.expand(4, 4, 4), _NODES.to(start.device))
+        return start.expand(POWERS, 4, 4)
+    return interpolate(start.expand(POWERS, 4, 4), end.expand(POWERS, 4, 4), _NODES.to(start.device))
 
 
 def check_ends(camera: Camera, placed: Sequence[Placed]) -> None:

@@ -11,7 +11,7 @@ import warp as wp
 from render.kernels.fields import exp_scale, rotation, rotation_backward, sigmoid
 from render.kernels.lenses import PARALLEL, PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import PARAMS, Optics, params
-from render.kernels.motion import motion_of, rotation_at, rotation_rate, translation_rate
+from render.kernels.motion import POWERS, motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
 from render.kernels.sight import column, sight_functions
@@ -126,10 +126,14 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
         g_r1 = wp.mat33d()
         g_r2 = wp.mat33d()
         g_r3 = wp.mat33d()
+        g_r4 = wp.mat33d()
+        g_r5 = wp.mat33d()
         g_t0 = wp.vec3d()
         g_t1 = wp.vec3d()
         g_t2 = wp.vec3d()
         g_t3 = wp.vec3d()
+        g_t4 = wp.vec3d()
+        g_t5 = wp.vec3d()
         g_lens = params()
         one = wp.float64(1.0)
         none = wp.float64(0.0)
@@ -206,12 +210,21 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         turn = wp.mat33d(motion.r0)
                         if wp.static(rolling):
                             turn = rotation_at(motion, s)
-                            g_r1 += s * by_pose
-                            g_t1 += s * g_y
-                            g_r2 += s * s * by_pose
-                            g_t2 += s * s * g_y
-                            g_r3 += s * s * s * by_pose
-                            g_t3 += s * s * s * g_y
+                            power = wp.float64(s)
+                            g_r1 += power * by_pose
+                            g_t1 += power * g_y
+                            power *= s
+                            g_r2 += power * by_pose
+                            g_t2 += power * g_y
+                            power *= s
+                            g_r3 += power * by_pose
+                            g_t3 += power * g_y
+                            power *= s
+                            g_r4 += power * by_pose
+                            g_t4 += power * g_y
+                            power *= s
+                            g_r5 += power * by_pose
+                            g_t5 += power * g_y
                         g_shift += g_y
                         g_point = wp.transpose(turn) * g_y
                         g_x += g_point
@@ -259,12 +272,21 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 g_r0 += by_pose
                 g_t0 += g_t
                 if wp.static(rolling):
-                    g_r1 += c.s * by_pose
-                    g_t1 += c.s * g_t
-                    g_r2 += c.s * c.s * by_pose
-                    g_t2 += c.s * c.s * g_t
-                    g_r3 += c.s * c.s * c.s * by_pose
-                    g_t3 += c.s * c.s * c.s * g_t
+                    power = wp.float64(c.s)
+                    g_r1 += power * by_pose
+                    g_t1 += power * g_t
+                    power *= c.s
+                    g_r2 += power * by_pose
+                    g_t2 += power * g_t
+                    power *= c.s
+                    g_r3 += power * by_pose
+                    g_t3 += power * g_t
+                    power *= c.s
+                    g_r4 += power * by_pose
+                    g_t4 += power * g_t
+                    power *= c.s
+                    g_r5 += power * by_pose
+                    g_t5 += power * g_t
                 g_x += wp.transpose(c.rotation) * g_t
                 if optics.period > none:
                     g_lens[0] = g_lens[0] + TURN * g_turns
@@ -280,7 +302,9 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
             write_pose(g_uniform, part, 1, g_r1, g_t1)
             write_pose(g_uniform, part, 2, g_r2, g_t2)
             write_pose(g_uniform, part, 3, g_r3, g_t3)
+            write_pose(g_uniform, part, 4, g_r4, g_t4)
+            write_pose(g_uniform, part, 5, g_r5, g_t5)
         for k in range(PARAMS):
-            g_uniform[part, wp.static(POSE * (4 if rolling else 1)) + k] = float(g_lens[k])
+            g_uniform[part, wp.static(POSE * (POWERS if rolling else 1)) + k] = float(g_lens[k])
 
     return LensKernels(project_lens, project_lens_backward)
