@@ -18,8 +18,8 @@ class RenderConfig:
 
     alpha_cutoff: contributions below it are skipped; alpha_max: no splat is more opaque;
     termination: a pixel is finished when this much light still passes; faint: splats less opaque than this are drawn out to
-    a cutoff that is less by as much. max_error: the largest error of a pixel's colour, but where
-    hundreds of splats stand in one line of sight; it sets all these, and order "pixel" (`render/budget.py`).
+    a cutoff that is less by as much. max_error: the largest error of a pixel's colour; it sets all these, the cutoff
+    lower the more splats there are, and order "pixel" (`render/budget.py`).
     order: "tile", by the depth of the splats' centres, unless told; or "pixel", by where each pixel's own ray meets them: nothing pops.
     most_entries: splat-tile entries that are drawn at once; it bounds memory and changes no pixel (`render/chunks.py`).
     """

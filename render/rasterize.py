@@ -139,6 +139,7 @@ def _draw(
         mask=None if mask is None else mask.to(placed[0].gaussians.device),
         gradients=torch.is_grad_enabled(),
         room=room,
+        splats=sum(len(p.gaussians) for p in placed),
     )
     frames = rays = None
     if settings.by_rays:

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import torch
 
+from render.budget import cutoff
 from render.frame_types import RenderConfig
 from render.kernels.types import TILE, Wanted
 from render.launch import stream_of
@@ -22,7 +23,8 @@ class Settings:
 
     crop: x, y, width, height of the part of the image that is drawn, in pixels; all of it where None. mask bool `[H, W]` of the whole
     image: which pixels are drawn. gradients: whether any may be asked for, of anything. looks: of each instance, which of the rays look
-    at it. room: for tile lists whose length is not asked for.
+    at it. room: for tile lists whose length is not asked for. splats: how many there are, seen or not, among which a budget
+    of error is divided.
     """
 
     width: int
@@ -39,6 +41,7 @@ class Settings:
     gradients: bool = True
     looks: tuple[int, ...] = ()
     room: Room | None = None
+    splats: int = 0
 
     @property
     def part(self) -> tuple[int, int, int, int]:
@@ -77,7 +80,8 @@ class Settings:
 
     @property
     def cutoff(self) -> float:
-        return max(self.config.alpha_cutoff, 1e-10)
+        budget = self.config.max_error
+        return max(self.config.alpha_cutoff if budget is None else cutoff(budget, self.splats), 1e-10)
 
     @property
     def by_rays(self) -> bool:

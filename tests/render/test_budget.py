@@ -16,7 +16,7 @@ from render.cull import in_sight
 from render.kernels.types import Wanted
 from render.rays import exact_rays
 from render.settings import Settings
-from scenes import Camera, Pinhole, Placed, SplatModel
+from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.poses import matrix_from_quat, translation
 from tests import oracle
 from tests.bench.culling import those_in_sight
@@ -75,6 +75,16 @@ def test_random_scenes_keep_every_budget(part):
 def test_a_fog_of_splats_below_the_cutoff_keeps_every_budget(seed):
     placed, model = fog(seed)
     assert_kept(placed, CAMERA, model, f"fog {seed}")
+
+
+@pytest.mark.parametrize("response", ["conic", "ray"])
+def test_a_stack_keeps_every_budget(response):
+    """Hundreds of splats in one line of sight, all of whose tails fall on the same pixels: each may leave out its part of the budget."""
+    n = 400
+    means = torch.stack([torch.zeros(n), torch.zeros(n), torch.linspace(5, 5.5, n)], 1)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    g = Gaussians(means, quats, torch.full((n, 3), -1.6), torch.zeros(n), torch.ones(n, 1, 3))
+    assert_kept([Placed(g, torch.eye(4, dtype=torch.float64))], CAMERA, SplatModel(response=response), "stack")
 
 
 def test_the_uniform_preset_keeps_every_budget():
