@@ -3,8 +3,8 @@
 A ray sees a splat within exponent s_max where it meets the ellipsoid of sqrt(2 s_max) sigma, so what the image shows is the outline of
 that ellipsoid. A pinhole's is an ellipse, by its dual conic: in coordinates that move with the centre's ray it is
 rho^2 Sigma' - diag(0, 0, z^2), rho^2 = 2 s_max, of which nothing cancels. Another lens, or a shutter that moves, takes the circle in which
-the cone from the eye touches the ellipsoid to a curve; the bound goes around points of it, with room. What reaches around the eye or
-past the lens's domain may be seen everywhere.
+the cone from the eye touches the ellipsoid to a curve; the bound goes around points of it, with room. What reaches around the eye, past
+the lens's domain or far beside the view may be seen everywhere.
 """
 
 from functools import cache
@@ -96,6 +96,14 @@ def pinhole_bound(t: wp.vec3d, axes: wp.mat33d, s_max: float, view: View):
     )  # fmt: skip
 
 
+@wp.func
+def beside(y: wp.vec3d, view: View):
+    """Whether a point before the camera lies beyond 1.3 times half the view. Distortion says nothing there, and of an outline that runs
+    away to the side few points show where it comes by."""
+    x_out = y[0] < wp.float64(view.clamp_left) * y[2] or y[0] > wp.float64(view.clamp_right) * y[2]
+    return x_out or y[1] < wp.float64(view.clamp_top) * y[2] or y[1] > wp.float64(view.clamp_bottom) * y[2]
+
+
 @cache
 def lens_bound(lens: LensFunctions, rolling: bool):
     """The function that bounds a splat for a lens under a global or a moving shutter."""
@@ -144,7 +152,7 @@ def lens_bound(lens: LensFunctions, rolling: bool):
             point = x + axes * q
             s = readout(o, m, point, wp.vec3d())
             y = placed(m, point, wp.vec3d(), s)
-            if not inside(o, y) or (wp.static(depth == PLANAR) and y[2] <= NEARLY * c.t[2]):
+            if not inside(o, y) or (wp.static(depth == PLANAR) and (y[2] <= NEARLY * c.t[2] or beside(y, view))):
                 return everywhere(s_max, view)
             d = pixel(o, y) - at
             dx = d[0] - nearest(o, d[0]) * o.period

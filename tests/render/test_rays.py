@@ -18,7 +18,7 @@ from tests.bench.presets import random_splats
 from tests.render.test_cuda import keep_forward
 from tests.render.test_lenses import LENSES, around, camera_of
 from tests.render.test_outputs import leaves
-from tests.render.test_rasterize import CAMERA, EXACT, assert_gradient, largest, two_instances
+from tests.render.test_rasterize import CAMERA, EXACT, assert_gradient, largest, off_axis_and_close, two_instances
 from tests.render.test_shutter import PINHOLE, driven, traffic
 
 RAY = SplatModel(response="ray")
@@ -113,6 +113,17 @@ def test_gradients_agree_with_the_oracle(way):
     model, order = WAYS[way]
     for seed in (2, 3):
         assert_gradients(two_instances(seed), CAMERA, model, order)
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_splats_that_reach_far_beside_the_view_are_drawn_within_it(seed):
+    """Where distortion sends the outline's points anywhere, no ellipse around them bounds the splat."""
+    camera = Camera(OpenCV(16.0, 17.6, 2.0, 19.0, 0.2, -0.046, 0.0, 0.0, 0.005), 34, 38, torch.eye(4, dtype=torch.float64))
+    placed = off_axis_and_close(seed)
+    with torch.no_grad():
+        rgb, *_, unsure = oracle.render(oracle.as_oracle(placed), camera, RAY, cutoff=1 / 255, alpha_max=0.999)
+    drawn = rasterize(placed, camera, ("rgb",), model=RAY, config=RenderConfig(termination=0)).rgb
+    assert largest(drawn, rgb, ~unsure) < 5e-6 * max(1.0, float(rgb.max()))
 
 
 def test_pixels_that_no_ray_leads_to_keep_the_centres_order():
