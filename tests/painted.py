@@ -26,9 +26,12 @@ CAMERAS = {"front": 0.0, "left": 0.5}
 BOARD, AHEAD, STRIDE = 1.6, 9.0, 0.5
 """Side of a painted board that crosses the street, how far ahead of the first camera, and its metres a picture."""
 
+LONG = 4.3
+"""Metres that the flanks of what goes along the street are long."""
+
 
 Rear = Callable[[float], tuple[float, float]]
-"""At seconds, how far ahead of the first camera and to its left a board's right edge is."""
+"""At seconds, how far ahead of the first camera and to its left the right edge of a car's painted end is."""
 
 
 def board_left(index: int) -> float:
@@ -45,19 +48,31 @@ def depth_of(camera: Camera) -> torch.Tensor:
     return torch.minimum(ground, wall)
 
 
-def _picture(camera: Camera, blotches: torch.Tensor, boards: list[tuple[float, float, float]]) -> Packed:
+def _picture(camera: Camera, blotches: torch.Tensor, boards: list[tuple[float, float, float, float]]) -> Packed:
     """Both painted with blotches of a third of a metre, and boards, brighter, so far ahead, with their right lower corners so far left and
-    up."""
+    up, and flanks so long behind them."""
     rays, depth = world_directions(camera).double(), depth_of(camera)
     eye = camera.world_from_cam[:3, 3]
     at = eye + rays * depth[..., None]
     plane = torch.where((at[..., 2] < 1e-6)[..., None], at[..., :2], at[..., 1:] + 50)
     image = _painted(blotches, plane)
-    for ahead, left, up in boards:
+    for ahead, left, up, long in boards:
         at = eye + rays * ((ahead - eye[0]) / rays[..., 0])[..., None]
         plane = at[..., 1:] - torch.tensor([left, up])
         hit = ((plane > 0) & (plane < BOARD)).all(-1) & (rays[..., 0] > 0) & (eye[0] < ahead)
         image = torch.where(hit[..., None], 0.5 + 0.5 * _painted(blotches, plane + 20), image)
+        # the flank that looks at us, if one does
+        side = left if eye[1] < left else left + BOARD
+        depth = (side - eye[1]) / rays[..., 1]
+        at = eye + rays * depth[..., None]
+        plane = at[..., ::2] - torch.tensor([ahead, up])
+        hit = (
+            (depth > 0)
+            & (plane > 0).all(-1)
+            & (plane < torch.tensor([long, BOARD])).all(-1)
+            & ((eye[1] - left) * (eye[1] - left - BOARD) > 0)
+        )
+        image = torch.where(hit[..., None], 0.5 + 0.5 * _painted(blotches, plane - 20), image)
     buffer = BytesIO()
     Image.fromarray((image * 255).byte().numpy()).save(buffer, "png")
     return Packed("painted", buffer.getvalue)
@@ -71,7 +86,7 @@ def _painted(blotches: torch.Tensor, plane: torch.Tensor) -> torch.Tensor:
 def drive(
     steps: list[float], names: tuple[str, ...] = tuple(CAMERAS), board: bool = False, rears: Sequence[Rear] = (), step_us: int = 100_000
 ) -> Log:
-    """The drive whose pictures are taken after so many metres each, `step_us` apart. rears: boards that stand on the ground."""
+    """The drive whose pictures are taken after so many metres each, `step_us` apart. rears: cars' ends on the ground, with flanks."""
     blotches = torch.rand(1, 3, 600, 600, generator=torch.Generator().manual_seed(0))
     lens, times = Pinhole(160, 160, 160, 90), torch.arange(len(steps)) * step_us
     bodies = torch.stack([translation(x, x / 12, HEIGHT) for x in np.cumsum(steps)])
@@ -79,8 +94,8 @@ def drive(
     for name in names:
         poses = bodies @ yaw(CAMERAS[name]) @ inverse(CAM_FROM_FLU)
         views = [Camera(lens, *SIZE, pose) for pose in poses]
-        crossing = [[(AHEAD, board_left(i), 0.3)] if board else [] for i in range(len(views))]
-        going = [[(*rear(float(t) / 1e6), 0.0) for rear in rears] for t in times]
+        crossing = [[(AHEAD, board_left(i), 0.3, 0.0)] if board else [] for i in range(len(views))]
+        going = [[(*rear(float(t) / 1e6), 0.0, LONG) for rear in rears] for t in times]
         pictures = tuple(_picture(v, blotches, a + b) for v, a, b in zip(views, crossing, going, strict=True))
         cameras[name] = LogCamera(name, lens, *SIZE, pictures, times, poses)
     return Log("bare", Path("bare"), cameras, (), (), Trajectory(times, bodies), {}, names)

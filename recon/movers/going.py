@@ -21,7 +21,7 @@ OFF, CUT = (0.08, 0.012), (0.25, 0.25)
 anything of it."""
 
 PACES = 2.5, 0.5
-"""Metres a second by which speeds are off, along the street, and across, where it is taken for nothing."""
+"""Metres a second by which speeds are off, along the street and across."""
 
 KEEPS = 6.0
 """How much less it is pushed across the street than along it."""
@@ -74,7 +74,7 @@ def _in_lane(thing: Sequence[Sighting], eyes: np.ndarray, stamps: np.ndarray, la
     places = np.array([lane.of(torch.from_numpy(s.place)) for s in thing])
     # what is pushed less across is smoothed as if it were so much wider
     wider = np.array([1.0, KEEPS])
-    paces = np.array([[s.speed, 0.0] for s in thing]), wider * PACES
+    paces = wider * [[s.speed, s.aside] for s in thing], wider * PACES
     seconds = np.array([s.time_us for s in thing]) / 1e6
     return smoothed(seconds, places * wider, stamps / 1e6, told / np.outer(wider, wider), paces) / wider
 

@@ -4,17 +4,20 @@ A thing that goes along with the camera looks like a standing one elsewhere: far
 smaller where it comes. But it stands on the ground, and what it hides of that tells where. So each place on the ground is asked whether
 what stands there looks alike in all pictures if it moves, and more so than anything that stands still could; and whether the ground before
 it is seen (a plane sweep, Collins 1996, over places and speeds).
+
+From aside a car shows its end that looks at us and a flank. Its place is the one at which both together have the outline that is seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import ndimage
 
+from recon.movers.boxing import CAR
 from recon.seeds.dense import FARTHEST, ground_depth
 from recon.seeds.stereo import WINDOW, Plate, box_means, unlike
 from scenes.ground import Ground
@@ -24,6 +27,10 @@ DISTANCES = 4.5 * 1.09 ** np.arange(27)
 
 ONCOMING, PASSING = 20, 12
 """Metres a second at which things come towards us at most, and by which they go faster than we do."""
+
+DRIFTS = np.arange(-4, 4.1, 1.0), np.arange(-1.5, 1.6, 0.25)
+"""Metres a second by which a thing may go faster than what suits the street's direction best, and leftwards: the other lane may lead three
+degrees elsewhere, and far aside a drift of half a metre a second looks like more than one less along the street."""
 
 SLOWEST = 1.5
 """Metres a second from which on something is believed to move."""
@@ -43,25 +50,51 @@ UNDER, NEARER = 0.87, 1.12
 WORTH, GROUNDED = 0.07, 0.04
 """By how much a thing must look more alike than what stands still, and the ground before it than if the thing went on there."""
 
+LIKE = 1.5
+"""Times as wide, or as narrow, as a car that what is taken for one may look."""
+
+HIDDEN, HIDING = 0.07, 1.3
+"""By how much something that stands nearer, by this part of inverse depth at least, may look more alike than the ground before a thing:
+what hides that hides its foot, and a tree behind a parked car seems to come."""
+
 APART = 0.6
 """Of a rear's width: two things in a picture are that far apart at least."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """Something that moves, in a picture at `time_us`: where the middle of what is seen of it stands `[2]`, the street's direction there
-    `[2]`, how far ahead of the camera that is, and its speed along the street in m/s; by how much it looks more alike than what stands
-    still, `worth`, and the ground before it than if it went on there, `grounded`. cut: whether the picture's border is so near that there
-    may be more of it beyond."""
+    """Something that moves, in a picture at `time_us`: where the middle of its end that looks at us stands `[2]`, the street's direction
+    there `[2]`, how far ahead of the camera what is seen of it is, and its speeds along the street and to its left in m/s, `speed` and
+    `aside`; by how much it looks more alike than what stands still, `worth`, and the ground before it than if it went on there, `grounded`.
+    cut: whether the picture's border is so near that there may be more of it beyond."""
 
     time_us: int
     place: np.ndarray
     along: np.ndarray
     away: float
     speed: float
+    aside: float
     worth: float
     grounded: float
     cut: bool
+
+    @property
+    def axes(self) -> np.ndarray:
+        """The directions `[2, 2]` of the street and to its left."""
+        return np.array([self.along, [-self.along[1], self.along[0]]])
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A sighting, `one`, of what so many columns `across` show around x, in `rows`; how good it is, `score`; and by how much each of all
+    columns looks more alike than what stands still, `worths` `[w]`."""
+
+    score: float
+    one: Sighting
+    x: int
+    across: int
+    rows: slice
+    worths: np.ndarray
 
 
 def sightings(
@@ -82,7 +115,7 @@ def sightings(
         base = _base(plate, ground, z)
         rows = slice(max(0, round(base - REAR[1] * plate.focal[1] / z)), round(base + BEFORE * plate.focal[1] / z) + 1 + WINDOW // 2)
         bottom = round(base) - rows.start
-        before = slice(bottom + WINDOW // 2, None)  # squares around pixels next to a thing show it, too
+        before = slice(bottom + WINDOW // 2, None)
         if bottom < WINDOW or len(of_ground[rows][before]) < 2:
             continue
         along = _along(path, eye[:2] + z * plate.axis()[:2])
@@ -91,22 +124,70 @@ def sightings(
         allowed = (inverse_depths[:, None, None] <= NEARER / z) & (inverse_depths[:, None, None] >= UNDER / torch.from_numpy(deepest[rows]))
         stands = np.minimum(torch.where(allowed, standing[:, rows], torch.inf).amin(0).numpy(), of_ground[rows])
         across = max(1, round(REAR[0] * plate.focal[0] / z))
-        as_mover = _beside(moving[:, :bottom].mean(1), across)
-        best, column = as_mover.argmin(0), np.arange(len(stands[0]))
-        worth = _beside(stands[:bottom].mean(0), across) - as_mover[best, column]
+        worths = stands[:bottom].mean(0) - moving[:, :bottom].mean(1)
+        best, column = _beside(worths, across).argmax(0), np.arange(len(stands[0]))
+        worth = _beside(worths, across)[best, column]
         grounded = _beside((moving[:, before] - of_ground[rows][before]).mean(1), across)[best, column]
-        fits = (worth > WORTH) & (grounded > GROUNDED) & (np.abs(speeds[best]) >= SLOWEST)
+        hidden = _beside(of_ground[rows][before].mean(0), across) - hiding(standing[:, rows][:, before], inverse_depths * z, across)
+        fits = (worth > WORTH) & (grounded > GROUNDED) & (hidden < HIDDEN) & (np.abs(speeds[best]) >= SLOWEST)
         for x in np.flatnonzero(fits):
             ray = np.array([(x + 0.5 - plate.centre[0]) / plate.focal[0], 0.0, 1.0]) @ plate.cam_from_world[:3, :3]
             cut = not across < x < len(stands[0]) - across
-            told = float(z), float(speeds[best[x]]), float(worth[x]), float(grounded[x])
+            told = float(z), float(speeds[best[x]]), 0.0, float(worth[x]), float(grounded[x])
             one = Sighting(time_us, (eye + z * ray)[:2], along, *told, cut)
-            found.append((float(worth[x] + min(grounded[x], worth[x])), int(x), across, z, one))
-    kept: list[tuple[float, int, int, float, Sighting]] = []
-    for new in sorted(found, key=lambda f: -f[0]):
-        if all(abs(new[1] - old[1]) > APART * max(new[2], old[2]) for old in kept):
+            score = float(worth[x] + min(grounded[x], worth[x]))
+            found.append(_Found(score, one, int(x), across, slice(rows.start, rows.start + bottom), worths[best[x]]))
+    kept: list[_Found] = []
+    for new in sorted(found, key=lambda f: -f.score):
+        if all(abs(new.x - old.x) > APART * max(new.across, old.across) for old in kept):
             kept.append(new)
-    return [one for *_, z, one in kept if z < DISTANCES[-1]]
+    return [_refined(plate, sides, new) for new in kept if new.one.away < DISTANCES[-1]]
+
+
+def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: _Found) -> Sighting:
+    """A sighting at the place that its outline tells, with its speeds along the street and across it."""
+    one, shown = found.one, slice(max(0, found.x - found.across // 2), found.x + found.across // 2 + 1)
+    seen = [_shown(plate, x, one) for x in (found.x, *outline(found.worths, shown))]
+    part = replace(plate, grey=plate.grey[:, shown], centre=(plate.centre[0] - shown.start, plate.centre[1]))
+    speeds = np.stack(np.meshgrid(one.speed + DRIFTS[0], DRIFTS[1]), -1).reshape(-1, 2)
+    flat = np.column_stack([speeds @ one.axes, np.zeros(len(speeds))])
+    ways = [[(other, flat * (t - one.time_us) / 1e6) for other, t in side] for side in sides]
+    speed, aside = speeds[int(unlike(part, ways, found.rows, one.away).mean((1, 2)).argmin())]
+    return replace(one, place=plate.eye()[:2] + facing_us(*seen) @ one.axes, speed=float(speed), aside=float(aside))
+
+
+def outline(worths: np.ndarray, shown: slice) -> tuple[int, int]:
+    """The first and last column of a thing that some columns show: by how much all look more alike, `worths` `[w]`, is there at least half
+    of what it is in these."""
+    smooth = _beside(worths, WINDOW)
+    less = np.flatnonzero(smooth < worths[shown].mean() / 2)
+    k = int(np.searchsorted(less, shown.start + int(smooth[shown].argmax())))
+    return (int(less[k - 1]) + 1 if k else 0), (int(less[k]) - 1 if k < len(less) else len(worths) - 1)
+
+
+def facing_us(seen: np.ndarray, *ends: np.ndarray) -> np.ndarray:
+    """Where the middle of that end of a car is that looks at us, `[2]` along the street and to its left of us: some of the car is seen
+    standing at a place, and the ends of its outline, those of its end and its flank together, in the directions of two more, each `[2]` so.
+    The place itself where that outline is as wide as no car's."""
+    if min(seen[0], *(end[0] for end in ends)) <= 0:
+        return seen
+    side = float(np.sign(ends[0][1] + ends[1][1])) or 1.0
+    inner, outer = sorted(float(side * end[1] / end[0]) for end in ends)
+    here, ahead, wide = float(side * seen[1] / seen[0]), float(seen[0]), CAR[1] / 2
+    for _ in range(5):
+        part, middle = ahead / (ahead + CAR[0]), (outer + inner) / 2 * ahead
+        left = max(middle, (2 * middle - (1 - part) * wide) / (1 + part))
+        # what is seen stands farther ahead than the end does where it is some of the flank
+        stands = max(ahead, (left - wide) / here) if here > 0 else ahead
+        ahead += float(seen[0]) - min(stands, ahead + CAR[0])
+    usual = left + wide - (left - wide) * (part if left > wide else 1.0)
+    return np.array([ahead, side * left]) if 1 / LIKE < (outer - inner) * ahead / usual < LIKE else seen
+
+
+def _shown(plate: Plate, column: int, one: Sighting) -> np.ndarray:
+    """What a column shows as far ahead as a sighting, `[2]` along the street and to its left of the camera."""
+    ray = np.array([(column + 0.5 - plate.centre[0]) / plate.focal[0], 0.0, 1.0]) @ plate.cam_from_world[:3, :3]
+    return one.axes @ (one.away * ray[:2])
 
 
 def _base(plate: Plate, ground: Ground, z: float) -> float:
@@ -116,6 +197,13 @@ def _base(plate: Plate, ground: Ground, z: float) -> float:
     at[:, 2] = ground.height(torch.from_numpy(at[:, :2].copy())).numpy()
     local = (at - plate.eye()) @ plate.cam_from_world[:3, :3].T
     return float(np.median(local[:, 1] / local[:, 2] * plate.focal[1] + plate.centre[1]))
+
+
+def hiding(standing: torch.Tensor, nearer: torch.Tensor, across: int) -> np.ndarray:
+    """What it costs to take what windows around columns show for something that stands before a thing, `[w]`: the least of the costs
+    `standing` `[D, rows, w]` of depths that are `HIDING` times `nearer` `[D]` than that."""
+    costs = standing[nearer > HIDING].mean(1).numpy()
+    return _beside(costs, across).min(0, initial=np.inf)
 
 
 def _along(path: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -139,7 +139,8 @@ def _apart(thing: list[Sighting], s: Sighting) -> float:
     """How far a sighting is from where a thing should be: the sum of what it is off in parts of what is allowed; 9 where that is more."""
     last = thing[-PACE:]
     speed = float(np.mean([k.speed for k in last]))
-    place = np.mean([k.place + k.along * speed * (s.time_us - k.time_us) / 1e6 for k in last], axis=0)
+    velocity = np.mean([[k.speed, k.aside] @ k.axes for k in last], axis=0)
+    place = np.mean([k.place + velocity * (s.time_us - k.time_us) / 1e6 for k in last], axis=0)
     off = s.place - place
     along, across = abs(off @ s.along), abs(off[1] * s.along[0] - off[0] * s.along[1])
     parts = [along / (GATE[0][0] + GATE[0][1] * s.away), across / (GATE[1][0] + GATE[1][1] * s.away), abs(s.speed - speed) / GATE[2]]
