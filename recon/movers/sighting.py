@@ -124,7 +124,8 @@ def sightings(
         allowed = (inverse_depths[:, None, None] <= NEARER / z) & (inverse_depths[:, None, None] >= UNDER / torch.from_numpy(deepest[rows]))
         stands = np.minimum(torch.where(allowed, standing[:, rows], torch.inf).amin(0).numpy(), of_ground[rows])
         across = max(1, round(REAR[0] * plate.focal[0] / z))
-        worths = stands[:bottom].mean(0) - moving[:, :bottom].mean(1)
+        rims = slice(bottom + WINDOW // 2)  # squares around pixels under a thing show its rim, which a bare street does not outdo
+        worths = stands[rims].mean(0) - moving[:, rims].mean(1)
         best, column = _beside(worths, across).argmax(0), np.arange(len(stands[0]))
         worth = _beside(worths, across)[best, column]
         grounded = _beside((moving[:, before] - of_ground[rows][before]).mean(1), across)[best, column]
