@@ -56,7 +56,7 @@ def test_what_goes_along_the_street_is_found_where_it_is(start, speed, left):
     went = (path.at(1_000_000)[:2, 3] - path.at(500_000)[:2, 3]).numpy() / 0.5
     assert track.moving and track.label == "car" and len(track.times_us) > 8
     # the painted street is as rich as the cars: what stands on it seems a tenth too far, at most
-    assert np.median(np.abs(off[:, 0])) < 2.5 and np.median(np.abs(off[:, 1])) < 0.6
+    assert np.median(np.abs(off[:, 0])) < 2.5 and np.median(np.abs(off[:, 1])) < 0.7
     assert abs(went[0] - speed) < 2.0
     assert float(track.world_from_box[0, 0, 0]) * speed > 0
 
