@@ -17,9 +17,8 @@ class RenderConfig:
     """How far the picture may be from the exact sum over all splats.
 
     alpha_cutoff: contributions below it are skipped; alpha_max: no splat is more opaque;
-    termination: a pixel is finished when this much light still passes; faint: splats less opaque than this are drawn out to
-    a cutoff that is less by as much. max_error: the largest error of a pixel's colour; it sets all these, the cutoff
-    lower the more splats there are, and order "pixel" (`render/budget.py`).
+    termination: a pixel is finished when this much light still passes. max_error: the largest error of a pixel's colour; it sets all
+    these, the cutoff lower the more splats there are, and order "pixel" (`render/budget.py`).
     order: "tile", by the depth of the splats' centres, unless told; or "pixel", by where each pixel's own ray meets them: nothing pops.
     most_entries: splat-tile entries that are drawn at once; it bounds memory and changes no pixel (`render/chunks.py`).
     """
@@ -27,7 +26,6 @@ class RenderConfig:
     alpha_cutoff: float = 1 / 255
     alpha_max: float = 0.999
     termination: float = 1e-4
-    faint: float = 0.0
     max_error: float | None = None
     order: str | None = None
     most_entries: int = 1 << 25
@@ -42,7 +40,7 @@ class RenderConfig:
                 object.__setattr__(self, name, limit)
         elif self.order is None:
             object.__setattr__(self, "order", "tile")
-        for name in ("alpha_cutoff", "termination", "faint"):
+        for name in ("alpha_cutoff", "termination"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(self, name)}")
         if not 1 <= self.most_entries < 2**31:

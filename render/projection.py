@@ -170,7 +170,6 @@ def _view(settings: Settings, lens: Lens) -> View:
     v.tile_left, v.tile_top, v.tiles_x, v.tiles_y = settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y
     v.along_rays = int(settings.model.response == "ray")
     v.dilation, v.smoothing = settings.model.widening, settings.model.compensated
-    v.near, v.log_cutoff = NEAR, -math.log(settings.cutoff)
-    v.faint, v.least_opacity = max(settings.config.faint, 1e-30), settings.least_opacity
+    v.near, v.cutoff, v.log_cutoff = NEAR, settings.cutoff, -math.log(settings.cutoff)
     v.unscented = int(settings.model.projection == "ut")
     return v

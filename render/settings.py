@@ -99,11 +99,6 @@ class Settings:
         return max(2, math.ceil(math.log2(-math.log(self.cutoff) / 1.5)))
 
     @property
-    def least_opacity(self) -> float:
-        """Splats up to this opacity are not drawn: all below the cutoff, or, where faint ones have cutoffs of their own, far below it."""
-        return self.cutoff if self.config.faint <= self.cutoff else self.cutoff / 64
-
-    @property
     def alpha_max(self) -> float:
         return min(self.config.alpha_max, 1 - 1e-6)
 

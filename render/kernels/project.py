@@ -72,7 +72,7 @@ def project(
         exact = pose.rotation * wp.vec3d(means[i]) + pose.translation
         t = wp.vec3(exact)
         opacity = sigmoid(logit_opacities[i])
-        if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.least_opacity:
+        if t[2] > view.near and wp.dot(t, t) < FARTHEST * FARTHEST and opacity > view.cutoff:
             axes = pose.rotation * rotation(quats[i])
             scale = exp_scale(log_scales[i])
             if in_view(t, wp.mat33(axes), scale, view):

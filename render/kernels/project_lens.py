@@ -90,7 +90,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
             opacity = sigmoid(logit_opacities[i])
             x = wp.vec3d(means[i])
             c = sighted(optics, motion, x, view)
-            if c.seen == 1 and opacity > view.least_opacity:
+            if c.seen == 1 and opacity > view.cutoff:
                 axes = scaled_axes(quats[i], log_scales[i])
                 ahead = bool(True)
                 if wp.static(planar):

@@ -95,8 +95,8 @@ def fade(e: Ellipse, opacity: float, view: View):
     """Opacity, compensated for the smoothing, and the exponent up to which the splat shows; 0 where it does not."""
     if view.smoothing > 0.0:
         opacity = opacity * wp.sqrt(float(unsmoothed(e, view) / wp.max(dilated(e, view)[2], LEAST)))
-    s_max = wp.log(wp.max(opacity, view.faint)) + view.log_cutoff
-    if opacity <= view.least_opacity or not (e.xx < LARGEST and e.yy < LARGEST):
+    s_max = wp.log(wp.max(opacity, view.cutoff)) + view.log_cutoff
+    if opacity <= view.cutoff or not (e.xx < LARGEST and e.yy < LARGEST):
         s_max = 0.0
     return wp.vec2(opacity, s_max)
 

@@ -103,8 +103,7 @@ class View:
     along_rays: int  # whether records only bound a splat (`ray_bound.py`)
     near: float
     log_cutoff: float  # ln(1 / alpha cutoff)
-    faint: float  # opacity below which a splat's cutoff shrinks with it
-    least_opacity: float  # splats up to it are not drawn
+    cutoff: float  # splats up to this opacity are not drawn
     unscented: int
 
 
