@@ -73,7 +73,7 @@ def test_nothing_is_left_standing_where_something_drove(drive, monkeypatch):
     monkeypatch.setattr("recon.fit.population.halves", lambda *told: ([], []))  # which would change the cars
     for hanging in ("curtains", "pennants"):  # which beyond the pictures' borders there are
         monkeypatch.setattr(f"recon.fit.population.{hanging}", lambda splats, *told: torch.zeros(len(splats), dtype=torch.bool))
-    fit.population.guess(fit._shown)
+    fit.population.guess(fit.shown)
     tensors = fit.population.descent.tensors()
     assert torch.equal(tensors["moments"][:, 1], squares[stays]) and torch.equal(tensors["last"], last[stays])
     assert fit.population.guessed.shape == (int(stays.sum()),) and len(fit.splats) == stays.sum() < count, "nothing is split"

@@ -112,8 +112,8 @@ def test_a_fit_completes_what_it_knows_one_side_of_and_changes_no_picture(drive,
         fit.step()
     pictures, given = [fit.picture(v) for v in fit.training], []
     monkeypatch.setattr("recon.fit.population.halves", lambda *told: given.append(halves(*told)) or given[-1])
-    fit.population.guess(fit._shown)
-    part = fit._shown().part
+    fit.population.guess(fit.shown)
+    part = fit.shown().part
     after = [fit.picture(v) for v in fit.training]
     assert len(fit.population.descent.last) == len(fit.splats) <= CONFIG.budget
     half = given[0][0][car].means
