@@ -236,7 +236,7 @@ class Render:
             return self.lateral_shift, f"--lateral-shift {self.lateral_shift:g}m" if self.lateral_shift else "as recorded", []
         require_metres(scene, "a lateral shift")
         said = ",".join(f"{k.left:g}m@{k.time_us / 1e6:g}s" for k in self.lateral_shift)
-        path, notes = changing_lane(scene.ego, self.lateral_shift, int(times[0]))
+        path, notes = changing_lane(scene.ego, self.lateral_shift, int(times[0]), int(times[-1]))
         return path, f"--lateral-shift {said}", notes
 
 

@@ -28,8 +28,9 @@ STEEPEST = 15 / 8
 """Of a lane change's mean slope, that of its middle."""
 
 
-def changing_lane(ego: Trajectory, keyframes: Sequence[Keyframe], start_us: int) -> tuple[Trajectory, list[str]]:
-    """A recorded path with a shift to the left that changes on the way, by keyframes counted from `start_us`, and what to tell of it.
+def changing_lane(ego: Trajectory, keyframes: Sequence[Keyframe], start_us: int, end_us: int) -> tuple[Trajectory, list[str]]:
+    """A recorded path with a shift to the left that changes on the way, by keyframes counted from a clip's first frame at `start_us`,
+    and what to tell of it until the last one at `end_us`.
 
     Between two keyframes the car goes over along a quintic of the distance that it drives, which begins and ends along the road without a
     jolt (Takahashi et al. 1989), and heads where it goes; where it hardly drives, it slides sideways over that time, which is told. Speed,
@@ -59,10 +60,10 @@ def changing_lane(ego: Trajectory, keyframes: Sequence[Keyframe], start_us: int)
         share = (times - begin) / (end - begin) if slides else (driven - gone(begin)) / length
         u = torch.where(times < end, share.double(), 1.0)[during].clamp(0, 1)
         aside[during] = left[k] + rise * u**3 * (10 - 15 * u + 6 * u**2)
-        if slides and rise:
+        if slides and rise and begin < end_us and end > start_us:
             hardly = f"drives {length:.1f} m from {keyframes[k].time_us / 1e6:g}s to {keyframes[k + 1].time_us / 1e6:g}s"
             notes.append(f"the recording car {hardly}, too little to go over by {abs(rise):g}m, and slides sideways; give it more time")
-        elif rise:
+        elif rise and not slides:
             turn[during] = torch.atan(rise * 30 * (u * (1 - u)) ** 2 / length)
     shift = translation().repeat(len(times), 1, 1)
     shift[:, 1, 3] = aside

@@ -23,6 +23,9 @@ SIDEWAYS = 30
 SLIDES = 0.5
 """Metres so from which it is told: what hardly moves shakes on the spot."""
 
+SHAKES = 0.1
+"""Metres that tell no direction: a recorded car that stands or creeps shakes by millimetres, tens of degrees from one row to the next."""
+
 
 @dataclass(frozen=True)
 class Way:
@@ -41,7 +44,7 @@ def way_of(file: Path, world_from_body: torch.Tensor, start_us: int) -> Way:
     t = torch.tensor([p.time_us for p in points], dtype=torch.float64)
     xy = torch.tensor([[p.x, p.y] for p in points], dtype=torch.float64)
     yaws = [p.yaw for p in points if p.yaw is not None]
-    turn = torch.tensor(yaws, dtype=torch.float64) if yaws else _direction(xy)
+    turn = torch.tensor(yaws, dtype=torch.float64) if yaws else _direction(_settled(xy))
     shorter = (turn.diff() + torch.pi) % (2 * torch.pi) - torch.pi
     turn = torch.cat([turn[:1], turn[0] + shorter.cumsum(0)])
 
@@ -85,6 +88,14 @@ def _check_times(path: Path, points: list[Waypoint]) -> None:
     if abs(far.time_us) > LONGEST_US:
         told = f"{path} has the time_s {far.time_us / 1e6:g}, which is more than an hour from the clip's first frame"
         raise ValueError(f"{told}; time_s counts seconds from there, no milliseconds, and not since 1970")
+
+
+def _settled(xy: torch.Tensor) -> torch.Tensor:
+    """Points `[T, 2]` of a path, each of which stays where it is until that is `SHAKES` away."""
+    kept = [xy[0]]
+    for place in xy[1:]:
+        kept.append(place if float((place - kept[-1]).norm()) >= SHAKES else kept[-1])
+    return torch.stack(kept)
 
 
 def _direction(xy: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,7 @@ from scenes.poses import translation, yaw, yaw_of
 from scenes.standing import standing_pose
 
 SECOND = 1_000_000
+END_US = START_US + 6 * SECOND
 
 
 def road(poses, step_us=SECOND // 10):
@@ -31,7 +32,7 @@ def at(path, seconds):
 
 def test_a_lane_is_changed_between_two_keyframes():
     ego = straight(pitch=0.02)
-    path, notes = changing_lane(ego, parse_lateral("0m@1s,3.5m@4s"), START_US)
+    path, notes = changing_lane(ego, parse_lateral("0m@1s,3.5m@4s"), START_US, END_US)
     assert notes == []
     for seconds, left in ((0, 0), (1, 0), (2.5, 1.75), (4, 3.5), (6, 3.5)):
         there = (at(ego, seconds).inverse() @ at(path, seconds))[:3, 3]
@@ -42,7 +43,7 @@ def test_a_lane_is_changed_between_two_keyframes():
 
 
 def test_a_car_that_changes_lane_faces_where_it_goes_and_never_jolts():
-    path, _ = changing_lane(straight(pitch=0.02), parse_lateral("-1m@1s,2.5m@4s"), START_US)
+    path, _ = changing_lane(straight(pitch=0.02), parse_lateral("-1m@1s,2.5m@4s"), START_US, END_US)
     moments = [1 + 0.05 * i for i in range(61)]
     way = torch.stack([at(path, s)[:3, 3] for s in moments])
     heading = torch.stack([yaw_of(at(path, s)) for s in moments])
@@ -55,7 +56,7 @@ def test_a_car_that_changes_lane_faces_where_it_goes_and_never_jolts():
 
 def test_in_a_bend_the_shift_is_square_to_the_road_as_a_steady_one_is():
     ego = road([translation(50 * math.sin(a), 50 * (1 - math.cos(a)), 0) @ yaw(a) for a in (0.02 * torch.arange(61)).tolist()])
-    path, _ = changing_lane(ego, parse_lateral("2m@0s,2m@6s"), START_US)
+    path, _ = changing_lane(ego, parse_lateral("2m@0s,2m@6s"), START_US, END_US)
     steady = ego.shifted(lateral=2)
     for seconds in (0, 0.33, 3, 5.95):
         assert torch.allclose(at(path, seconds), at(steady, seconds), atol=1e-3)
@@ -63,22 +64,30 @@ def test_in_a_bend_the_shift_is_square_to_the_road_as_a_steady_one_is():
 
 def test_who_waits_changes_lane_as_he_drives_on():
     ego = road([translation(0.0, 0, 0)] * 20 + [translation(1.0 * i, 0, 0) for i in range(1, 41)])
-    path, notes = changing_lane(ego, parse_lateral("0m@0s,3m@5s"), START_US)
+    path, notes = changing_lane(ego, parse_lateral("0m@0s,3m@5s"), START_US, END_US)
     assert notes == [] and torch.allclose(at(path, 1.5), at(ego, 1.5), atol=1e-9)
     assert at(path, 5)[1, 3] == pytest.approx(3)
 
 
 def test_who_hardly_drives_slides_which_is_told():
-    path, (said,) = changing_lane(straight(speed=1), parse_lateral("0m@1s,3m@3s"), START_US)
+    path, (said,) = changing_lane(straight(speed=1), parse_lateral("0m@1s,3m@3s"), START_US, END_US)
     assert said.startswith("the recording car drives 2.0 m from 1s to 3s, too little to go over by 3m")
     assert at(path, 2)[1, 3] == pytest.approx(-2 + 1.5) and float(yaw_of(at(path, 2))) == 0
-    still, (said,) = changing_lane(Trajectory(torch.tensor([START_US]), translation(0, 0, 1)[None]), parse_lateral("0m@0s,1m@1s"), START_US)
+    still, (said,) = changing_lane(
+        Trajectory(torch.tensor([START_US]), translation(0, 0, 1)[None]), parse_lateral("0m@0s,1m@1s"), START_US, END_US
+    )
     assert "drives 0.0 m" in said and still.at(START_US)[1, 3] == 0
+
+
+def test_what_slides_outside_the_clip_is_not_told():
+    for text in ("0m@-4s,3m@-2s", "0m@3s,3m@5s"):
+        path, notes = changing_lane(straight(speed=1), parse_lateral(text), START_US, START_US + 2 * SECOND)
+        assert notes == [] and float(yaw_of(at(path, 4))) == 0, text
 
 
 def test_a_keyframe_beyond_the_drive_is_only_made_for():
     """At 10 m/s the way from 4 to 8 seconds is half done when the drive ends at 6."""
-    path, _ = changing_lane(straight(), parse_lateral("0m@4s,4m@8s"), START_US)
+    path, _ = changing_lane(straight(), parse_lateral("0m@4s,4m@8s"), START_US, END_US)
     assert at(path, 6)[1, 3] == pytest.approx(-2 + 2, abs=1e-6)
 
 
@@ -118,6 +127,14 @@ def test_the_recorded_path_written_as_a_file_is_driven_again(street, tmp_path):
     for i in range(7):
         t = START_US + (i + 2) * STEP_US
         assert torch.allclose(path.at(t), ego.at(t), atol=1e-6)
+
+
+def test_who_creeps_and_shakes_faces_the_way_it_drives(street, tmp_path):
+    """As a recorded car does that waits: by a centimetre a row, and millimetres to and fro."""
+    rows = "".join(f"{i / 100},{0.01 * i},{0.003 * (i % 3 - 1)}\n" for i in range(81))
+    path, _ = drive(street, tmp_path, rows)
+    headings = torch.tensor([float(yaw_of(at(path, i / 100))) for i in range(81)]) - float(yaw_of(street.ego.at(START_US)))
+    assert float(headings.abs().max()) < math.radians(4)
 
 
 def test_a_path_of_its_own_follows_the_ground_as_the_recorded_one_did(street, tmp_path):
