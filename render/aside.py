@@ -60,7 +60,7 @@ def path_warning(scene: Scene, recorded: Sequence[Camera], path: float | Traject
     if isinstance(path, float | int) and not path:
         return []
     looks = spread(recorded, LOOKS)
-    return _beyond(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
+    return _beyond(scene, looks, path, said) or _off(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
 
 
 def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
@@ -76,7 +76,7 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
     left = asides[first][1]
     room, side, after = abs(left) - most, "left" if left > 0 else "right", _after(looks, looks[first].time_us)
     if isinstance(path, Trajectory):
-        ends = f"it is {abs(left):.1f} m to the {side} of the recorded path, but {room + BEFORE:.1f} m from that something stands"
+        ends = f"it is {abs(left):.1f} m to the {side} of the recorded path, and something stands {room + BEFORE:.1f} m to that side of it"
         fix = "stay nearer to the recorded path there"
         return [f"{said} goes beyond what was recorded: {after} {ends}, or the known ground ends, and what is behind is a guess; {fix}"]
     whole = STEP * math.floor(room / STEP)
@@ -85,6 +85,16 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
         f"{said} goes beyond what was recorded: {after} something stands, or the known ground ends, "
         f"{room + BEFORE:.1f} m to the {side} of the path, and what is behind is a guess; {fix}"
     ]
+
+
+def _off(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
+    """Told of a path that goes on before the recorded one begins or after it ends, so that nothing is aside of it."""
+    if not isinstance(path, Trajectory):
+        return []
+    off = next((look.time_us for look in looks if outside_ground(scene, path.at(look.time_us)[:2, 3]) > 0), None)
+    if off is None:
+        return []
+    return [f"{said} leaves the known ground {_after(looks, off)}, and what is there is a guess; stay nearer to the recorded path"]
 
 
 def _in_the_way(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:

@@ -114,7 +114,7 @@ def read_waypoints(path: Path) -> list[Waypoint]:
             raise ValueError(f"{path}, line {number}: time_s must rise, but {cells[0]} follows {points[-1].time_us / 1e6:g}")
         points.append(point)
     if len(points) < 2:
-        fix = "what stands is put in by X,Y"
+        fix = "what stands has its place in both"
         raise ValueError(f"{path} has {len(points)} row{'s' * (len(points) != 1)} below its header; a trajectory needs at least 2; {fix}")
     return points
 

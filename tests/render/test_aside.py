@@ -91,5 +91,15 @@ def test_a_path_of_its_own_is_told_where_it_meets_something(street):
     (said,) = path_warning(replace(street, actors=(beside,)), cameras, driving(2.5), "--trajectory t.csv")
     assert said.startswith("--trajectory t.csv takes the recording car through t (car), 0.") and said.endswith("lead it past there")
     (said,) = path_warning(street, cameras, driving(12.0), "--trajectory t.csv")
-    assert "goes beyond what was recorded: 0." in said and "it is 12.0 m to the left of the recorded path, but 8." in said
+    assert "goes beyond what was recorded: 0." in said and "it is 12.0 m to the left of the recorded path, and something stands 8." in said
     assert not path_warning(street, cameras, driving(2.5), "--trajectory t.csv")
+
+
+def test_a_path_that_goes_on_where_the_recorded_one_ends_is_told_of_the_grounds_edge(street):
+    """Straight on along the street, and a kilometre back: it is nowhere aside of the recorded path."""
+    ego, cameras = street.ego, clip_cameras(street, CAMERA)
+    for far in (1000.0, -1000.0):
+        poses = ego.world_from_body.clone()
+        poses[len(ego) // 2 :, 0, 3] += far
+        (said,) = path_warning(street, cameras, Trajectory(ego.times_us, poses), "--trajectory t.csv")
+        assert said.startswith("--trajectory t.csv leaves the known ground 0.") and said.endswith("stay nearer to the recorded path")

@@ -53,7 +53,7 @@ def test_yaw_is_optional(tmp_path):
     [
         ("", "must begin with the header"),
         ("t,x,y\n0,1,2\n", 'got "t,x,y"'),
-        ("time_s,x_m,y_m\n0,1,2\n", "1 row below its header; a trajectory needs at least 2; what stands is put in by X,Y"),
+        ("time_s,x_m,y_m\n0,1,2\n", "1 row below its header; a trajectory needs at least 2; what stands has its place in both"),
         ("time_s;x_m;y_m\n0;1,5;2\n1;2,5;2\n", "by commas, not by semicolons, and write decimals with a point"),
         ("time_s\tx_m\ty_m\n0\t1\t2\n", "by commas, not by tabs"),
         ("time_s,x_m,y_m\n0,1,2\n1,2\n", "line 3: 2 values for 3 columns"),
