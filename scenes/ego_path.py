@@ -16,7 +16,7 @@ from scenes.poses import interpolate, inverse, translation, yaw, yaw_of
 from scenes.scene import Scene
 from scenes.standing import EDGE, outside_ground, standing_pose
 from scenes.trajectory import Trajectory, between
-from scenes.waypoints import SIDEWAYS, Way, sliding_warning, way_of
+from scenes.waypoints import SIDEWAYS, STEP_US, Way, sliding_warning, way_of
 
 CAR = (3.0, 2 * HALF, 1.6)
 """Length, width and height in metres about a body's origin that are the recording car, wherever on it that lies."""
@@ -86,6 +86,7 @@ def driven(scene: Scene, file: Path, start_us: int, end_us: int) -> tuple[Trajec
     if (early := int(way.times_us[-1])) < end_us:
         lasts = f"{file} ends {(early - start_us) / 1e6:g}s after the clip's first frame, and the clip's last frame is at"
         raise ValueError(f"{lasts} {(end_us - start_us) / 1e6:g}s; add rows, or give --duration {max(early - start_us, 1) / 1e6:g}s")
+    way = _during(way, start_us - STEP_US, end_us + STEP_US)  # each pose takes looks at the ground; a shutter reads beyond the clip
     poses = [_lifted(scene, xy, float(heading)) for xy, heading in zip(way.xy, way.headings, strict=True)]
     slides = sliding_warning("the recording car", _during(way, start_us, end_us), file, start_us)
     return Trajectory(way.times_us, torch.stack(poses)), slides

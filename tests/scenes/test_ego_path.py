@@ -172,6 +172,13 @@ def test_a_file_that_does_not_last_as_long_as_the_clip_is_refused(street, tmp_pa
         drive(replace(street, meta={**street.meta, "metric": False}), tmp_path, "0,0,0\n0.8,4,0\n")
 
 
+def test_of_a_long_file_only_the_clip_is_put_on_the_ground(street, tmp_path):
+    """An hour's rows took over a minute."""
+    path, _ = drive(street, tmp_path, "-3600,-3600,0\n0,0,0\n3600,3600,0\n")
+    assert len(path) < 20 and path.span_us()[0] < START_US and path.span_us()[1] > START_US + 7 * STEP_US
+    assert torch.allclose(at(path, 0.5)[:3, :3], at(street.ego, 0.5)[:3, :3], atol=1e-6)
+
+
 def test_a_car_that_slides_is_told(street, tmp_path):
     _, (said,) = drive(street, tmp_path, "0,0,0\n0.4,0,-2\n0.8,-3,-2\n")
     assert said.startswith("the recording car slides sideways 0.") and "t.csv by yaw_deg" in said
