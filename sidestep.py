@@ -181,10 +181,13 @@ class Render:
         from scenes.files import kind_of
         from scenes.insert import insert
         from scenes.seen import absence_warning, seeing, unseen_warning
+        from scenes.trajectory import Trajectory
 
         check_device(self.device)
-        if self.insert and kind_of(self.scene) in ("asset", "splats"):
-            raise UsageError(f"--insert needs a scene that sidestep recon wrote, with a ground and a path; {self.scene} holds splats only")
+        needs_path = ["--insert"] * bool(self.insert) + ["--trajectory"] * (self.trajectory is not None)
+        if needs_path and kind_of(self.scene) in ("asset", "splats"):
+            told = "needs a scene that sidestep recon wrote, with a ground and a path"
+            raise UsageError(f"{needs_path[0]} {told}; {self.scene} holds splats only")
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
@@ -192,9 +195,11 @@ class Render:
         cameras = clip_cameras(scene, camera, way, times)
         warnings += notes
         warnings += cut_warning(scene, camera, self.start, self.duration)
+        ego = way if isinstance(way, Trajectory) else scene.ego.shifted(lateral=way)
         put_in: set[str] = set()
         for placement in self.insert:
-            result = insert(scene, Databank(self.databank).load(placement.asset), placement, int(times[0]), int(times[-1]))
+            asset = Databank(self.databank).load(placement.asset)
+            result = insert(scene, asset, placement, int(times[0]), int(times[-1]), ego)
             scene, warnings = result.scene, [*warnings, *result.warnings]
             put_in.add(result.actor.track)
         warnings += path_warning(scene, clip_cameras(scene, camera, 0.0, times), way, said)

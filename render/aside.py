@@ -31,6 +31,9 @@ PIXELS, WIDE = 16, math.radians(10)
 BEFORE = 0.5
 """Metres before what stands there that a camera can still go: nearer, it is between the splats of it."""
 
+TURNED = math.radians(60)
+"""From the nearest camera's axis from which on a camera sees little of what that showed."""
+
 STEP = 0.5
 """Metres, of which the largest shift is told in whole ones: it is measured no better."""
 
@@ -60,7 +63,10 @@ def path_warning(scene: Scene, recorded: Sequence[Camera], path: float | Traject
     if isinstance(path, float | int) and not path:
         return []
     looks = spread(recorded, LOOKS)
-    return _beyond(scene, looks, path, said) or _off(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
+    if not isinstance(path, Trajectory):
+        return _beyond(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
+    where = _beyond(scene, looks, path, said) or _off(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
+    return where + _turned(scene, looks, path, said)
 
 
 def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
@@ -72,9 +78,9 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
     most = max(lacks)
     if most <= 0:
         return []
-    first = lacks.index(most)
-    left = asides[first][1]
-    room, side, after = abs(left) - most, "left" if left > 0 else "right", _after(looks, looks[first].time_us)
+    worst = lacks.index(most)
+    left = asides[worst][1]
+    room, side, after = abs(left) - most, "left" if left > 0 else "right", _after(looks, looks[worst].time_us)
     if isinstance(path, Trajectory):
         ends = f"it is {abs(left):.1f} m to the {side} of the recorded path, and something stands {room + BEFORE:.1f} m to that side of it"
         fix = "stay nearer to the recorded path there"
@@ -87,14 +93,25 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
     ]
 
 
-def _off(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
+def _off(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) -> list[str]:
     """Told of a path that goes on before the recorded one begins or after it ends, so that nothing is aside of it."""
-    if not isinstance(path, Trajectory):
-        return []
     off = next((look.time_us for look in looks if outside_ground(scene, path.at(look.time_us)[:2, 3]) > 0), None)
     if off is None:
         return []
     return [f"{said} leaves the known ground {_after(looks, off)}, and what is there is a guess; stay nearer to the recorded path"]
+
+
+def _turned(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) -> list[str]:
+    """Told by the camera's axis, and those that the rig's cameras had where the path is nearest."""
+    for look in looks:
+        body = path.at(look.time_us)
+        axis = (body @ inverse(scene.ego.at(look.time_us)) @ look.world_from_cam)[:3, 2]
+        recorded = nearest(scene.ego, body[:2, 3])
+        off = min(math.acos(float((axis @ (recorded @ c.body_from_cam)[:3, 2]).clamp(-1, 1))) for c in scene.rig.values())
+        if off > TURNED:
+            turned = f"{said} looks {math.degrees(off):.0f}deg away from where any camera looked there, {_after(looks, look.time_us)}"
+            return [f"{turned}, and what it shows may be a guess; face more along the recorded path"]
+    return []
 
 
 def _in_the_way(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:

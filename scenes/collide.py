@@ -9,6 +9,7 @@ import torch
 from scenes.asset import Actor
 from scenes.poses import inverse
 from scenes.scene import Scene
+from scenes.trajectory import Trajectory
 
 STEP_US = 100_000
 """Between the moments that are looked at."""
@@ -29,9 +30,11 @@ FEWEST = 12
 """Splats that make something: floaters come alone."""
 
 
-def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None) -> dict[str, str]:
+def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None, ego: Trajectory | None = None) -> dict[str, str]:
     """What an actor of the scene touches during the drive, or from one time of it to another, a sentence each with the first moment, by
-    what that is: "actor <track>", "ego", "background"; {} where its way is free."""
+    what that is: "actor <track>", "ego", "background"; {} where its way is free. ego: what the recording car drives, as recorded where
+    None."""
+    driven = ego or scene.ego
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     begin, end = during or (first, last)
     times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
@@ -39,7 +42,7 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
         f"actor {other.track}": f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment"
         for other, hit in met(scene, actor, times)
     }
-    hit = next((t for t in times if scene.ego.covers(t) and _holds(actor, scene.ego.at(t), t)), None)
+    hit = next((t for t in times if driven.covers(t) and _holds(actor, driven.at(t), t)), None)
     if hit is not None:
         found["ego"] = f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment"
     still = len(actor.trajectory) == 1

@@ -32,11 +32,19 @@ class Inserted:
     warnings: tuple[str, ...]
 
 
-def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | None = None, end_us: int | None = None) -> Inserted:
+def insert(
+    scene: Scene,
+    asset: Asset,
+    placement: Placement,
+    start_us: int | None = None,
+    end_us: int | None = None,
+    ego: Trajectory | None = None,
+) -> Inserted:
     """Put an asset into a scene.
 
     start_us: the time of the clip's first frame, to whose body pose the placement is relative; the drive's first by default. end_us: that
-    of its last: what it runs into is looked for from the one to the other; in the whole drive by default.
+    of its last: what it runs into is looked for from the one to the other; in the whole drive by default. ego: the path that the recording
+    car drives there, in whose way it may be; the recorded one by default.
     The actor gets a track of its own and `inserted` in its asset's meta; its colours are those of the light at its first place. What it
     runs into is among the warnings. ValueError where the time is off the path or the
     trajectory file is bad; where the scene is not metric.
@@ -78,7 +86,8 @@ def insert(scene: Scene, asset: Asset, placement: Placement, start_us: int | Non
     warnings += light_held(placement.asset, there, scene)
     marked = replace(there, meta={**there.meta, "inserted": True})
     actor = Actor(marked, path, _track(scene, placement.asset))
-    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, None if end_us is None else (start_us, end_us)).values()]
+    during = None if end_us is None else (start_us, end_us)
+    warnings += [f"{placement.asset} {said}" for said in collisions(scene, actor, during, ego).values()]
     return Inserted(replace(scene, actors=(*scene.actors, actor)), actor, tuple(warnings))
 
 

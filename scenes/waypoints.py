@@ -44,9 +44,7 @@ def way_of(file: Path, world_from_body: torch.Tensor, start_us: int) -> Way:
     t = torch.tensor([p.time_us for p in points], dtype=torch.float64)
     xy = torch.tensor([[p.x, p.y] for p in points], dtype=torch.float64)
     yaws = [p.yaw for p in points if p.yaw is not None]
-    turn = torch.tensor(yaws, dtype=torch.float64) if yaws else _direction(_settled(xy))
-    shorter = (turn.diff() + torch.pi) % (2 * torch.pi) - torch.pi
-    turn = torch.cat([turn[:1], turn[0] + shorter.cumsum(0)])
+    turn = _unwrapped(torch.tensor(yaws, dtype=torch.float64)) if yaws else _facing(xy)
 
     at = [torch.tensor([len(points) - 1.0], dtype=torch.float64)]
     for i, step in enumerate(t.diff().tolist()):
@@ -90,12 +88,24 @@ def _check_times(path: Path, points: list[Waypoint]) -> None:
         raise ValueError(f"{told}; time_s counts seconds from there, no milliseconds, and not since 1970")
 
 
-def _settled(xy: torch.Tensor) -> torch.Tensor:
-    """Points `[T, 2]` of a path, each of which stays where it is until that is `SHAKES` away."""
-    kept = [xy[0]]
-    for place in xy[1:]:
-        kept.append(place if float((place - kept[-1]).norm()) >= SHAKES else kept[-1])
-    return torch.stack(kept)
+def _unwrapped(angles: torch.Tensor) -> torch.Tensor:
+    """The same angles `[T]`, none farther than half a turn from the one before."""
+    shorter = (angles.diff() + torch.pi) % (2 * torch.pi) - torch.pi
+    return torch.cat([angles[:1], angles[0] + shorter.cumsum(0)])
+
+
+def _facing(xy: torch.Tensor) -> torch.Tensor:
+    """Where what goes along points `[T, 2]` faces at each, radians: by those that are `SHAKES` apart, and between them by the way gone."""
+    before = [0]  # of each point the last that tells a direction
+    for i in range(1, len(xy)):
+        before.append(i if float((xy[i] - xy[before[-1]]).norm()) >= SHAKES else before[-1])
+    after = [before[-1]]
+    for i in range(len(xy) - 1, 0, -1):
+        after.append(i if before[i] == i else after[-1])
+    after.reverse()
+    turn, there = _unwrapped(_direction(xy[before])), xy[before]
+    gone = (xy - there).norm(dim=1) / (xy[after] - there).norm(dim=1).clamp_min(SHAKES)
+    return torch.lerp(turn[before], turn[after], gone.clamp_max(1))
 
 
 def _direction(xy: torch.Tensor) -> torch.Tensor:

@@ -31,6 +31,7 @@ USAGE = [
     ([*SHOOT, "--size", "100000x9"], "--size", "at most 16384 pixels a side"),
     ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, above 0 and below 1000, as 10"),
     (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a scene", "usdc holds splats only"),
+    (["render", "street/background.usdc", *SHOOT[4:], "--trajectory", "t.csv"], "--trajectory needs a scene", "usdc holds splats only"),
     ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
     (["render", "street"], "--output", "required"),
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),

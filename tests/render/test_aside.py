@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ from street import START_US, box, car
 from render.aside import path_warning, room_aside
 from render.clip import clip_cameras
 from scenes import Actor, Asset, Gaussians, Trajectory
-from scenes.poses import translation
+from scenes.poses import translation, yaw
 
 CAMERA = "front_camera"
 
@@ -103,3 +104,13 @@ def test_a_path_that_goes_on_where_the_recorded_one_ends_is_told_of_the_grounds_
         poses[len(ego) // 2 :, 0, 3] += far
         (said,) = path_warning(street, cameras, Trajectory(ego.times_us, poses), "--trajectory t.csv")
         assert said.startswith("--trajectory t.csv leaves the known ground 0.") and said.endswith("stay nearer to the recorded path")
+
+
+def test_a_path_that_looks_where_no_camera_did_is_told(street):
+    def turned(angle):
+        return replace(street.ego, world_from_body=street.ego.world_from_body @ yaw(angle))
+
+    cameras = clip_cameras(street, CAMERA)
+    (said,) = path_warning(street, cameras, turned(math.pi), "--trajectory t.csv")
+    assert "looks " in said and "deg away from where any camera looked there, 0.0s after" in said
+    assert not path_warning(street, cameras, turned(0.5), "--trajectory t.csv")

@@ -182,3 +182,13 @@ def test_of_a_long_file_only_the_clip_is_put_on_the_ground(street, tmp_path):
 def test_a_car_that_slides_is_told(street, tmp_path):
     _, (said,) = drive(street, tmp_path, "0,0,0\n0.4,0,-2\n0.8,-3,-2\n")
     assert said.startswith("the recording car slides sideways 0.") and "t.csv by yaw_deg" in said
+
+
+def test_on_a_dense_file_a_bend_is_driven_without_steps(street, tmp_path):
+    """A hundred rows a second, each less than what tells a direction from the one before."""
+    steps = [0.01 * i for i in range(81)]
+    rows = "".join(f"{t},{10 * math.sin(0.5 * t)},{10 * (1 - math.cos(0.5 * t))}\n" for t in steps)
+    path, _ = drive(street, tmp_path, rows, 8 * STEP_US)
+    facing = torch.stack([yaw_of(at(path, t)) for t in steps])
+    assert torch.allclose(facing[10:-10], 0.5 * torch.tensor(steps, dtype=torch.float64)[10:-10], atol=1e-2)
+    assert float(facing[10:-10].diff().diff().abs().max()) < 2e-3

@@ -180,3 +180,12 @@ def test_what_an_asset_runs_into_is_looked_for_in_the_clip_alone(street):
     place = Placement("car", 10.0 - float(body), 0.0)
     assert any("runs into" in said for said in insert(scene, car(), place, late).warnings)
     assert not any("runs into" in said for said in insert(scene, car(), place, late, int(path.times_us[-1])).warnings)
+
+
+def test_what_the_recording_car_drives_into_is_told_of_the_path_that_it_drives(street):
+    place, start = Placement("car", 3.0, 0.0), street.ego.times_us
+    aside = street.ego.shifted(lateral=3.5)
+    assert any("where the recording car drives" in said for said in insert(street, car(), place).warnings)
+    assert not any("recording car" in said for said in insert(street, car(), place, int(start[0]), int(start[-1]), aside).warnings)
+    beside = Placement("car", 3.0, 3.5)
+    assert any("recording car" in said for said in insert(street, car(), beside, int(start[0]), int(start[-1]), aside).warnings)
