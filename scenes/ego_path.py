@@ -43,21 +43,21 @@ def changing_lane(ego: Trajectory, keyframes: Sequence[Keyframe], start_us: int,
     times = torch.cat([ego.times_us, at.clamp(first, last), torch.arange(first, last, FINE_US), ends]).unique()
     recorded = ego.near_each(times)
     ahead = (recorded[1:, :2, 3] - recorded[:-1, :2, 3]) * torch.nn.functional.normalize(recorded[:-1, :2, 0], dim=1)
-    driven = torch.cat([torch.zeros(1, dtype=torch.float64), ahead.sum(1).cumsum(0)])  # forwards: who stands shakes on the spot
+    metres = torch.cat([torch.zeros(1, dtype=torch.float64), ahead.sum(1).cumsum(0)])  # forwards: who stands shakes on the spot
 
     def gone(time_us: int) -> float:
         """Metres driven until then; beyond the drive as fast as in its first and last second."""
         inside = min(max(time_us, first), last)
         other = min(first + 1_000_000, last) if time_us < inside else max(last - 1_000_000, first)
-        here, there = (float(between(times, driven, t)) for t in (inside, other))
+        here, there = (float(between(times, metres, t)) for t in (inside, other))
         return here + (here - there) / (inside - other) * (time_us - inside) if time_us != inside else here
 
-    aside, turn, notes = left[0].expand(len(times)).clone(), torch.zeros_like(driven), []
+    aside, turn, notes = left[0].expand(len(times)).clone(), torch.zeros_like(metres), []
     for k, rise in enumerate(left.diff().tolist()):
         begin, end = int(at[k]), int(at[k + 1])
         during, length = times > begin, gone(end) - gone(begin)
         slides = abs(rise) * STEEPEST >= length * math.tan(math.radians(SIDEWAYS))
-        share = (times - begin) / (end - begin) if slides else (driven - gone(begin)) / length
+        share = (times - begin) / (end - begin) if slides else (metres - gone(begin)) / length
         u = torch.where(times < end, share.double(), 1.0)[during].clamp(0, 1)
         aside[during] = left[k] + rise * u**3 * (10 - 15 * u + 6 * u**2)
         if slides and rise and begin < end_us and end > start_us:
