@@ -204,7 +204,7 @@ class Fit:
     def _in_sight(self, *shots: Shot, of: Splats | None = None) -> torch.Tensor:
         """Indices of the splats that any of the pictures may show."""
         eyes: list[Eye] = [(shot.camera, *shot.backs()) for shot in shots]
-        return in_sight(of or self.splats, eyes, {i for shot in shots for i in shot.near})
+        return in_sight(self.splats if of is None else of, eyes, {i for shot in shots for i in shot.near})
 
     def _render(
         self,
@@ -310,7 +310,7 @@ class Fit:
     @torch.no_grad()
     def shown_by(self, shots: Iterable[Shot], splats: Splats | None = None) -> Shown:
         """What these show of each splat."""
-        splats = splats or self.splats
+        splats = self.splats if splats is None else splats
         shown = Shown.none(len(splats), self.device)
         for shot in shots:
             which, camera = self._in_sight(shot, of=splats), shot.camera
