@@ -30,7 +30,8 @@ def assemble(fit: Fit, start: Start, log: Log, extra: dict | None = None) -> Sce
         r = start.rig[name]
         gains = [v.gain.cpu() for v in fit.frames.views if v.camera == c and v.gain is not None]
         exposure = fit.exposures[c].detach().cpu().clone()
-        rig[name] = RigCamera(r.lens, r.width, r.height, mount, exposure, times, gains=torch.stack(gains) if gains else None)
+        each, flat_field = torch.stack(gains) if gains else None, fit.flat_fields[c].found()
+        rig[name] = RigCamera(r.lens, r.width, r.height, mount, exposure, times, gains=each, flat_field=flat_field)
     share = {k: log.meta[k] for k in ("licence", "attribution", "source") if k in log.meta}
     actors = []
     for i, (track, gaussians) in enumerate(zip(start.tracks, movers, strict=True)):

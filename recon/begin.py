@@ -13,6 +13,7 @@ from recon.fit.clear import Clear
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
 from recon.fit.flat import FlatGround
+from recon.fit.flat_field import FlatField
 from recon.fit.knots import Knots
 from recon.fit.limbs import Limbs
 from recon.fit.motion import Motion
@@ -44,7 +45,7 @@ def begin(
     """What a fit starts from, prepared unless it is given, and the fit on a device before its first step.
 
     names, span: cameras, and first and last microsecond (`choose`). size: width and height of the first camera's pictures. exposed: cameras
-    by name as a scene has them, whose exposures and frames' gains are taken; estimated where None.
+    by name as a scene has them, whose exposures, frames' gains and flat fields are taken; estimated where None.
     """
     estimated = start is None and exposed is None and "gains" in config.refine  # else they are known
     with Progress("images") as steps:
@@ -56,7 +57,7 @@ def begin(
     else:
         told = zip(frames.views, start.gains, start.skies, strict=True)
         frames = replace(frames, views=[replace(v, gain=gain, sky=sky) for v, gain, sky in told])
-    return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device)
+    return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device, exposed or {})
 
 
 def _prepared(
@@ -86,7 +87,7 @@ def _prepared(
     return frames, start
 
 
-def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: str) -> Fit:
+def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: str, exposed: Mapping[str, RigCamera]) -> Fit:
     """The fit of prepared splats, with all that constrains it."""
     trained = torch.tensor([v.time_us for v in frames.of(0)])
     motion = Motion(frames, start.rig, Knots(start.ego, trained), start.tracks)
@@ -96,4 +97,12 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
     ground = FlatGround(start.ground, start.ground_shown, torch.device(device))
     population = Population(start.splats.to(device), motion, config, ground, start.swept, clear)
-    return Fit(frames, population, start.sky, start.exposures, limbs, start.measured)
+    fields = [_flat_field(start.rig[name], exposed.get(name), population.device) for name in frames.names]
+    return Fit(frames, population, start.sky, start.exposures, limbs, start.measured, fields)
+
+
+def _flat_field(camera: RigCamera, known: RigCamera | None, device: torch.device) -> FlatField:
+    """A camera's flat field before the fit: as it is known, or even."""
+    if known is None or known.flat_field is None:
+        return FlatField.even(camera.width, camera.height, device)
+    return FlatField(known.flat_field.to(device))

@@ -21,7 +21,7 @@ from scenes.lenses import LENSES
 from scenes.state import load_state, save_state
 from scenes.trajectory import Trajectory
 
-VERSION = 17
+VERSION = 18
 
 
 def checkpoint_path(output: Path) -> Path:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from render.flat_field import in_flat_field
 from render.frame_types import Frame, RenderConfig
 from render.launch import upload
 from render.need import need_of, support_fields
@@ -80,8 +81,7 @@ def render_frame(
         if scene.sky is not None:
             assert frame.alpha is not None
             rgb = over_sky(rgb, frame.alpha, scene.sky, camera)
-        if camera.exposure is not None:
-            rgb = expose(rgb, camera.exposure)
+        rgb = expose(rgb, camera)
     if frame.instance_alpha is not None:
         frame = replace(frame, instance_alpha=by_instance(frame.instance_alpha, placed, len(scene.actors)))
     wanted = {name: getattr(frame, name) for name in outputs}
@@ -93,9 +93,10 @@ def by_instance(each: torch.Tensor, placed: Sequence[Placed], actors: int) -> to
     return each.new_zeros(*each.shape[:2], 1 + actors).index_add(2, torch.tensor([p.instance for p in placed], device=each.device), each)
 
 
-def expose(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
-    """rgb' = E[:, :3] rgb + E[:, 3] for an affine colour `[3, 4]`."""
-    if not exposure.requires_grad and torch.equal(exposure, neutral_exposure().to(exposure)):
-        return rgb
-    exposure = upload(exposure, rgb.device).to(rgb.dtype)
-    return rgb @ exposure[:, :3].T + exposure[:, 3]
+def expose(rgb: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """A picture `[H, W, 3]` as a camera takes it: rgb' = F (E[:, :3] rgb + E[:, 3]), of its exposure and flat field."""
+    exposure = camera.exposure
+    if exposure is not None and (exposure.requires_grad or not torch.equal(exposure, neutral_exposure().to(exposure))):
+        exposure = upload(exposure, rgb.device).to(rgb.dtype)
+        rgb = rgb @ exposure[:, :3].T + exposure[:, 3]
+    return in_flat_field(rgb, camera.flat_field)

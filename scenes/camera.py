@@ -42,7 +42,8 @@ class Camera:
 
     With an end pose and shutter "rows" or "columns" the pose moves while the image is read out: from `world_from_cam` at the image's
     top (left) edge, at `time_us`, to `world_from_cam_end` at its bottom (right) edge, `readout_us` later, or earlier if that is negative.
-    `exposure` is an affine colour `[3, 4]` that `render_frame` applies last: rgb' = E[:, :3] rgb + E[:, 3].
+    `exposure` is an affine colour `[3, 4]` that `render_frame` applies last but one: rgb' = E[:, :3] rgb + E[:, 3]; and `flat_field` the
+    gains `[h, w, 3]` that it applies last, of a grid of cells over the picture, linear between their middles; None: 1 everywhere.
     """
 
     lens: Lens
@@ -54,6 +55,7 @@ class Camera:
     shutter: str = "global"
     exposure: torch.Tensor | None = None
     readout_us: int = 0
+    flat_field: torch.Tensor | None = None
 
     def __post_init__(self):
         check_size(self.width, self.height)
@@ -64,6 +66,8 @@ class Camera:
                 check_tensor(name, getattr(self, name), (4, 4), torch.float64)
         if self.exposure is not None:
             check_tensor("exposure", self.exposure, (3, 4))
+        if self.flat_field is not None:
+            check_tensor("flat_field", self.flat_field, ("h", "w", 3))
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on an image of another size."""
@@ -91,7 +95,7 @@ class RigCamera:
 
     gains float32 `[F, 3]`, of frames that were exposed one by one: how many times as much as `exposure` each was; None where all alike.
     fitted: whether splats were fitted to pictures of its size. shutter "rows" or "columns": an image is read out over `readout_us` from its
-    time on, top (left) edge first; negative: that one last, at its time.
+    time on, top (left) edge first; negative: that one last, at its time. flat_field: as a `Camera`'s.
     """
 
     lens: Lens
@@ -104,6 +108,7 @@ class RigCamera:
     readout_us: int = 0
     gains: torch.Tensor | None = None
     fitted: bool = True
+    flat_field: torch.Tensor | None = None
 
     def __post_init__(self):
         check_size(self.width, self.height)
@@ -114,6 +119,8 @@ class RigCamera:
         check_tensor("times_us", self.times_us, ("F",), torch.int64)
         if self.gains is not None:
             check_tensor("gains", self.gains, (max(1, len(self.times_us)), 3), torch.float32)
+        if self.flat_field is not None:
+            check_tensor("flat_field", self.flat_field, ("h", "w", 3), torch.float32)
 
     def exposure_at(self, time_us: int) -> torch.Tensor:
         """The affine exposure `[3, 4]` at a time: between frames the logarithms of their gains are linear, beyond they stay."""
@@ -127,7 +134,8 @@ class RigCamera:
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
         """The camera of a body that stands at a pose while the image is read out."""
         world_from_cam = world_from_body @ self.body_from_cam
-        return Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure_at(time_us))
+        camera = Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), flat_field=self.flat_field)
+        return replace(camera, exposure=self.exposure_at(time_us))
 
     def along(self, ego: Trajectory, time_us: int) -> Camera:
         """The camera of a body on its way, from `time_us` on. ValueError for a time off the path."""

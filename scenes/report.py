@@ -224,6 +224,8 @@ def _scene_problems(scene: Scene, where: str) -> Iterator[str]:
             yield f"{where}: the exposure of camera {name} is not finite"
         if camera.gains is not None and not (camera.gains.isfinite() & (camera.gains > 0)).all():
             yield f"{where}: camera {name} has a frame whose gain is not a positive number"
+        if camera.flat_field is not None and not (camera.flat_field.isfinite() & (camera.flat_field > 0)).all():
+            yield f"{where}: the flat field of camera {name} has gains that are not positive numbers"
     if scene.ground is not None and not torch.isfinite(scene.ground.heights).all():
         yield f"{where}: the ground has heights that are not finite"
     for edit in scene.meta.get("edits", []):

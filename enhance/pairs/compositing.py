@@ -114,9 +114,7 @@ def _alone(actor: Actor, camera: Camera, scene: Scene) -> tuple[torch.Tensor, to
         frame = rasterize(placed, camera, ("rgb", "alpha"), model=scene.model_for(camera))
     assert frame.rgb is not None and frame.alpha is not None
     alpha = frame.alpha[..., None]
-    if camera.exposure is None:
-        return frame.rgb, alpha
-    return expose(frame.rgb / alpha.clamp_min(1 / 512), camera.exposure) * alpha, alpha
+    return expose(frame.rgb / alpha.clamp_min(1 / 512), camera) * alpha, alpha
 
 
 def light_left(frame: Frame, scene: Scene) -> torch.Tensor:

@@ -30,6 +30,7 @@ from render import render_frame
 from render.progress import Progress
 from render.references import References, Shot
 from render.video import from_bytes, to_bytes, write_image
+from scenes.camera import Camera, RigCamera
 from scenes.files import load, save
 from scenes.scene import Scene
 from scenes.usd.metadata import is_scene
@@ -107,13 +108,18 @@ def shots_of(log: Log, scene: Scene) -> list[Shot]:
     had been read at once, by that scene's depth."""
     return [
         Shot(
-            replace(camera.camera(i), exposure=scene.rig_camera(name).exposure_at(int(t))),
+            _exposed(camera.camera(i), scene.rig_camera(name)),
             partial(_read, scene, camera, i),
             camera.ego_mask,
         )
         for name, camera in log.cameras.items()
         for i, t in enumerate(camera.times_us)
     ]
+
+
+def _exposed(camera: Camera, like: RigCamera) -> Camera:
+    """A camera that takes its picture as one of a rig does at that time."""
+    return replace(camera, exposure=like.exposure_at(camera.time_us), flat_field=like.flat_field)
 
 
 def _read(scene: Scene, camera: LogCamera, index: int, width: int, height: int) -> np.ndarray:
@@ -197,7 +203,7 @@ def rendered_aside(scene: Scene, log: Log, folder: Path, metres: float, size: tu
 
 def _fit(scene: Scene, log: Log, path: Path, config: FitConfig, size: tuple[int, int], device: str) -> None:
     names, span = choose(log, list(log.cameras))
-    known = config.without("exposures", "gains")
+    known = config.without("exposures", "gains", "flat fields")
     start, fit = begin(log, names, span, size, known, held_out=0, device=device, exposed=scene.rig)
     with Progress(f"fit {path.name}", total=config.steps) as steps:
         while fit.step_count < config.steps:

@@ -15,6 +15,7 @@ from recon.objects.actors import box_skin
 from recon.views.frames import Frames
 from recon.views.project import nearest_around, project
 from recon.views.view import View
+from render.flat_field import evened
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
@@ -70,12 +71,13 @@ def photo_at(frames: Frames, name: str, time_us: int) -> View:
 
 def road_errors(shown: torch.Tensor, camera: Camera, view: View, recorded: Camera, points: np.ndarray) -> np.ndarray:
     """Squared errors `[M]`, means of three channels, of a picture `[H, W, 3]` of `camera`'s at points `[N, 3]` of the road, against what
-    the photo of `view`, taken by `recorded`, has there; of those that lie within both, and in the photo not on the recording car."""
-    colours, within = _looked_up(view.image.float() / 255, recorded, points)
+    the photo of `view`, taken by `recorded`, has there, wherever in their pictures it lies; of those that lie within both, and in the photo
+    not on the recording car."""
+    colours, within = _looked_up(evened(view.image.float() / 255, camera.flat_field), recorded, points)
     if view.ego is not None:
         on_car, _ = _looked_up(view.ego.float()[..., None], recorded, points)
         within &= on_car[:, 0] == 0
-    seen, there = _looked_up(shown.clamp(0, 1), camera, points)
+    seen, there = _looked_up(evened(shown.clamp(0, 1), camera.flat_field), camera, points)
     return (seen - colours).double().square().mean(1)[within & there].numpy()
 
 

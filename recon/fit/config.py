@@ -23,11 +23,11 @@ class FitConfig:
     """Steps between densifications."""
     grow_span: tuple[float, float] = (0.06, 0.6)
     """Part of the fit within which splats are added."""
-    refine: tuple[str, ...] = ("path", "surfaces", "road", "gains", *REFINED, "exposures", "limbs")
+    refine: tuple[str, ...] = ("path", "surfaces", "road", "gains", *REFINED, "exposures", "flat fields", "limbs")
     """What is corrected besides the splats and the sky: before the fit (`recon/registration`) the body's path by lidar (`align.py`), where
     cameras are fixed to it by what they show of lidar's surfaces (`mounts_by_surfaces.py`) and of the road (`mounts_by_road.py`), and how
     frames were exposed, by what several show (`recon/views/gains.py`); in it poses and clocks by kind, the cameras' exposures against the
-    first's, and how the limbs of people and animals stand."""
+    first's, how much of the light they show over their pictures, and how the limbs of people and animals stand."""
     poses_from: float = 0.1
     """Part of the fit from which poses are corrected."""
     dissimilarity: float = 0.2

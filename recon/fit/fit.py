@@ -11,6 +11,7 @@ import torch
 from recon.fit.densify import hold_shade, shade_of
 from recon.fit.descent import rates_at
 from recon.fit.develop import developed
+from recon.fit.flat_field import FlatField, due
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
@@ -75,12 +76,13 @@ class Fit:
         exposures: torch.Tensor,
         limbs: Limbs,
         measured: Sequence[Measured],
+        flat_fields: Sequence[FlatField],
     ):
         self.device, self.motion, self.config = population.device, population.motion, population.config
         self.frames, self.population, self.limbs = frames, population, limbs
         self.measured = [m.to(self.device) for m in measured]
         self.sky, self.exposures = sky.to(self.device), exposures.to(self.device)
-        self.first_sky = self.sky.clone()
+        self.first_sky, self.flat_fields = self.sky.clone(), flat_fields
         self.step_count = 0
         self.training = [view.to(self.device) for view in frames.training()]
         self.generator = torch.Generator().manual_seed(self.config.seed)
@@ -146,6 +148,8 @@ class Fit:
         outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
         drawn = self._render(by_lot, shot, sky, shift, outputs, blank)
         rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
+        if self._evening():
+            self.flat_fields[view.camera].compare(rgb, target)
         lattice = (STEP, *torch.randint(0, STEP, (2,), generator=self.generator).tolist())
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, lattice)
         haze = self.openings.haze(alpha, view, camera)
@@ -223,7 +227,8 @@ class Fit:
         theirs = None if of_groups is None else [of_groups[p.instance] for p in placed]
         drawn = draw(placed, camera, *outputs, features=theirs, scale=scale_of(view, camera))
         found = dict(zip(outputs, drawn, strict=True))
-        return found | {"rgb": developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)}
+        rgb = developed(found["rgb"], found["alpha"], sky, self._exposure(view), camera, shift)
+        return found | {"rgb": self.flat_fields[view.camera].over(rgb)}
 
     def _exposure(self, view: View) -> torch.Tensor:
         """The affine exposure `[3, 4]` of a view: its camera's, as many times as it was exposed."""
@@ -271,13 +276,20 @@ class Fit:
     # ---- which splats there are
 
     def _tend(self) -> None:
-        """Add, drop and colour splats where it is time to."""
+        """Add, drop and colour splats, and even cameras out, where it is time to."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
             self.population.grow(self.progress)
         if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
             self._refill()
+        if self._evening() and due(self.step_count, self.config.steps):
+            for field in self.flat_fields:
+                field.follow()
         if self.population.guessed is None and self.progress >= GUESSED_FROM:
             self.population.guess(self.shown)
+
+    def _evening(self) -> bool:
+        """Whether cameras' flat fields are found on the way."""
+        return "flat fields" in self.config.refine
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""
@@ -326,6 +338,7 @@ class Fit:
             "sky": self.sky.detach(),
             "first_sky": self.first_sky,
             "exposures": self.exposures.detach(),
+            "flat_fields": [field.tensors() for field in self.flat_fields],
             "motion": self.motion.tensors(),
             "limbs": self.limbs.tensors(),
             "adam": [o.state_dict() for o in (self.rest_adam, self.pose_adam)],
@@ -339,6 +352,8 @@ class Fit:
         """Go on from `tensors()` of another run, on whichever device: the same steps follow as would have followed there."""
         self.population.restore(state)
         self.sky, self.first_sky, self.exposures = (state[name].to(self.device) for name in ("sky", "first_sky", "exposures"))
+        for field, saved in zip(self.flat_fields, state["flat_fields"], strict=True):
+            field.restore(saved)
         self.motion.restore(state["motion"])
         self.limbs.restore(state["limbs"])
         self._optimise()

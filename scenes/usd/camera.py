@@ -48,5 +48,6 @@ def load_camera(stage: Usd.Stage, entry: dict, name: str) -> RigCamera:
     times = torch.tensor(entry["times_us"], dtype=torch.int64)
     shutter = entry.get("shutter", "global"), entry.get("readout_us", 0)  # absent from scenes of before, as what follows
     gains = None if entry.get("gains") is None else torch.tensor(entry["gains"], dtype=torch.float32)
-    taken, mount = (exposure, times, *shutter, gains, entry.get("fitted", True)), local_pose(prim) @ _FLIP
+    flat_field = None if entry.get("flat_field") is None else torch.tensor(entry["flat_field"], dtype=torch.float32)
+    taken, mount = (exposure, times, *shutter, gains, entry.get("fitted", True), flat_field), local_pose(prim) @ _FLIP
     return RigCamera(LENSES[kind](**lens), entry["width"], entry["height"], mount, *taken)

@@ -57,6 +57,7 @@ def metadata_text(scene: Scene, cameras: dict[str, str], origin: int) -> str:
             "readout_us": c.readout_us,
             "gains": None if c.gains is None else c.gains.detach().cpu().tolist(),
             "fitted": c.fitted,
+            "flat_field": None if c.flat_field is None else c.flat_field.detach().cpu().tolist(),
         }
         for name, c in scene.rig.items()
     }

@@ -42,6 +42,7 @@ def same(a: Scene, b: Scene, sky=True) -> None:
         assert torch.equal(x.exposure, y.exposure) and torch.equal(x.times_us, y.times_us)
         assert (x.shutter, x.readout_us, x.fitted) == (y.shutter, y.readout_us, y.fitted)
         assert y.gains is None if x.gains is None else torch.equal(x.gains, y.gains)
+        assert y.flat_field is None if x.flat_field is None else torch.equal(x.flat_field, y.flat_field)
         assert largest(x.body_from_cam, y.body_from_cam) < 1e-12
     assert (a.model, a.meta) == (b.model, b.meta)
     if a.ground is None:
@@ -62,6 +63,7 @@ def test_a_scene_returns(saved):
 def test_how_a_camera_reads_out_and_exposes_returns(tmp_path):
     made, gains = scene((), sky=False, ground=False), torch.tensor([[0.5, 0.6, 0.7], [1.5, 1.4, 1.3]])
     read = {"shutter": "rows", "readout_us": -30_000, "times_us": made.ego.times_us[:2], "gains": gains, "fitted": False}
+    read["flat_field"] = 0.5 + torch.rand(9, 16, 3)
     made = replace(made, rig={**made.rig, "left": replace(made.rig["left"], **read)})
     save(made, tmp_path / "s1")
     same(made, load(tmp_path / "s1"))
