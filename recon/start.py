@@ -25,6 +25,7 @@ from recon.seeds.dense import agreeing, cloud_from_pictures, points_of
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
+from recon.seeds.road import road_by_pictures
 from recon.seeds.standing import by_all_sweeps
 from recon.views.frames import Frames
 from recon.views.skies import SkyPicture, like_sky
@@ -109,8 +110,12 @@ def prepare(
     known = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
     if sparse is not None:
         agreed = agreeing(log, frames, sparse, estimate_ground(sparse.xyz, driven))
+        road = road_by_pictures(log, frames.names, driven, span_us, points_of(agreed), estimate_ground(points_of(agreed), driven))
+        lies = np.zeros((0, 3))
+        if road is not None:
+            agreed, lies = [own.on(road) for own in agreed], road.points()
         if not log.tracks:
-            movers = list(traffic(log, frames, estimate_ground(points_of(agreed), driven)))
+            movers = list(traffic(log, frames, estimate_ground(np.concatenate([points_of(agreed), lies]), driven)))
     report("sorting lidar points")
     split = split_points(log, sweeps, movers)
     taken_us = times_of(sweeps, split.static_sweep)
@@ -118,7 +123,8 @@ def prepare(
     if sparse is not None:
         gains = np.ones((len(frames.names), 3)) if known is None else known
         points, *measured = cloud_from_pictures(log, frames, sparse, agreed, movers, gains)
-        street = _Street(points, Cloud.cat([]), Cloud.cat([]), estimate_ground(points.xyz, driven), gains, measured)
+        shown = np.concatenate([points.xyz, lies])
+        street = _Street(points, Cloud.cat([]), Cloud.cat([]), estimate_ground(shown, driven), gains, measured)
     else:
         street = _lidar_street(log, frames, sweeps, split, movers, driven, taken_us, known, report)
     ground, gains = street.ground, street.gains
@@ -149,7 +155,7 @@ def prepare(
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
     splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
     of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
-    ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(street.points.xyz, ground, STRAY_IN_PICTURES)
+    ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(shown, ground, STRAY_IN_PICTURES)
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(street.measured), swept, *of_views)
 
 

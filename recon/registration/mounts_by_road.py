@@ -123,14 +123,14 @@ def mounts_by_road(
     return as_corrected(log, {REMOUNTED: found}) if found else log
 
 
-def far_pairs(camera: LogCamera, span_us: tuple[int, int], most: int = PAIRS) -> list[tuple[int, int]]:
-    """Indices of pictures of the span, and of the first taken `WAY` further on; `most` of them, spread over it."""
+def far_pairs(camera: LogCamera, span_us: tuple[int, int], most: int = PAIRS, way: float = WAY) -> list[tuple[int, int]]:
+    """Indices of pictures of the span, and of the first taken a `way` further on; `most` of them, spread over it."""
     times, places = camera.times_us.numpy(), camera.world_from_cam[:, :2, 3].numpy()
     chosen = np.flatnonzero((times >= span_us[0]) & (times <= span_us[1]))
     pairs = []
     for i in chosen:
         later = chosen[(chosen > i) & (times[chosen] - times[i] <= WITHIN_US)]
-        far = later[np.linalg.norm(places[later] - places[i], axis=1) >= WAY]
+        far = later[np.linalg.norm(places[later] - places[i], axis=1) >= way]
         if len(far):
             pairs.append((int(i), int(far[0])))
     return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, most).round().astype(int))] if pairs else []
@@ -186,8 +186,8 @@ def _apart(
     x, y = np.meshgrid(u, u, indexing="ij")
     spots = middle[:2] + x[..., None] * forward + y[..., None] * [-forward[1], forward[0]]
     spots = np.concatenate([spots, street.ground.height(torch.from_numpy(spots)).numpy()[..., None]], 2)
-    one = _laid_out(log, camera, first, grey, spots)
-    other = None if one is None else _laid_out(log, camera, second, grey, spots)
+    one = laid_out(log, camera, first, grey, spots)
+    other = None if one is None else laid_out(log, camera, second, grey, spots)
     if one is None or other is None:
         return None
     shift = _shift(one, other, math.ceil(OFF * (way + height) / STEP))
@@ -196,9 +196,9 @@ def _apart(
     return None if shift is None else (lever, -height * shift * STEP / (way + shift * STEP))
 
 
-def _laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.ndarray], spots: np.ndarray) -> np.ndarray | None:
-    """What a picture shows at spots `[X, Y, 3]` of the ground, seen from where the camera was as their rows were read; None where it does
-    not show all."""
+def laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.ndarray], spots: np.ndarray) -> np.ndarray | None:
+    """What a picture shows at spots `[X, Y, 3]` of the ground, seen from where the camera was as their rows were read, by its `grey` levels
+    of any size; None where it does not show all."""
     pose, time = camera.world_from_cam[index].numpy(), int(camera.times_us[index])
     speed = (log.ego.near(time + 50_000) - log.ego.near(time - 50_000))[:3, 3].numpy() / 100_000
     late = np.zeros((*spots.shape[:2], 1))
@@ -210,7 +210,9 @@ def _laid_out(log: Log, camera: LogCamera, index: int, grey: Callable[[int], np.
         if row.min() < 0 or column.min() < 0 or row.max() > camera.height or column.max() > camera.width:
             return None
         late = camera.late_us(column / camera.width, row / camera.height)[..., None]
-    return ndimage.map_coordinates(grey(index).astype(np.float32), [row - 0.5, column - 0.5], order=1, mode="nearest")
+    image = grey(index).astype(np.float32)
+    rows, columns = (n / size for n, size in zip(image.shape, (camera.height, camera.width), strict=True))
+    return ndimage.map_coordinates(image, [row * rows - 0.5, column * columns - 0.5], order=1, mode="nearest")
 
 
 def _shift(one: np.ndarray, other: np.ndarray, most: int) -> float | None:

@@ -13,6 +13,7 @@ from recon.log import Log, SparsePoints, Track
 from recon.seeds.ground_rays import ground_hits
 from recon.seeds.measured import PICTURES, Measured, by_pictures
 from recon.seeds.points import Cloud, nearest_box
+from recon.seeds.road import Road
 from recon.seeds.stereo import Plate, plate_of, swept
 from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
@@ -68,6 +69,12 @@ class Depths:
     def only(self, mask: np.ndarray) -> Depths:
         """The depths of a mask `[h, w]` alone."""
         return replace(self, depth=np.where(mask, self.depth, np.nan))
+
+    def on(self, road: Road) -> Depths:
+        """The depths with what may be the road on it, and without what is under it."""
+        off, slack = road.off(self.points())
+        depth = np.where(np.abs(off) < slack, ground_depth(self.plate, road.ground, 0.0), self.depth)
+        return replace(self, depth=np.where((off < -slack) & (slack > 0), np.nan, depth))
 
     def points(self) -> np.ndarray:
         """What its pixels show, `[h, w, 3]` in the world."""

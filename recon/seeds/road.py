@@ -1,0 +1,212 @@
+"""The road under a drive that has no lidar: of asphalt pictures tell little, but the cameras are carried along it at one height.
+
+It looks like nothing in particular, so that depths on which pictures agree may be decimetres off it, now above and now below, and from
+beside the path its lines wind. How high the path is above it, all of these depths and all pictures tell together: pieces of road are laid
+out at ever other heights, as two pictures show them, and correlated (a plane sweep, Collins 1996, along the path).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from recon.log import Log, LogCamera
+from recon.registration.mounts_by_road import far_pairs, laid_out
+from scenes.ground import Ground
+from scenes.trajectory import Trajectory
+
+WAY, PAIRS = 4.0, 24
+"""Metres between the pictures of a pair, and how many of a camera, spread over the drive."""
+
+PIXELS = 640
+"""Columns at which pictures are laid out, at most: finer grain is noise."""
+
+AHEAD, ROWS, ASIDE = np.arange(3.0, 12.0, 0.5), (0.0, 1.5, 3.0), (-2.5, 0.0, 2.5)
+"""Heights of the camera at which the nearest piece may lie before it, and others beyond it, and metres to the left of its view."""
+
+HALF, STEP, SMOOTH = (2.0, 1.25), 0.1, 0.6
+"""Metres: half of a piece's length and width, between its points, and over which its brightness is evened out."""
+
+RISES = np.linspace(-0.15, 0.15, 31)
+"""Parts of the cameras' height by which the road is tried to be higher than points say that it is in the middle."""
+
+FEWEST, ALIKE, PEAK = 12, 0.3, 0.05
+"""Pieces that are needed; how alike they are in the mean at the right height, at least; and how much more than a tenth of it beside."""
+
+TOLD, EVERY = 200, 4.0
+"""Points under the path that are needed to say where the road is, and metres of it over which the middle of them is taken."""
+
+WAVES = 0.06
+"""Metres off its middle up to which the road is taken to be where points show it."""
+
+WIDE, LONG = 3.0, 12.0
+"""Metres beside the path, and beyond its ends, up to which the road is known."""
+
+DRIVEN, OFF, KERB = 1.5, 0.6, 0.2
+"""Metres beside the path where the car drove: what is no more metres than this off the road is the road; and farther aside."""
+
+
+@dataclass(frozen=True)
+class Road:
+    """Its heights, in a ground, and how many metres off them all is the road, `[Y, X]`: 0 where it is not known."""
+
+    ground: Ground
+    slack: np.ndarray
+
+    def off(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Metres `[...]` by which points `[..., 3]`, NaN or not, are above it, and its slack there."""
+        known, points = np.isfinite(points).all(-1), np.nan_to_num(points)
+        place = np.round((points[..., :2] - np.array(self.ground.origin)) / self.ground.cell).astype(np.int64)
+        row, column = place[..., 1].clip(0, self.slack.shape[0] - 1), place[..., 0].clip(0, self.slack.shape[1] - 1)
+        above = points[..., 2] - self.ground.height(torch.from_numpy(points[..., :2])).numpy()
+        return np.where(known, above, np.nan), np.where(known, self.slack[row, column], 0.0)
+
+    def points(self) -> np.ndarray:
+        """Points `[N, 3]` that lie on it, four in each of its cells."""
+        row, column = np.nonzero(self.slack)
+        middles = np.stack([column, row], 1) * self.ground.cell + np.array(self.ground.origin)
+        quarters = self.ground.cell / 4 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        xy = (middles[:, None] + quarters).reshape(-1, 2)
+        return np.column_stack([xy, self.ground.height(torch.from_numpy(xy)).numpy()])
+
+
+class Path:
+    """A body's path `[N, 3]`, a point every metre, and straight on beyond its ends for `LONG`."""
+
+    def __init__(self, ego: Trajectory):
+        places = ego.world_from_body[:, :3, 3].numpy()
+        moved = np.concatenate([[True], np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 0.05])
+        places = places[moved]
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1))])
+        at = np.arange(0.0, way[-1] + 1.0)
+        inner = np.stack([np.interp(at, way, places[:, k]) for k in range(3)], 1)
+        # as it goes over the first and last metres: a single pose shakes
+        steps = min(len(inner) - 1, 5)
+        ends = [(inner[e] - inner[o]) / max(1, steps) for e, o in ((0, steps), (-1, -1 - steps))]
+        on = np.arange(1.0, LONG + 1.0)[:, None]
+        self.places = np.concatenate([(inner[0] + on * ends[0])[::-1], inner, inner[-1] + on * ends[1]])
+        self.length = way[-1]
+        self.tree = cKDTree(self.places[:, :2])
+
+    def beside(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of points `[N, 2]` how far along the path they are in metres, how far to its left, and how high it is there."""
+        nearest = self.tree.query(xy)[1].clip(1, len(self.places) - 2)
+        ahead = self.places[nearest + 1, :2] - self.places[nearest - 1, :2]
+        ahead /= np.maximum(1e-9, np.linalg.norm(ahead, axis=1))[:, None]
+        off = xy - self.places[nearest, :2]
+        along = nearest + (off * ahead).sum(1)
+        left = ahead[:, 0] * off[:, 1] - ahead[:, 1] * off[:, 0]
+        return along, left, np.interp(along, np.arange(len(self.places)), self.places[:, 2])
+
+
+def road_by_pictures(
+    log: Log, names: Sequence[str], ego: Trajectory, span_us: tuple[int, int], points: np.ndarray, guess: Ground
+) -> Road | None:
+    """The road along a body's path `ego`, which points `[N, 3]` show roughly, and the pictures of the cameras `names` in a span; in the
+    cells of a `guess` of the ground. None where points do not tell it."""
+    path = Path(ego)
+    along, left, level = path.beside(points[:, :2])
+    eyes = np.concatenate([log.camera(name).world_from_cam[:, :3, 3].numpy() for name in names])
+    mount = float(np.median(eyes[:, 2] - path.beside(eyes[:, :2])[2]))
+    near = (np.abs(left) < DRIVEN) & (along > LONG) & (along < len(path.places) - LONG) & (level - points[:, 2] + mount > 0)
+    under, along = (level - points[:, 2])[near], along[near]
+    if len(under) < TOLD or path.length < 2 * WAY:
+        return None
+    below = _mode(under)
+    stretch = (along / EVERY).astype(np.int64)
+    middles = np.array([np.median(under[stretch == k]) for k in np.unique(stretch)])
+    if np.median(np.abs(middles - below)) < WAVES:
+        return None  # nothing to do: it goes along with the path as it is
+    alike = [p for name in names for p in _pieces(log, log.camera(name), span_us, path, below, below + mount)]
+    return _laid(path, guess, below - (below + mount) * _rise(alike))
+
+
+def _rise(alike: Sequence[np.ndarray]) -> float:
+    """The part of the cameras' height by which the road is higher, as pieces of it are `alike` `[R]`; 0 where these do not tell."""
+    if len(alike) < FEWEST:
+        return 0.0
+    together = np.mean(alike, 0)
+    best = int(together[1:-1].argmax()) + 1
+    beside = np.interp([RISES[best] - 0.1, RISES[best] + 0.1], RISES, together)
+    if together[best] < ALIKE or together[best] - beside.max() < PEAK:
+        return 0.0
+    before, at, after = together[best - 1 : best + 2]
+    return float(RISES[best] + 0.5 * (before - after) / min(-1e-9, before - 2 * at + after) * (RISES[1] - RISES[0]))
+
+
+def _mode(values: np.ndarray) -> float:
+    """About where most values are: the middle of the shortest stretch that has half of them."""
+    ordered = np.sort(values)
+    half = len(ordered) // 2
+    first = int((ordered[half:] - ordered[: len(ordered) - half]).argmin())
+    return float(np.median(ordered[first : first + half + 1]))
+
+
+def _pieces(log: Log, camera: LogCamera, span_us: tuple[int, int], path: Path, below: float, height: float) -> list[np.ndarray]:
+    """How alike a camera's pairs of pictures show pieces of the road before it, `[R]` each, at each of `RISES` of its height from what is
+    `below` the path."""
+
+    @lru_cache(16)
+    def grey(index: int) -> np.ndarray:
+        width = min(PIXELS, camera.width)
+        return camera.image(index, width, round(camera.height * width / camera.width)).mean(2).astype(np.uint8)
+
+    x, y = np.meshgrid(*(np.arange(-half, half + STEP / 2, STEP) for half in HALF), indexing="ij")
+    middle = x.shape[0] // 2, x.shape[1] // 2
+    found = []
+    for pair in far_pairs(camera, span_us, PAIRS, WAY):
+        eye, view = camera.world_from_cam[pair[1], :2, 3].numpy(), camera.world_from_cam[pair[1], :2, 2].numpy()
+        view = view / max(1e-6, float(np.linalg.norm(view)))
+        left = np.array([-view[1], view[0]])
+
+        def piece(ahead: float, aside: float, pair=pair, eye=eye, view=view, left=left) -> np.ndarray | None:
+            xy = eye + (ahead * height + x)[..., None] * view + (aside + y)[..., None] * left
+            _, beside, level = (v.reshape(x.shape) for v in path.beside(xy.reshape(-1, 2)))
+            if abs(beside[middle]) > WIDE:
+                return None
+            return _alike(log, camera, pair, grey, xy, level - below + height * RISES[:, None, None])
+
+        # the nearest that is shown, and no more than some beyond it: farther on the car ahead may hide the road
+        nearest = next((ahead for ahead in AHEAD if piece(ahead, 0.0) is not None), None)
+        if nearest is not None:
+            made = (piece(nearest + row, aside) for row in ROWS for aside in ASIDE)
+            found += [p for p in made if p is not None]
+    return found
+
+
+def _alike(
+    log: Log, camera: LogCamera, pair: tuple[int, int], grey: Callable[[int], np.ndarray], xy: np.ndarray, levels: np.ndarray
+) -> np.ndarray | None:
+    """Correlations `[R]` of what two pictures show at places `[X, Y, 2]`, at each of the levels `[R, X, Y]`; None where they do not show
+    all of them."""
+    spots = np.concatenate([np.broadcast_to(xy, (*levels.shape, 2)), levels[..., None]], -1)
+    shown = []
+    for index in pair:
+        image = laid_out(log, camera, index, grey, spots.reshape(-1, *spots.shape[2:]))
+        if image is None:
+            return None
+        image = image.reshape(levels.shape)
+        shown.append(image - ndimage.gaussian_filter(image, (0, SMOOTH / STEP, SMOOTH / STEP)))
+    one, other = shown
+    return (one * other).sum((1, 2)) / np.maximum(1e-6, np.linalg.norm(one, axis=(1, 2)) * np.linalg.norm(other, axis=(1, 2)))
+
+
+def _laid(path: Path, guess: Ground, below: float) -> Road:
+    """The road so many metres below a path, in a ground's cells."""
+    rows, columns = guess.heights.shape
+    x, y = (origin + guess.cell * np.arange(n) for origin, n in zip(guess.origin, (columns, rows), strict=True))
+    xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    far, _ = path.tree.query(xy, distance_upper_bound=WIDE + 4 * guess.cell)
+    cells = np.flatnonzero(np.isfinite(far))
+    along, left, level = path.beside(xy[cells])
+    heights, slack = guess.heights.numpy().astype(np.float64).ravel(), np.zeros(rows * columns)
+    heights[cells] = level - below  # also of the cells around those that are known, between which heights are linear
+    within = (np.abs(left) < WIDE) & (along > 1) & (along < len(path.places) - 2)
+    slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, OFF, KERB)
+    return Road(replace(guess, heights=torch.from_numpy(heights.reshape(rows, columns)).float()), slack.reshape(rows, columns))
