@@ -45,11 +45,12 @@ TOLD, EVERY = 200, 4.0
 WAVES = 0.06
 """Metres off its middle up to which the road is taken to be where points show it."""
 
-WIDE, LONG = 3.0, 12.0
+WIDE, LONG = 4.0, 12.0
 """Metres beside the path, and beyond its ends, up to which the road is known."""
 
-DRIVEN, OFF, KERB = 1.5, 0.6, 0.2
-"""Metres beside the path where the car drove: what is no more metres than this off the road is the road; and farther aside."""
+DRIVEN, OFF, KERB, NOISE = 1.5, 0.6, 0.2, 2.5
+"""Metres beside the path where the car drove: what is no more metres than this off the road is the road; farther aside so many at least,
+or times how far points are off it in the median."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +122,11 @@ def road_by_pictures(
     below = _mode(under)
     stretch = (along / EVERY).astype(np.int64)
     middles = np.array([np.median(under[stretch == k]) for k in np.unique(stretch)])
-    if np.median(np.abs(middles - below)) < WAVES:
+    waves = float(np.median(np.abs(middles - below)))
+    if waves < WAVES:
         return None  # nothing to do: it goes along with the path as it is
     alike = [p for name in names for p in _pieces(log, log.camera(name), span_us, path, below, below + mount)]
-    return _laid(path, guess, below - (below + mount) * _rise(alike))
+    return _laid(path, guess, below - (below + mount) * _rise(alike), min(OFF, max(KERB, NOISE * waves)))
 
 
 def _rise(alike: Sequence[np.ndarray]) -> float:
@@ -197,8 +199,8 @@ def _alike(
     return (one * other).sum((1, 2)) / np.maximum(1e-6, np.linalg.norm(one, axis=(1, 2)) * np.linalg.norm(other, axis=(1, 2)))
 
 
-def _laid(path: Path, guess: Ground, below: float) -> Road:
-    """The road so many metres below a path, in a ground's cells."""
+def _laid(path: Path, guess: Ground, below: float, beside: float) -> Road:
+    """The road so many metres below a path, in a ground's cells; beside: its slack where the car did not drive."""
     rows, columns = guess.heights.shape
     x, y = (origin + guess.cell * np.arange(n) for origin, n in zip(guess.origin, (columns, rows), strict=True))
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -208,5 +210,5 @@ def _laid(path: Path, guess: Ground, below: float) -> Road:
     heights, slack = guess.heights.numpy().astype(np.float64).ravel(), np.zeros(rows * columns)
     heights[cells] = level - below  # also of the cells around those that are known, between which heights are linear
     within = (np.abs(left) < WIDE) & (along > 1) & (along < len(path.places) - 2)
-    slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, OFF, KERB)
+    slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, OFF, beside)
     return Road(replace(guess, heights=torch.from_numpy(heights.reshape(rows, columns)).float()), slack.reshape(rows, columns))
