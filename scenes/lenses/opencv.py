@@ -13,6 +13,10 @@ from scenes.lenses.lens import Lens, Number, first_fall, kept, solve_rising
 RING_STEPS = 256
 """Angles at which the determinant is looked at in all directions, before the first where it falls is looked into."""
 
+STEEPEST = 100.0
+"""How much further than on the axis a step outward may lead, beside a pole of the radial factor: a splat that reaches all the way to it
+would have a footprint of rounding alone. A polynomial is as steep more than ten focal lengths out, beyond any picture."""
+
 
 @dataclass(frozen=True)
 class OpenCV(Lens):
@@ -22,7 +26,7 @@ class OpenCV(Lens):
     With x, y = X/Z, Y/Z and q = x^2 + y^2, the pinhole sees
     x (1 + k1 q + k2 q^2 + k3 q^3) / (1 + k4 q + k5 q^2 + k6 q^3) + 2 p1 x y + p2 (q + 2 x^2) + s1 q + s2 q^2, and
     y (...) + p1 (q + 2 y^2) + 2 p2 x y + s3 q + s4 q^2.
-    The domain ends where, in some direction, the Jacobian's determinant first stops being positive.
+    The domain ends where, in some direction, the Jacobian's determinant first stops being positive, or just before a pole.
     """
 
     kind: ClassVar[str] = "opencv"
@@ -135,6 +139,7 @@ def _fold(lens: OpenCV) -> float:
 def _radial_fold(lens: OpenCV) -> float:
     def margin(angle: torch.Tensor) -> torch.Tensor:
         r = angle.tan()
-        return torch.minimum(_denominator(lens, r * r), lens._radial_slope(r))
+        slope = lens._radial_slope(r)
+        return torch.minimum(_denominator(lens, r * r), torch.minimum(slope, STEEPEST - slope))
 
     return first_fall(margin, math.pi / 2)

@@ -69,6 +69,18 @@ def test_every_lens_draws_what_the_oracle_draws(make, name, model):
     assert (frame.instance != instance)[sure & ((alpha - 0.5).abs() > 1e-4)].float().mean() < 0.002
 
 
+def test_splats_that_reach_a_pole_of_the_lens_are_drawn_as_the_oracle_draws_them():
+    """The radial factor's denominator is 0 at 77 degrees. While the domain went up to there, footprints were endless by rounding."""
+    camera = camera_of(OpenCV(17.0, 18.0, 28.0, 20.0, 0.003, -0.001, k4=-0.0022, k5=0.0003, k6=-0.00016))
+    g = random_splats(60, 3, sh_count=4)
+    angles = torch.linspace(1.1, 1.33, 60)
+    placed = [Placed(replace(g, means=torch.stack([2 * angles.sin(), 0.3 * g.means[:, 1], 2 * angles.cos()], 1)), camera.world_from_cam)]
+    rgb, alpha, *_, unsure = oracle.render(oracle.as_oracle(placed), camera, SplatModel(), cutoff=1e-8, alpha_max=0.999)
+    drawn = rasterize(placed, camera, ("rgb",), config=EXACT).rgb
+    assert alpha.max() > 0.3
+    assert largest(drawn, rgb, ~unsure) < 2e-5 * max(1.0, float(rgb.detach().max()))
+
+
 def gradients(placed: list[Placed], camera: Camera, model: SplatModel):
     """(name, ours, the oracle's) for every field, start and end pose, and lens parameter, of a random loss on rgb, alpha, depth."""
     truth = oracle.as_oracle(placed)

@@ -8,6 +8,7 @@ import torch
 
 from scenes import Camera, Equirectangular, Fisheye, FTheta, OpenCV, Orthographic, Pinhole, load, save
 from scenes.lenses import LENSES
+from scenes.lenses.opencv import STEEPEST
 from tests import randomized
 
 RATIONAL = (0.2, 0.1, 0.001, -0.002, 0.01, 0.3, 0.05, 0.01)
@@ -88,6 +89,13 @@ def test_the_domain_ends_where_the_distortion_folds_over(lens, end):
     beyond = edge + torch.tensor([[0.5, 0.0]], dtype=torch.float64)
     assert (lens.unproject(beyond) == 0).all(), "no direction leads past the edge"
     assert lens.unproject(edge - 0.5 * (beyond - edge)).norm() > 0.9
+
+
+def test_the_domain_ends_before_a_pole():
+    """r / (1 - r^2 / 4) goes to infinity at r = 2; what a domain up to there showed of splats that reach there was rounding."""
+    lens = OpenCV(60.0, 60.0, 32.0, 24.0, k4=-0.25)
+    r = torch.tensor(math.tan(lens.limit()), dtype=torch.float64)
+    assert 1.8 < r < 2 and float(lens._radial_slope(r)) == pytest.approx(STEEPEST, rel=1e-6)
 
 
 def test_a_fisheye_sees_behind_itself():
@@ -184,9 +192,10 @@ def test_where_a_bent_lens_ends_is_found_as_by_looking_at_every_angle_and_at_onc
             looked.clear()
             limit = lens.limit()
             assert sum(looked) < 60_000
-            # inside, every direction sees; just outside, some direction does not, or nothing is left to see
+            steep = float(lens._radial_slope(torch.tensor(math.tan(limit), dtype=torch.float64))) > 0.99 * STEEPEST
+            # inside, every direction sees; just outside, some direction does not, or nothing is left to see, or it ends before a pole
             for angle, sees in ((limit - 1e-3, True), (limit + 1e-3, False)):
                 if angle < math.pi / 2 - 2e-3:
                     ring = torch.stack([around.cos(), around.sin()], -1) * math.tan(angle)
                     det = torch.linalg.det(jacobian(lens, ring))
-                    assert bool((det > 0).all()) == sees or bent == 0
+                    assert bool((det > 0).all()) == sees or bent == 0 or steep
