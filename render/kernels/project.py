@@ -115,7 +115,7 @@ def project_backward(
             r_splat = rotation(quats[i])
             scale = wp.vec3d(exp_scale(log_scales[i]))
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            g = gather(ellipse(t, f, view), sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
+            g = gather(ellipse(t, f, view), logit_opacities[i], view, slots, starts[j], counts[j])
             g_logit_opacities[i] = g.logit
 
             uv = cross2(f.u.e, f.v.e)

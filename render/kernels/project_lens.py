@@ -148,7 +148,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 axes = scaled_axes(quats[i], log_scales[i])
                 q = spread(optics, motion, x, axes, c, view.unscented)
                 e = ellipse(optics, motion, q)
-                g = gather(e, sigmoid(logit_opacities[i]), view, slots, starts[j], counts[j])
+                g = gather(e, logit_opacities[i], view, slots, starts[j], counts[j])
                 g_logit_opacities[i] = g.logit
                 g_mean_px = wp.vec2d(g.x, g.y)
                 g_v = covariance_backward(q.v, g.xx, g.xy, g.yy, g.det0)

@@ -6,6 +6,7 @@ Nothing from here on knows of lenses or shutters.
 import warp as wp
 
 from render.kernels.bin import ROOM, note_reach, span_of, within
+from render.kernels.fields import sigmoid
 from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
@@ -160,8 +161,9 @@ def cull(depth_keys: wp.array[int], counts: wp.array[int], j: int):
 
 
 @wp.func
-def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: int, count: int):
-    """Sum a splat's slots in fixed order and carry them from its record to its ellipse; o is its opacity."""
+def gather(e: Ellipse, logit: float, view: View, slots: wp.array2d[float], start: int, count: int):
+    """Sum a splat's slots in fixed order and carry them from its record to its ellipse; logit is its opacity's."""
+    o = sigmoid(logit)
     g = vec_gradients()
     for slot in range(start, start + count):
         for c in range(GRADIENTS):
@@ -192,7 +194,7 @@ def gather(e: Ellipse, o: float, view: View, slots: wp.array2d[float], start: in
         by_rest = g_ratio * rest * det / less
         out.det0 += g_ratio * smoothing * (e.xx + e.yy + dilation + rest) / less
         g_o = g_o * ratio
-    out.logit = float(g_o) * o * (1.0 - o)
+    out.logit = float(g_o) * o * sigmoid(-logit)  # 1 - o, which loses its digits where o is nearly 1
     out.xx = g_trace * dilation + by_rest
     out.yy = (HALF * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * dilation + by_rest
     out.x = g[G_X]
