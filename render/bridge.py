@@ -88,12 +88,12 @@ def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, featur
 
 def pictures(settings: Settings, picture: Picture) -> tuple[torch.Tensor | None, ...]:
     """What `Rasterize` gives; None for what is not wanted."""
-    alpha = 1 - picture.planes[0]
+    passing = picture.planes[0]
     z, weights = picture.planes[4:6] if settings.wanted.depth else (None, None)
     channels = picture.planes[settings.wanted.first_channel :] if settings.wanted.channels else None
     median = picture.picks[MEDIAN] if settings.wanted.median else None
-    instance = torch.where(alpha < 0.5, -1, picture.picks[WHO]).to(torch.int32) if settings.wanted.instance else None
-    return picture.planes[1:4], alpha, z, weights, channels, median, instance
+    instance = torch.where(passing > 0.5, -1, picture.picks[WHO]).to(torch.int32) if settings.wanted.instance else None
+    return picture.planes[1:4], passing, z, weights, channels, median, instance
 
 
 def drawn_only(settings: Settings, seen, poses, lens, features, frames, rays, *fields) -> tuple[torch.Tensor | None, ...]:
@@ -110,10 +110,11 @@ class Rasterize(torch.autograd.Function):
 
     (settings, items seen of each instance as `work` takes them, poses [P, C, 4, 4] f64 as `projection.poses`, lens parameters f64,
     features [N, C] of all splats or None, canonical frames [N, FRAME] where these have gradients, rays [G, C, H, W] where pixels look
-    along their own, 5 fields of P instances) -> rgb [3, H, W], alpha, sum of w z, sum of w, sums of w features [C, H, W], median depth (0
-    where there is none), instance.
+    along their own, 5 fields of P instances) -> rgb [3, H, W], light that passes, T = 1 - alpha, sum of w z, sum of w, sums of w features
+    [C, H, W], median depth (0 where there is none), instance.
 
-    The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it.
+    The weights are summed beside z, since 1 - T has lost its digits where alpha is small and depth divides by it; as 1 - alpha has where T
+    is small, by which a background is seen.
     """
 
     @staticmethod
@@ -131,13 +132,13 @@ class Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # kernels leave no trace: a gradient of gradients is refused, not taken as 0
-    def backward(ctx, g_rgb, g_alpha, g_z, g_weights, g_channels, _g_median, _g_instance):
+    def backward(ctx, g_rgb, g_passing, g_z, g_weights, g_channels, _g_median, _g_instance):
         _unchanged = ctx.saved_tensors  # raises where a field was written to
         settings, device, groups = ctx.settings, ctx.scene.records.device, ctx.work.groups
         threads, instances = _threads(device), len(ctx.like_poses)
         outs, shared, jobs = [], [], []
         with stage(device):
-            slots = draw_backward(settings, ctx.scene, ctx.parts, [-g_alpha[None], g_rgb, g_z, g_weights, g_channels])
+            slots = draw_backward(settings, ctx.scene, ctx.parts, [g_passing[None], g_rgb, g_z, g_weights, g_channels])
             ways = projection(settings.lens, settings.rolling)
             for g in groups:
                 outs.append([torch.empty_like(f) for f in g.fields])

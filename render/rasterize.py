@@ -170,12 +170,13 @@ def _draw(
     return Frame(camera=camera, **{name: frame[name] for name in outputs})
 
 
-def picture_of(settings: Settings, background, rgb, alpha, z, weights, sums, median, instance) -> dict[str, torch.Tensor]:
+def picture_of(settings: Settings, background, rgb, passing, z, weights, sums, median, instance) -> dict[str, torch.Tensor]:
     """A frame's fields by name, and "sums" of all channels `[H, W, C]`, from what `Rasterize` gives."""
-    frame = {"alpha": alpha, "rgb": rgb.permute(1, 2, 0), "instance": instance}
+    frame = {"alpha": 1 - passing, "rgb": rgb.permute(1, 2, 0), "instance": instance}
     if background is not None:
         behind = background if background.ndim == 1 else background[settings.of_image]
-        frame["rgb"] = frame["rgb"] + (1 - alpha)[..., None] * behind.to(alpha)
+        # not 1 - alpha, which has lost the digits of what little light passes
+        frame["rgb"] = frame["rgb"] + passing[..., None] * behind.to(passing)
     if settings.wanted.depth:
         # the safe denominator keeps the gradient finite where nothing was drawn
         drawn = weights > 0

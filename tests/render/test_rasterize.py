@@ -141,6 +141,17 @@ def test_gradients_of_needles_agree_with_the_oracle(seed):
             assert_gradient(name, mine, reference)
 
 
+def test_gradients_of_nearly_opaque_splats_agree_with_the_oracle():
+    """Logits to 30, of which 1 - opacity in floats has lost the digits, and from 17 on all."""
+    for logits in ((4.0, 10.0), (12.0, 30.0)):
+        placed = [
+            replace(p, gaussians=replace(p.gaussians, logit_opacities=torch.linspace(*logits, len(p.gaussians)))) for p in two_instances(4)
+        ]
+        for name, mine, reference in gradients_of_both(placed, MODELS[2]):
+            if name.startswith("logit"):
+                assert_gradient(name, mine, reference)
+
+
 def test_the_oracles_gradients_are_its_finite_differences():
     placed = [Placed(random_splats(6, 3), translation(0, 0, 5))]
     camera = CAMERA.resized(14, 10)
@@ -179,6 +190,20 @@ def test_zero_splats_renders_background():
     frame = rasterize(Gaussians.empty(), CAMERA, ("rgb", "alpha", "depth", "instance"), background=sky)
     assert torch.equal(frame.rgb, sky.expand(50, 70, 3))
     assert (frame.alpha == 0).all() and frame.depth.isinf().all() and (frame.instance == -1).all()
+
+
+def test_a_background_behind_what_is_nearly_opaque_has_the_oracles_gradient():
+    """What passes there, T, has lost its digits in 1 - alpha: by that it would be 5 tolerances off."""
+    g = random_splats(3, 3, sh_count=1)
+    g = replace(
+        g, means=torch.tensor([[0.0, 0, z] for z in range(3)]), log_scales=torch.full((3, 3), 3.0), logit_opacities=torch.full((3,), 5.0)
+    )
+    placed, background = [Placed(g, translation(0, 0, 5))], torch.zeros(4, 5, 3, requires_grad=True)
+    camera = replace(CAMERA.resized(5, 4), world_from_cam=torch.eye(4, dtype=torch.float64))
+    rasterize(placed, camera, ("rgb",), background, model=MODELS[2], config=EXACT).rgb.sum().backward()
+    _, alpha, *_ = oracle.render(oracle.as_oracle(placed), camera, MODELS[2], alpha_max=0.999)
+    assert alpha.min() > 1 - 1e-4
+    assert of_tolerance(background.grad[..., 0], 1 - alpha.detach()).max() < 1
 
 
 def test_hidden_splats_do_not_perturb_render():
