@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import torch
 
+from render.projection import at_their_moments
+from scenes.camera import Camera
 from scenes.checks import check_tensor
 from scenes.gaussians import Gaussians, Placed
-from scenes.lenses import Lens, Orthographic
+from scenes.lenses import Orthographic
 from scenes.poses import matrix_from_quat
 
 MOST = 128
@@ -18,30 +20,32 @@ Features = torch.Tensor | Sequence[torch.Tensor]
 
 
 def channel_fields(
-    outputs: Sequence[str], placed: Sequence[Placed], cam_from_local: torch.Tensor, lens: Lens, features: Features | None
+    outputs: Sequence[str], placed: Sequence[Placed], cam_from_local: torch.Tensor, camera: Camera, features: Features | None
 ) -> dict[str, torch.Tensor]:
-    """By output, float32 `[N, C]` over the splats of all instances. ValueError for features that do not fit."""
+    """By output, float32 `[N, C]` over the splats of all instances, whose poses are as of `poses`. ValueError for features that do not
+    fit."""
     fields = {}
     if "features" in outputs:
         fields["features"] = _features(placed, features)
     if "normal" in outputs:
-        fields["normal"] = torch.cat([normals(p.gaussians, pose, lens) for p, pose in zip(placed, cam_from_local, strict=True)])
+        fields["normal"] = torch.cat([normals(p.gaussians, pose, camera) for p, pose in zip(placed, cam_from_local, strict=True)])
     if "instance_alpha" in outputs:
         which = torch.repeat_interleave(torch.arange(len(placed)), torch.tensor([len(p.gaussians) for p in placed]))
         fields["instance_alpha"] = torch.nn.functional.one_hot(which, len(placed)).to(placed[0].gaussians.device, torch.float32)
     return fields
 
 
-def normals(gaussians: Gaussians, cam_from_local: torch.Tensor, lens: Lens) -> torch.Tensor:
-    """Unit vectors `[N, 3]` in the camera along each splat's shortest axis, turned towards where it is seen from."""
-    pose = cam_from_local.to(gaussians.device, torch.float32)
+def normals(gaussians: Gaussians, cam_from_local: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """Unit vectors `[N, 3]` in the camera along each splat's shortest axis, turned towards where it is seen from, as it is read out."""
+    pose = at_their_moments(camera, cam_from_local, gaussians.means).to(torch.float32)
     shortest = gaussians.log_scales.detach().argmin(1)
     axis = matrix_from_quat(gaussians.quats)[torch.arange(len(gaussians), device=gaussians.device), :, shortest]
-    normal = axis @ pose[:3, :3].T
-    if isinstance(lens, Orthographic):
+    normal = (pose[:, :3, :3] @ axis[:, :, None])[..., 0]
+    if isinstance(camera.lens, Orthographic):
         away = normal[:, 2] > 0
     else:
-        away = (normal * (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).detach()).sum(-1) > 0
+        sight = (pose[:, :3, :3] @ gaussians.means[:, :, None])[..., 0] + pose[:, :3, 3]
+        away = (normal * sight.detach()).sum(-1) > 0
     return torch.where(away[:, None], -normal, normal)
 
 

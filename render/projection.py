@@ -35,6 +35,9 @@ LARGEST_TURN = math.radians(60)
 """How far a pose may turn while the image is read out: where camera and instance both do, against each other, what the kernels write
 their motion by (`kernels/motion.py`) is off by 1e-4 of a radian."""
 
+READINGS = 20
+"""Steps towards the moment at which a point is read out: of one that moves by a tenth of the image meanwhile, 1e-20 is left."""
+
 _NODES = torch.linspace(0, 1, POWERS, dtype=torch.float64)
 _POLYNOMIAL = torch.linalg.inv(_NODES[:, None] ** torch.arange(POWERS))
 """Coefficients of the polynomial through values at the nodes."""
@@ -54,6 +57,34 @@ def poses(camera: Camera, placed: Sequence[Placed]) -> torch.Tensor:
     cam_from_world = inverse(_along(camera.world_from_cam, camera.world_from_cam_end))
     nodes = torch.stack([cam_from_world @ _along(p.world_from_local, p.world_from_local_end) for p in placed])
     return torch.einsum("kn,pnij->pkij", _POLYNOMIAL.to(nodes.device), nodes)
+
+
+def at_their_moments(camera: Camera, cam_from_local: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """float64 `[N, 4, 4]`: an instance's pose, one of `poses`, as each of its `points` `[N, 3]` is read out, on their device; `[1, 4, 4]`
+    where nothing moves. Differentiable: the moment's gradient is its equation's (implicit function theorem)."""
+    cam_from_local = cam_from_local.to(points.device)
+    if len(cam_from_local) == 1:
+        return cam_from_local
+    points = points.to(torch.float64)
+    axis, extent = (0, camera.width) if camera.shutter == "columns" else (1, camera.height)
+
+    def pose(share: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("nk,kij->nij", share[:, None] ** torch.arange(POWERS, device=share.device), cam_from_local)
+
+    def line(share: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        at = pose(share)
+        return camera.lens.project((at[:, :3, :3] @ points[:, :, None])[..., 0] + at[:, :3, 3])[:, axis] / extent
+
+    with torch.no_grad():
+        share = torch.full_like(points[:, 0], 0.5)
+        for _ in range(READINGS):
+            share = line(share, points).nan_to_num(0.5).clamp(0, 1)
+        (seen,) = ((line(share, points) - share).abs() < 1e-6).nonzero(as_tuple=True)  # others have no gradient, which might be nan
+    at, those = share[seen], points[seen]
+    with torch.enable_grad():
+        leaf = at.clone().requires_grad_()
+        (rate,) = torch.autograd.grad(line(leaf, those).sum(), leaf)
+    return pose(share.index_put((seen,), at + (line(at, those) - at) / (1 - rate)))
 
 
 def _along(start: torch.Tensor, end: torch.Tensor | None) -> torch.Tensor:

@@ -120,7 +120,7 @@ def _draw(
         placed = [p if g is p.gaussians else replace(p, gaussians=g) for p, g in zip(placed, lean, strict=True)]
         seen = in_sight(placed, camera, model)
     cam_from_local = poses(camera, placed)
-    summed = channel_fields(outputs, placed, cam_from_local[:, 0], camera.lens, features)
+    summed = channel_fields(outputs, placed, cam_from_local, camera, features)
     channels = torch.cat(list(summed.values()), 1) if summed else None
     if channels is not None and seen is not None:
         channels = channels[splats_in_sight(placed, seen)]

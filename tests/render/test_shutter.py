@@ -11,9 +11,10 @@ from render.projection import poses
 from render.rays import world_directions
 from scenes import Camera, Equirectangular, Fisheye, OpenCV, Pinhole, Placed, SplatModel, load, save
 from scenes.poses import interpolate, inverse, matrix_from_quat, pose_from, translation
-from tests import oracle
+from tests import oracle, oracle_lens
 from tests.bench.presets import random_splats
-from tests.render.test_lenses import HEIGHT, LENSES, START, WIDTH, gradients
+from tests.render.test_lenses import EXACT, HEIGHT, LENSES, START, WIDTH, gradients
+from tests.render.test_outputs import leaves
 from tests.render.test_rasterize import assert_gradient, largest, of_tolerance
 
 PINHOLE = Pinhole(48.0, 50.0, 27.0, 18.0)
@@ -218,6 +219,43 @@ def test_flow_leads_to_where_a_splat_stands_in_the_other_frame(lens, here, there
     assert (frame.flow_next[y, x] - (after - before))[shown].abs().max() < 0.2  # the pixel's centre is not the splat's
     moved = after - before
     assert (moved[driving].mean(0) - moved[~driving].mean(0)).norm() > 0.5, "the motion must show"
+
+
+@pytest.mark.parametrize(("lens", "shutter"), [(PINHOLE, "rows"), (FISHEYE, "columns")], ids=["pinhole-rows", "fisheye-columns"])
+def test_normals_are_those_of_the_moments_at_which_splats_are_seen(lens, shutter):
+    """In the camera as it has turned by then, by up to 20 degrees; with gradients through the moments."""
+    placed, camera = traffic(5), driven(lens, shutter, rate=600)
+    leaf = lambda t: None if t is None else t.clone().requires_grad_()  # noqa: E731
+    truth, ends = oracle.as_oracle(placed), [leaf(p.world_from_local_end) for p in placed]
+    start, end = leaf(camera.world_from_cam), leaf(camera.world_from_cam_end)
+    painted = []
+    for (g, pose, instance), instance_end in zip(truth, ends, strict=True):
+        at = oracle_lens.pose_at((start, end), (pose, instance_end))
+        then = at(oracle_lens.readout(lens, camera, at, g["means"], torch.zeros_like(g["means"]), True))
+        shortest = g["log_scales"].argmin(1)
+        axis = matrix_from_quat(g["quats"])[torch.arange(len(shortest)), :, shortest]
+        axis = (then[:, :3, :3] @ axis[..., None])[..., 0]
+        away = (axis * oracle_lens.transformed(then, g["means"])).sum(-1) > 0
+        painted.append(({**g, "features": torch.where(away[:, None], -axis, axis)}, pose, instance))
+    *_, sums = oracle.render(
+        painted, camera, SplatModel(), start, cutoff=1e-8, alpha_max=0.999, world_from_cam_end=end, ends=ends, features=True
+    )
+    solid = sums.detach().norm(dim=-1) > 0.2
+    weights = torch.randn(*sums.shape, generator=torch.Generator().manual_seed(1)).double() * solid[..., None]
+    exact = sums / sums.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    (exact * weights).sum().backward()
+    mine = [replace(p, world_from_local_end=leaf(p.world_from_local_end)) for p in leaves(placed)]
+    moved = replace(camera, world_from_cam=leaf(camera.world_from_cam), world_from_cam_end=leaf(camera.world_from_cam_end))
+    normal = rasterize(mine, moved, ("normal",), config=EXACT).normal
+    assert solid.float().mean() > 0.1 and (normal - exact)[solid].abs().max() < 2e-4
+    (normal * weights).sum().backward()
+    more = [("camera pose", moved.world_from_cam, start), ("end pose", moved.world_from_cam_end, end)]
+    of_ends = [(f"end pose of {i}", p.world_from_local_end, e) for i, (p, e) in enumerate(zip(mine, ends, strict=True)) if e is not None]
+    for name, a, b in more + of_ends:
+        assert_gradient(name, a.grad[:3], b.grad[:3])
+    for p, (fields, *_) in zip(mine, truth, strict=True):
+        for name in ("means", "quats"):
+            assert_gradient(name, getattr(p.gaussians, name).grad, fields[name].grad)
 
 
 def test_moving_splats_and_camera_by_the_same_motion_shows_nothing_of_it():
