@@ -88,8 +88,9 @@ def rasterize(
     gradients. The frame may lack splats until `room.held` confirms it, as `one_ahead` does.
 
     rgb, alpha, depth, normal, features and instance_alpha are differentiable in every field of the splats, every pose (camera and
-    instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn. What is found out about
-    a tensor of splats is kept until it is written to; torch does not count writes through numpy or `.data`, so make a new one for these.
+    instance), the lens, the features and the background. Splats whose centre is nearer than 0.1 m are not drawn, nor those that a camera
+    drives through while it reads out. What is found out about a tensor of splats is kept until it is written to; torch does not count
+    writes through numpy or `.data`, so make a new one for these.
     ValueError for what cannot be drawn.
     """
     outputs = check_outputs(outputs)

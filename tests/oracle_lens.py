@@ -132,7 +132,9 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
     points = transformed(at, g["means"])
     local = matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
     axes = at[..., :3, :3] @ local
-    rows = shown(lens, camera, model, points, axes).nonzero()[:, 0]
+    ends = [lens.depth(transformed(pose(torch.full_like(s, end)), g["means"])) for end in (0.0, 1.0)]
+    driven_through = torch.minimum(*ends) <= NEAR  # while the image is read out
+    rows = (shown(lens, camera, model, points, axes) & ~driven_through).nonzero()[:, 0]
     points, axes, local, means = points[rows], axes[rows], local[rows], g["means"][rows]
     along = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand_as(points) if isinstance(lens, Orthographic) else points
     sight = (at[rows, :3, :3].transpose(1, 2) @ along[..., None])[..., 0]

@@ -137,6 +137,13 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         return wp.float64(0.0)
 
     @wp.func
+    def far(y: wp.vec3d):
+        """A point's depth, as this lens has it."""
+        if wp.static(around):
+            return wp.length(y)
+        return y[2]
+
+    @wp.func
     def sighted(o: Optics, m: Motion, x: wp.vec3d, view: View):
         c = Sight()
         c.s = readout(o, m, x, wp.vec3d())
@@ -145,11 +152,9 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         if wp.static(rolling):
             c.rotation = rotation_at(m, c.s)
         c.aim = c.t
-        c.depth = c.t[2]
+        c.depth = far(c.t)
         if wp.static(planar):
             c.aim = pulled(c.t, view)
-        if wp.static(around):
-            c.depth = wp.length(c.t)
         c.seen = int(0)
         if c.depth > wp.float64(view.near) and wp.length(c.t) < wp.float64(FARTHEST) and inside(o, c.t):
             c.seen = int(1)
@@ -157,6 +162,9 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
                 p = pixel(o, c.t)
                 if wp.abs(wp.clamp(p[m.axis] / m.extent, wp.float64(0.0), wp.float64(1.0)) - c.s) > STILL:
                     c.seen = int(0)  # moves too fast for one place on the image
+                nearest_by = wp.min(far(placed(m, x, wp.vec3d(), wp.float64(0.0))), far(placed(m, x, wp.vec3d(), wp.float64(1.0))))
+                if nearest_by <= wp.float64(view.near):
+                    c.seen = int(0)  # the camera drives through it
         return c
 
     @wp.func

@@ -123,6 +123,25 @@ def test_a_motion_is_written_to_a_ten_thousandth_of_a_radian():
             assert (found - true)[:3, :3].abs().max() < off, degrees
 
 
+@pytest.mark.parametrize("speed", [60.0, -60.0])
+@pytest.mark.parametrize("lens", [PINHOLE, LENSES["opencv"]], ids=lambda lens: lens.kind)
+def test_what_the_camera_drives_through_while_it_reads_out_is_not_drawn(lens, speed):
+    """Behind it, what a lens says of a splat is no place on the image, by which to find the moment at which it is seen."""
+    g, camera = random_splats(80, 1, sh_count=1), driven(lens, "rows", speed, 200)
+    placed = [Placed(g, START)]
+    poses = torch.stack([inverse(pose) @ START for pose in (camera.world_from_cam, camera.world_from_cam_end)])
+    z = g.means.double() @ poses[:, 2, :3].T + poses[:, 2, 3]
+    passed = (z.amin(1) < 0.1) & (z.amax(1) > 0.1)
+    assert passed.sum() > 10
+    drawn = rasterize(placed, camera, config=EXACT).rgb
+    assert torch.equal(drawn, rasterize(Placed(g.select(~passed), START), camera, config=EXACT).rgb)
+    with torch.no_grad():
+        rgb, *_, unsure = oracle.render(
+            oracle.as_oracle(placed), camera, SplatModel(), cutoff=1e-8, alpha_max=0.999, world_from_cam_end=camera.world_from_cam_end
+        )
+    assert largest(drawn, rgb, ~unsure) < 2e-5
+
+
 def test_a_car_drives_past_a_camera_that_stands():
     """Beside what stands, too, whose moment of readout hangs on nothing."""
     placed, camera = traffic(3), Camera(PINHOLE, WIDTH, HEIGHT, START, shutter="rows")
