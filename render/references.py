@@ -129,7 +129,7 @@ class References:
         for index, share in self.chosen(frame, predicted):
             baseline = float((self.eyes[index] - frame.camera.world_from_cam[:3, 3]).norm())
             told = [share, NOISE, baseline / PARALLAX, (rays, wp.vec3), (frame.depth, float), (sums, wp.vec4), (squares, float)]
-            run_over(add_photo, frame, placed, clear, self._seen(index, frame.camera.width, frame.rgb.device), told)
+            run_over(add_photo, frame, placed, clear, self._seen(index, frame.camera, frame.rgb.device), told)
         moments = {camera.time_us for camera in predicted}
         for portraits in self.portraits:
             portraits.add(frame, placed, clear, rays, sums, squares, moments)
@@ -195,13 +195,14 @@ class References:
         """float64 `[S]`: metres from a camera to each shot, and what may have moved in the time between them."""
         return (self.eyes - camera.world_from_cam[:3, 3]).norm(dim=-1) + SPEED * 1e-6 * (self.times - camera.time_us).abs()
 
-    def _seen(self, index: int, width: int, device: torch.device) -> Seen:
-        """What a shot adds to the splats, at most as wide as the frames, so that nothing is skipped between its pixels."""
+    def _seen(self, index: int, seer: Camera, device: torch.device) -> Seen:
+        """What a shot adds to the splats, in at most as many pixels a radian as the frames have, so that none is skipped."""
+        shot = self.shots[index]
+        shrink = min(1.0, seer.lens.focal()[0] / shot.camera.lens.focal()[0])
+        width, height = (max(1, round(side * shrink)) for side in (shot.camera.width, shot.camera.height))
         key = (index, width)
         if key not in self.kept:
-            shot = self.shots[index]
-            shrink = min(1.0, width / shot.camera.width)
-            camera = shot.camera.resized(round(shot.camera.width * shrink), round(shot.camera.height * shrink))
+            camera = shot.camera.resized(width, height)
             frame = render_frame(self.recorded, camera, READS)
             assert frame.rgb is not None and frame.instance is not None
             photo = torch.from_numpy(np.array(shot.read(camera.width, camera.height))).to(device).float() / 255

@@ -81,6 +81,17 @@ def test_from_where_a_photo_was_taken_it_is_seen_pixel_by_pixel(street, shrink):
     assert (found.reference - photo)[told].abs().max() < 1e-3
 
 
+def test_a_wider_view_gets_of_a_photo_what_its_own_pixels_average(street):
+    """As wide in pixels as the photo, it has half as many a radian: in its middle it shows the photo at half the size."""
+    camera = at_hand(street)
+    wide = replace(camera, lens=replace(camera.lens, cy=26.5))
+    tele = replace(camera, lens=replace(camera.lens.scaled(2, 2), cx=48.0, cy=27.0))
+    (found,) = References([Shot(tele, snow)], street).along([render_frame(street, wide, READS)])
+    middle = slice(13, 40), slice(24, 72)
+    told, photo = found.trust[middle] > 0, torch.from_numpy(snow(48, 27)) / 255
+    assert told.float().mean() > 0.4 and (found.reference[middle] - photo)[told].abs().quantile(0.9) < 0.01
+
+
 def test_the_sky_of_a_photo_is_that_behind_a_haze(street):
     """Splats too faint to be what stands there do not bring the sky near."""
     g = street.background.gaussians
