@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from shlex import quote
@@ -124,7 +124,11 @@ class Render:
     output: Output
     """Video to write, as out.mp4; the report goes to out.json."""
     camera: OneOfRig = None
-    """Camera of the rig, as front_camera; the scene's first by default. For a splat file: orbit, which circles it."""
+    """Camera of the rig, as front_camera; the scene's first by default. For a splat file: orbit, which circles it. Or a camera of your own,
+    as roof.json: a JSON file with any of like (a camera of the rig: what is not said is as of that), moved_m ([forward, left, up] from
+    there), height_m (above the ground), yaw_deg (to the left), pitch_deg (up) and roll_deg (to the right) to the car's axes,
+    angle_of_view_deg (across), size ([width, height]), lens (pinhole or fisheye); calibrated: fx, fy, cx, cy, size and distortion in
+    OpenCV's order."""
     up: Axis = None
     """Up axis of a splat file: x, -x, y, ...; by default y for .glb and .spz, what a USD file says, else z. Splats trained from photos
     mostly have -y."""
@@ -174,22 +178,27 @@ class Render:
             raise UsageError(f"--weights {self.weights} have no effect without --enhance; add it, or leave out --weights")
         if self.trajectory is not None and self.lateral_shift:
             raise UsageError("--trajectory is the whole path; leave out --lateral-shift, or add it to the file's y_m")
-        from render.aside import path_warning
+        from render.aside import path_warning, sight_warning
         from render.clip import clip_cameras, clip_times, cut_warning
         from render.record import record, stale_warning
         from scenes import Databank
         from scenes.files import kind_of
         from scenes.insert import insert
+        from scenes.own_camera import described, own_camera
         from scenes.seen import absence_warning, seeing, unseen_warning
         from scenes.trajectory import Trajectory
 
         check_device(self.device)
-        needs_path = ["--insert"] * bool(self.insert) + ["--trajectory"] * (self.trajectory is not None)
+        own = Path(self.camera) if self.camera is not None and self.camera.lower().endswith(".json") else None
+        asked = {f"--camera {own}": own, "--insert": self.insert or None, "--trajectory": self.trajectory}
+        needs_path = [option for option, value in asked.items() if value is not None]
         if needs_path and kind_of(self.scene) in ("asset", "splats"):
             told = "needs a scene that sidestep recon wrote, with a ground and a path"
             raise UsageError(f"{needs_path[0]} {told}; {self.scene} holds splats only")
         scene, warnings = open_view(self.scene, self.drop_invalid, self.up)
         camera = next(iter(scene.rig), "camera") if self.camera is None else self.camera
+        if own is not None:
+            scene = replace(scene, own={camera: own_camera(scene, own)})
         times = clip_times(scene, camera, self.start, self.duration, self.fps)
         way, said, notes = self._path(scene, times)
         cameras = clip_cameras(scene, camera, way, times)
@@ -203,6 +212,7 @@ class Render:
             scene, warnings = result.scene, [*warnings, *result.warnings]
             put_in.add(result.actor.track)
         warnings += path_warning(scene, clip_cameras(scene, camera, 0.0, times), way, said)
+        warnings += sight_warning(scene, camera, cameras) if own is not None else []
         for actor in (a for a in scene.actors if not a.recorded):  # those of edits too: a shift may show another side of them
             witnesses = seeing(actor, cameras)
             warnings += absence_warning(actor, cameras, witnesses) if actor.track in put_in else []
@@ -215,6 +225,8 @@ class Render:
         needs: tuple[str, ...] = ()
         scene = scene.to(self.device)
         facts: dict[str, object] = {"scene": str(self.scene), "path": said, "enhanced": self.weights if self.enhance else None}
+        if own is not None:
+            facts["camera_file"] = described(own)
         if self.enhance:
             from enhance.clip import enhancement
             from render.album import references_of

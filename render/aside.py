@@ -11,6 +11,7 @@ import torch
 
 from render.frame_types import Frame
 from render.rasterize import rasterize
+from render.rays import camera_rays
 from scenes.asset import Actor, Asset
 from scenes.camera import Camera
 from scenes.collide import into, met
@@ -34,6 +35,16 @@ BEFORE = 0.5
 TURNED = math.radians(60)
 """From the nearest camera's axis from which on a camera sees little of what that showed."""
 
+SIGHTS, ACROSS, FRAMES = 5, 48, 100
+"""Moments of a clip at which it is looked what a camera shows, pixels across its picture then, and frames of each camera that may have
+shown that."""
+
+FARTHEST = 200.0
+"""Metres at which the sky is taken to be then."""
+
+UNSEEN = 0.05
+"""Part of a picture from which on it is told that no camera saw it."""
+
 STEP = 0.5
 """Metres, of which the largest shift is told in whole ones: it is measured no better."""
 
@@ -43,18 +54,75 @@ def room_aside(scene: Scene, camera: Camera, world_from_body: torch.Tensor, left
     """Metres, up to `reach`, that a camera of a body at a pose can go to the left or right before it meets what stands or leaves the known
     ground."""
     aside = world_from_body[:3, 1] * (1.0 if left else -1.0)
-    down = -world_from_body[:3, 2]
-    eye, pose = camera.world_from_cam[:3, 3], torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([torch.linalg.cross(down, aside), down, aside], 1)
-    pose[:3, 3] = eye
-    focal = PIXELS / 2 / math.tan(WIDE / 2)
-    looking = Camera(Pinhole(focal, focal, PIXELS / 2, PIXELS / 2), PIXELS, PIXELS, pose)
-    frame = rasterize(scene.background, looking, ("median_depth",), model=scene.model_for(looking))
-    assert isinstance(frame, Frame) and frame.median_depth is not None
-    room = min(reach, max(0.0, float(frame.median_depth.median()) - BEFORE))
+    eye = camera.world_from_cam[:3, 3]
+    room = min(reach, max(0.0, _free(scene, eye, aside, -world_from_body[:3, 2]) - BEFORE))
     while room > 0 and (beyond := outside_ground(scene, (eye + room * aside)[:2])) > 0:
         room = max(0.0, room - max(STEP, beyond))
     return room
+
+
+def _free(scene: Scene, eye: torch.Tensor, way: torch.Tensor, down: torch.Tensor) -> float:
+    """Metres from an eye `[3]` to what stands in a way; `down`: a direction at right angles to it."""
+    pose, focal = torch.eye(4, dtype=torch.float64), PIXELS / 2 / math.tan(WIDE / 2)
+    pose[:3, :3] = torch.stack([torch.linalg.cross(down, way), down, way], 1)
+    pose[:3, 3] = eye
+    return float(_depth(scene, Camera(Pinhole(focal, focal, PIXELS / 2, PIXELS / 2), PIXELS, PIXELS, pose)).median())
+
+
+def _depth(scene: Scene, camera: Camera) -> torch.Tensor:
+    """`[H, W]`, of what stands still."""
+    frame = rasterize(scene.background, camera, ("median_depth",), model=scene.model_for(camera))
+    assert isinstance(frame, Frame) and frame.median_depth is not None
+    return frame.median_depth
+
+
+@torch.no_grad()
+def sight_warning(scene: Scene, name: str, cameras: Sequence[Camera]) -> list[str]:
+    """What to tell of a clip by a camera of one's own (`Scene.own`): that something stands between it and the nearest camera of the rig,
+    how much of what it shows no camera of the rig ever had in its picture, hidden there or not, and how much of the picture its lens does
+    not reach; a sentence each, or nothing."""
+    looks = spread(cameras, SIGHTS)
+    said = _behind(scene, name, looks)
+    if (unseen := max(_unseen(scene, look) for look in looks)) >= UNSEEN:
+        told = f"{name} shows what no camera recorded on {unseen:.0%} of its pixels"
+        said.append(f"{told}, which is a guess; turn it to where a camera looked, or narrow its view")
+    if (dark := float((camera_rays(looks[0]) == 0).all(-1).double().mean())) >= UNSEEN:
+        told = "its distortion folds over there: check the numbers and their order, and whether it is a fisheye"
+        said.append(f"{name} sees nothing on {dark:.0%} of its pixels, since {told}")
+    return said
+
+
+def _behind(scene: Scene, name: str, looks: Sequence[Camera]) -> list[str]:
+    mount = scene.own[name].body_from_cam
+    near = min((c.body_from_cam for c in scene.rig.values()), key=lambda m: float((mount - m)[:3, 3].norm()))
+    moved = (mount - near)[:3, 3]
+    reach = float(moved.norm())
+    across = torch.linalg.cross(moved, torch.eye(3, dtype=torch.float64)[int(moved.abs().argmin())])
+    for look in looks if reach > BEFORE else []:
+        body = look.world_from_cam @ inverse(mount)
+        free = _free(scene, (body @ near)[:3, 3], body[:3, :3] @ moved / reach, body[:3, :3] @ across / across.norm())
+        if free < reach:
+            where = f"{name} is {reach:.1f} m from the nearest recorded camera, and something stands {free:.1f} m from that towards it"
+            return [f"{where}, {_after(looks, look.time_us)}: what is behind is a guess; move it nearer"]
+    return []
+
+
+def _unseen(scene: Scene, camera: Camera) -> float:
+    """Part of a picture that shows what was in no recorded one."""
+    small = camera.resized(ACROSS, max(1, round(ACROSS * camera.height / camera.width)))
+    rays = camera_rays(small).double()
+    shown = (rays != 0).any(-1)  # past the edge of a fisheye's image there is nothing to show
+    points = rays[shown] * _depth(scene, small)[shown].double().clamp_max(FARTHEST)[:, None]
+    points = points @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for name, c in scene.rig.items():
+        times = torch.stack(spread(list(scene.frame_times(name)), FRAMES))
+        back = inverse(scene.ego.near_each(times) @ c.body_from_cam)
+        local = points @ back[:, :3, :3].mT + back[:, None, :3, 3]
+        pixels = c.lens.project(local)
+        inside = (pixels >= 0).all(-1) & (pixels <= torch.tensor([c.width, c.height])).all(-1)
+        seen |= (c.lens.valid(local) & inside).any(0)
+    return 1 - float(seen.double().mean())
 
 
 def path_warning(scene: Scene, recorded: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:

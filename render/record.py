@@ -82,6 +82,7 @@ def record(
             "scene": scene.meta.get("name"),
             "attribution": scene.meta.get("attribution"),
             "camera": camera,
+            "body_from_cam": scene.rig_camera(camera).body_from_cam.tolist(),
             "lens": {"type": type(cameras[0].lens).__name__, "params": cameras[0].lens.params().tolist()},
             "size": [cameras[0].width, cameras[0].height],
             "fps": round(fps, 6),

@@ -44,6 +44,7 @@ class Camera:
     top (left) edge, at `time_us`, to `world_from_cam_end` at its bottom (right) edge, `readout_us` later, or earlier if that is negative.
     `exposure` is an affine colour `[3, 4]` that `render_frame` applies last but one: rgb' = E[:, :3] rgb + E[:, 3]; and `flat_field` the
     gains `[h, w, 3]` that it applies last, of a grid of cells over the picture, linear between their middles; None: 1 everywhere.
+    trained_focal: pixels a radian of the pictures that what it shows was fitted to; None where the rig is to tell (`Scene.model_for`).
     """
 
     lens: Lens
@@ -56,6 +57,7 @@ class Camera:
     exposure: torch.Tensor | None = None
     readout_us: int = 0
     flat_field: torch.Tensor | None = None
+    trained_focal: float | None = None
 
     def __post_init__(self):
         check_size(self.width, self.height)
@@ -95,7 +97,7 @@ class RigCamera:
 
     gains float32 `[F, 3]`, of frames that were exposed one by one: how many times as much as `exposure` each was; None where all alike.
     fitted: whether splats were fitted to pictures of its size. shutter "rows" or "columns": an image is read out over `readout_us` from its
-    time on, top (left) edge first; negative: that one last, at its time. flat_field: as a `Camera`'s.
+    time on, top (left) edge first; negative: that one last, at its time. flat_field, trained_focal: as of `Camera`.
     """
 
     lens: Lens
@@ -109,6 +111,7 @@ class RigCamera:
     gains: torch.Tensor | None = None
     fitted: bool = True
     flat_field: torch.Tensor | None = None
+    trained_focal: float | None = None
 
     def __post_init__(self):
         check_size(self.width, self.height)
@@ -134,8 +137,8 @@ class RigCamera:
     def at(self, world_from_body: torch.Tensor, time_us: int) -> Camera:
         """The camera of a body that stands at a pose while the image is read out."""
         world_from_cam = world_from_body @ self.body_from_cam
-        camera = Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), flat_field=self.flat_field)
-        return replace(camera, exposure=self.exposure_at(time_us))
+        camera = Camera(self.lens, self.width, self.height, world_from_cam, time_us=int(time_us), exposure=self.exposure_at(time_us))
+        return replace(camera, flat_field=self.flat_field, trained_focal=self.trained_focal)
 
     def along(self, ego: Trajectory, time_us: int) -> Camera:
         """The camera of a body on its way, from `time_us` on. ValueError for a time off the path."""

@@ -28,7 +28,7 @@ def finest_pixel(scene: Scene, path: Trajectory) -> float:
     """Metres that a pixel of the sharpest camera spans at the nearest that a body's path comes to the drive, seen from `ASIDE` nearer."""
     if not scene.rig:
         return 1e-3
-    focal = max(max(camera.lens.focal()) for camera in scene.rig.values())
+    focal = max(max(camera.lens.focal()) for camera in (*scene.rig.values(), *scene.own.values()))
     moments = scene.ego.times_us[[path.covers(int(t)) for t in scene.ego.times_us]] if len(path) > 1 else scene.ego.times_us
     gaps = [float((scene.ego.at(int(t))[:3, 3] - path.at(int(t))[:3, 3]).norm()) for t in moments]
     return max(min(gaps, default=0.0) - ASIDE, NEAREST) / focal

@@ -27,6 +27,7 @@ class Scene:
     """Background, actors, sky, ground, and the ego body with its cameras. Instance ids: background 0, `actors[i]` i + 1.
 
     `meta` is json-like: name, source, licence, attribution, geodetic origin, what the body frame is, ...
+    own: further cameras on the body (`scenes/own_camera.py`), which recorded nothing; no file keeps them.
     """
 
     background: Placed
@@ -37,6 +38,7 @@ class Scene:
     model: SplatModel = field(default_factory=SplatModel)
     ground: Ground | None = None
     meta: dict = field(default_factory=dict)
+    own: dict[str, RigCamera] = field(default_factory=dict)
 
     def __post_init__(self):
         object.__setattr__(self, "actors", tuple(self.actors))
@@ -55,7 +57,9 @@ class Scene:
         return replace(self, background=background, actors=actors)
 
     def rig_camera(self, name: str) -> RigCamera:
-        """The rig's camera of that name; ValueError naming the nearest where there is none."""
+        """The camera of that name, of one's own or the rig's; ValueError naming the nearest where there is none."""
+        if name in self.own:
+            return self.own[name]
         if name not in self.rig:
             raise ValueError(unknown("camera", name, str(self.meta.get("path", self.meta.get("name", "the scene"))), self.rig))
         return self.rig[name]
@@ -66,11 +70,13 @@ class Scene:
 
     def model_for(self, camera: Camera) -> SplatModel:
         """The splat model for a camera's pictures, scaled (`SplatModel.at_scale`) by its focal length in pixels over that of the rig's
-        camera with the most similar field of view. Not scaled for orthographic cameras, nor up for those of another field of view, whose
-        splats other cameras were fitted to from nearer by."""
+        camera with the most similar field of view, or over the camera's `trained_focal`. Not scaled for orthographic cameras, nor up for
+        those of another field of view without a `trained_focal`, whose splats other cameras were fitted to from nearer by."""
         fitted = [c for c in self.rig.values() if c.fitted and not isinstance(c.lens, Orthographic)]
         if not fitted or isinstance(camera.lens, Orthographic):
             return self.model
+        if camera.trained_focal is not None:
+            return self.model.at_scale(max(camera.lens.focal()) / camera.trained_focal)
         focal, narrow = max(camera.lens.focal()), max(camera.lens.focal()) / camera.width
         angle, same = min(((abs(math.log(max(c.lens.focal()) / c.width / narrow)), c) for c in fitted), key=lambda pair: pair[0])
         scale = float(focal / max(same.lens.focal()))

@@ -53,6 +53,25 @@ def test_the_recording_car_changes_lane_or_drives_a_path_of_its_own(door, tmp_pa
     assert middle()[:2] == (0, "as recorded")
 
 
+def test_a_camera_of_ones_own_is_read_from_a_file(door, tmp_path):
+    file = tmp_path / "roof.json"
+    file.write_text('{"moved_m": [0, 0, 0.5], "yaw_deg": -10, "angle_of_view_deg": 120, "lens": "fisheye", "size": [64, 40]}')
+    words = ["render", "street", "--camera", str(file), "-o", str(tmp_path / "out.mp4"), "--duration", "300ms", "-w"]
+    door([*words, "--lateral-shift", "1m", "--enhance"])
+    told, recorded = json.loads((tmp_path / "out.json").read_text()), made.street()
+    assert told["camera"] == str(file) and told["camera_file"] == json.loads(file.read_text()) and told["size"] == [64, 40]
+    assert told["lens"]["type"] == "Fisheye" and told["lens"]["params"][0] == pytest.approx(32 / np.deg2rad(60))
+    mount = np.array(told["body_from_cam"])
+    assert mount[:3, 3].tolist() == [1, 0, 2] and mount[:3, 2] == pytest.approx([np.cos(np.deg2rad(10)), -np.sin(np.deg2rad(10)), 0])
+    for frame in told["frames"]:
+        body = recorded.ego.shifted(lateral=1.0).at(frame["time_us"]).numpy()
+        assert np.array(frame["world_from_cam"]) == pytest.approx(body @ mount)
+    file.write_text('{"yaw_deg": 180}')
+    _, errors = door([*words, "--size", "32x18"])
+    told = json.loads((tmp_path / "out.json").read_text())
+    assert told["size"] == [32, 18] and f"warning: {file} shows what no camera recorded on " in errors and len(told["warnings"]) == 1
+
+
 def test_an_asset_that_nobody_sees_is_said(door, tmp_path):
     words = [*SHOOT[:-1], str(tmp_path / "out.mp4"), "--size", "32x18", "--duration", "100ms", "--databank", "bank"]
     _, errors = door([*words, "--insert", "car/0001@-7m,0m"])

@@ -32,6 +32,7 @@ USAGE = [
     ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, above 0 and below 1000, as 10"),
     (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a scene", "usdc holds splats only"),
     (["render", "street/background.usdc", *SHOOT[4:], "--trajectory", "t.csv"], "--trajectory needs a scene", "usdc holds splats only"),
+    (["render", "street/background.usdc", "--camera", "a.json", *SHOOT[4:]], "--camera a.json needs a scene", "usdc holds splats only"),
     ([*SHOOT, "--enhanc"], "--enhanc", "--enhance"),
     (["render", "street"], "--output", "required"),
     (INSERT, "--at 20m,-3.5m", "--trajectory t.csv"),
@@ -67,6 +68,8 @@ CAMERAS = "it has front_camera, left_camera. Did you mean front_camera?"
 
 DATA = [
     (["render", "street", "--camera", "frnt", "-o", "x.mp4"], f'camera "frnt" is not in street; {CAMERAS}'),
+    (["render", "street", "--camera", "roof.json", "-o", "x.mp4"], "roof.json does not exist"),
+    (["render", "street", "--camera", "street/metadata.json", "-o", "x.mp4"], 'street/metadata.json has the unknown key "'),
     (["render", "stret", *SHOOT[2:]], "stret does not exist. Did you mean street?"),
     (["render", "bank", *SHOOT[2:]], "bank is a databank"),
     (["render", "street/background.usdc", *SHOOT[2:]], "is not in street/background.usdc; it has orbit"),

@@ -5,9 +5,9 @@ import pytest
 import torch
 from street import START_US, box, car
 
-from render.aside import path_warning, room_aside
+from render.aside import path_warning, room_aside, sight_warning
 from render.clip import clip_cameras
-from scenes import Actor, Asset, Gaussians, Trajectory
+from scenes import Actor, Asset, Gaussians, OpenCV, Trajectory
 from scenes.poses import translation, yaw
 
 CAMERA = "front_camera"
@@ -114,3 +114,22 @@ def test_a_path_that_looks_where_no_camera_did_is_told(street):
     (said,) = path_warning(street, cameras, turned(math.pi), "--trajectory t.csv")
     assert "looks " in said and "deg away from where any camera looked there, 0.0s after" in said
     assert not path_warning(street, cameras, turned(0.5), "--trajectory t.csv")
+
+
+def test_a_camera_of_ones_own_that_sees_what_no_camera_did_is_told(street):
+    def told_of(mount=None, **changed):
+        """Of a camera like the front one with another mount, seen from that one, or another lens."""
+        front = street.rig[CAMERA]
+        own = replace(front, body_from_cam=front.body_from_cam if mount is None else mount @ front.body_from_cam, **changed)
+        scene = replace(street, own={"own.json": own})
+        return sight_warning(scene, "own.json", clip_cameras(scene, "own.json"))
+
+    assert told_of() == [] and told_of(yaw(0.4)) == []
+    (said,) = told_of(yaw(math.pi))
+    share = int(said.split(" on ")[1].split("%")[0])
+    assert said.startswith("own.json shows what no camera recorded on ") and share > 50 and said.endswith("narrow its view")
+    assert told_of(translation(y=3.0)) == []
+    (said, *_) = told_of(translation(y=12.0))
+    assert said.startswith("own.json is 12.0 m from the nearest recorded camera, and something stands 8.") and "move it nearer" in said
+    (said,) = [line for line in told_of(lens=OpenCV(57.6, 57.6, 48.0, 27.0, -1.0)) if "distortion" in line]
+    assert said.startswith("own.json sees nothing on ") and "check the numbers and their order" in said

@@ -96,6 +96,15 @@ def test_a_larger_picture_of_another_angle_is_drawn_as_trained(drive, camera):
     assert drive.model_for(small).dilation == pytest.approx(0.3 / 4)
 
 
+def test_what_was_fitted_to_pictures_that_are_known_is_drawn_by_their_pixels_a_radian(drive, camera):
+    """Up, too: of what a telephoto lens shows from the fitted camera's place nobody was nearer."""
+    focal = max(camera.lens.focal())
+    for scale in (1 / 4, 1, 3):
+        own = replace(camera, lens=Pinhole(scale * focal, scale * focal, 320, 180), trained_focal=focal)
+        assert drive.model_for(own) == drive.model.at_scale(scale)
+        assert drive.model_for(own.resized(camera.width // 2, camera.height // 2)) == drive.model.at_scale(scale / 2)
+
+
 def test_a_smoothing_below_none_is_refused():
     with pytest.raises(ValueError, match="smoothing must be at least 0 px.2 and finite"):
         SplatModel(smoothing=-0.1)

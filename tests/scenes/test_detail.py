@@ -61,6 +61,9 @@ def test_detail_is_that_of_where_the_drive_comes_nearest():
     focal = max(max(c.lens.focal()) for c in scene.rig.values())
     pixels = [finest_pixel(replace(scene, ego=ego), path) * focal for path in (stands, along)]
     assert pixels == pytest.approx([10 - ASIDE, 30 - ASIDE])
+    front = scene.rig["front_camera"]
+    tele = replace(scene, ego=ego, own={"tele": replace(front, lens=front.lens.scaled(2, 2))})
+    assert finest_pixel(tele, stands) * focal == pytest.approx((10 - ASIDE) / 2), "a camera of one's own may see more sharply"
 
 
 def test_of_two_merged_splats_each_counts_as_much_as_it_covers():
