@@ -172,7 +172,11 @@ class Render:
         from render.video import check_container, odd_warning
 
         check_container(self.output)  # now: to open a scene, what is put in and its photos takes long
-        for path in (self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])):
+        own = Path(self.camera) if self.camera is not None and self.camera.lower().endswith(".json") else None
+        report = self.output.with_suffix(".json")
+        if own is not None and own.exists() and report.exists() and own.samefile(report):
+            raise UsageError(f"{report} is the camera's file, and {self.output}'s report would replace it; give another name with -o")
+        for path in (report, *([self.output.with_suffix("")] if self.outputs else [])):
             fresh(path, self.overwrite)
         if self.weights != "builtin" and not self.enhance:
             raise UsageError(f"--weights {self.weights} have no effect without --enhance; add it, or leave out --weights")
@@ -189,7 +193,6 @@ class Render:
         from scenes.trajectory import Trajectory
 
         check_device(self.device)
-        own = Path(self.camera) if self.camera is not None and self.camera.lower().endswith(".json") else None
         asked = {f"--camera {own}": own, "--insert": self.insert or None, "--trajectory": self.trajectory}
         needs_path = [option for option, value in asked.items() if value is not None]
         if needs_path and kind_of(self.scene) in ("asset", "splats"):
@@ -238,7 +241,7 @@ class Render:
             scene, camera, self.output, shift=way, times_us=times, width=width, height=height, keep=self.outputs,
             shadows=not self.no_shadows, stages=stages, needs=needs, facts=facts, warnings=warnings,
         )  # fmt: skip
-        written = [self.output, self.output.with_suffix(".json"), *([self.output.with_suffix("")] if self.outputs else [])]
+        written = [self.output, report, *([self.output.with_suffix("")] if self.outputs else [])]
         print(f"wrote {', '.join(map(str, written))}")
 
     def _path(self, scene: Scene, times: Tensor) -> tuple[float | Trajectory, str, list[str]]:

@@ -35,7 +35,7 @@ BEFORE = 0.5
 TURNED = math.radians(60)
 """From the nearest camera's axis from which on a camera sees little of what that showed."""
 
-SIGHTS, ACROSS, FRAMES = 5, 48, 100
+SIGHTS, ACROSS, FRAMES = 5, 32, 50
 """Moments of a clip at which it is looked what a camera shows, pixels across its picture then, and frames of each camera that may have
 shown that."""
 

@@ -67,6 +67,8 @@ def test_a_camera_of_ones_own_is_read_from_a_file(door, tmp_path):
         body = recorded.ego.shifted(lateral=1.0).at(frame["time_us"]).numpy()
         assert np.array(frame["world_from_cam"]) == pytest.approx(body @ mount)
     file.write_text('{"yaw_deg": 180}')
+    _, errors = door([*words, "-o", str(tmp_path / "roof.mp4")], 2)
+    assert "roof.json is the camera's file, and" in errors and file.read_text() == '{"yaw_deg": 180}'
     _, errors = door([*words, "--size", "32x18"])
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["size"] == [32, 18] and f"warning: {file} shows what no camera recorded on " in errors and len(told["warnings"]) == 1
