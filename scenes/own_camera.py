@@ -72,6 +72,9 @@ NUMBERS = {
 }
 KEYS = ("like", "lens", *NUMBERS)
 
+MOVES = {"like", "moved_m", "height_m"}
+"""Keys by which a camera is only moved."""
+
 
 def described(file: Path) -> dict[str, Any]:
     """What a file says of a camera, by `KEYS`. ValueError naming file, key and fix where it is bad; FileNotFoundError."""
@@ -107,7 +110,8 @@ def own_camera(scene: Scene, file: Path) -> RigCamera:
     like = scene.rig[name]
     width, height = map(int, said.get("size", (like.width, like.height)))
     mount, lens = _mount(scene, file, said, like), _lens(file, said, like, width, height)
-    own = replace(like, lens=lens, width=width, height=height, body_from_cam=mount, fitted=False)
+    lit = like.flat_field if said.keys() <= MOVES else None  # it is of that lens, and of where the sun stands before it
+    own = replace(like, lens=lens, width=width, height=height, body_from_cam=mount, fitted=False, flat_field=lit)
     return replace(own, trained_focal=_trained_focal(scene, like, own))
 
 

@@ -48,6 +48,13 @@ def test_what_describes_a_recorded_camera_is_drawn_bit_by_bit_as_that(street, ow
             )
 
 
+def test_a_flat_field_is_of_a_lens_and_of_where_it_looks(street, own):
+    lit = replace(street, rig=street.rig | {FRONT: replace(street.rig[FRONT], flat_field=torch.full((9, 16, 3), 0.8))})
+    assert own(scene=lit, like=FRONT, moved_m=[0, 0, 0.5]).flat_field is lit.rig[FRONT].flat_field
+    for words in ({"yaw_deg": 40}, {"angle_of_view_deg": 80}, {"size": [64, 64]}):
+        assert own(scene=lit, like=FRONT, **words).flat_field is None
+
+
 def test_a_camera_turned_by_90_degrees_sees_what_one_made_by_hand_does(street, own):
     moment = int(street.frame_times(FRONT)[3])
     pose = street.ego.at(moment) @ translation(1.0, 0.0, 1.5) @ yaw(math.pi / 2)
