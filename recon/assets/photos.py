@@ -123,13 +123,13 @@ def _cut(asset: Asset, scene: Scene, view: _View, world_from_asset: torch.Tensor
     local = rays.double() @ turn.T
     at = shot.lens.project(local) / torch.tensor([shot.width, shot.height])
     taken = shot.lens.valid(local) & ((at > 0) & (at < 1)).all(-1)
+    ego = torch.zeros(1, 1) if view.shot.ego is None else torch.from_numpy(view.shot.ego).float()
+    grid = torch.nan_to_num(at * 2 - 1, nan=-2.0)[None].float()
+    taken &= F.grid_sample(ego[None, None], grid, mode="nearest", align_corners=False)[0, 0] == 0
     if int((shows & taken).sum()) < SHOWN * int((alone.alpha > 0.5).sum()):
         return None
     shrink = focal / max(camera.lens.focal())  # read as small as it is cut out: single pixels of a larger one would be picked
     photo = torch.from_numpy(np.array(view.shot.read(round(shot.width * shrink), round(shot.height * shrink)))).float() / 255
-    ego = torch.zeros(1, 1) if view.shot.ego is None else torch.from_numpy(view.shot.ego).float()
-    grid = torch.nan_to_num(at * 2 - 1, nan=-2.0)[None].float()
-    taken &= F.grid_sample(ego[None, None], grid, mode="nearest", align_corners=False)[0, 0] == 0
     rgb = F.grid_sample(photo.permute(2, 0, 1)[None], grid, mode="bicubic", padding_mode="border", align_corners=False)[0]
     alpha = (shows & taken).float()[None]
     pixels = (torch.cat([rgb.clamp(0, 1) * alpha, alpha]).permute(1, 2, 0) * 255).round().to(torch.uint8)

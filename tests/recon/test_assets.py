@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from street import box, car, rig
+from street import START_US, box, car, rig
 
 from recon import extract_assets
 from recon.assets.extract import candidates, completed, moved, silhouette, thumbnail, turned
 from recon.assets.looking import looking_at
+from recon.assets.photos import _views, photos_of
 from recon.assets.sight import Views, sight_of
 from recon.objects.mirror import within_box
 from render import rasterize, render_frame
 from render.album import keep_photos
+from render.rays import camera_rays
 from render.references import Shot
 from render.video import from_bytes, to_bytes
-from scenes import Asset, Databank, Gaussians, Placed, Trajectory, load, save
+from scenes import Asset, Databank, Gaussians, Pinhole, Placed, Trajectory, load, save
 from scenes.edit import Edit
 from scenes.harmonics import evaluate
 from scenes.poses import inverse, translation, yaw
@@ -183,6 +185,45 @@ def test_a_photo_that_is_shrunk_averages_its_pixels(sharp_street, monkeypatch):
     photos = mover.photos(sharp_street, [replace(s, read=read) for s in _shots(sharp_street)])
     shown = np.concatenate([pixels[..., :3][pixels[..., 3] == 255] for pixels in (photo.read() for photo in photos)])
     assert len(shown) > 50 and abs(shown.mean() - 127) < 15 and shown.std() < 30
+
+
+def _of_mover(street, times, **shot):
+    """Photos of the street's mover at some of the front camera's frames, in which red says the column and green the row."""
+    places = np.stack([*np.meshgrid(np.arange(256), np.arange(144)), np.zeros((144, 256))], -1).astype(np.uint8)
+    cameras = [street.camera(CAMERA, int(t)).resized(256, 144) for t in street.frame_times(CAMERA)[times]]
+    shots = [Shot(camera, lambda width, height: np.asarray(Image.fromarray(places).resize((width, height))), **shot) for camera in cameras]
+    (mover,) = street.actors
+    return cameras, photos_of(mover.asset, street, shots, mover.trajectory, 1)
+
+
+def test_a_photo_shows_in_each_direction_what_was_there(street):
+    (camera,), (photo,) = _of_mover(street, [7])
+    pose = street.actors[0].trajectory.at(camera.time_us)
+    torch.testing.assert_close((pose @ photo.camera.world_from_cam)[:3, 3], camera.world_from_cam[:3, 3])
+    pixels = torch.from_numpy(photo.read())
+    shown = pixels[..., 3] == 255
+    ways = camera_rays(photo.camera)[shown].double() @ (pose @ photo.camera.world_from_cam)[:3, :3].T
+    there = camera.lens.project(ways @ camera.world_from_cam[:3, :3]) - 0.5
+    assert shown.sum() > 300 and (pixels[shown][:, :2] - there).abs().max() < 0.55
+
+
+def test_of_two_photos_of_one_moment_the_nearer_one_is_kept(street):
+    cameras, (photo,) = _of_mover(street, [6, 7])
+    assert photo.camera.time_us == cameras[1].time_us
+
+
+@pytest.mark.parametrize(("metres", "kept"), [(0.9, 0), (1.1, 1)])
+def test_from_right_before_an_object_nothing_is_pictured(street, metres, kept):
+    """Nearness is to its box, not to its middle."""
+    mount = looking_at(torch.zeros(3, dtype=torch.float64), torch.tensor([2.1 + metres, 0, 0.75], dtype=torch.float64), 200, 200)
+    camera = replace(mount, lens=Pinhole(40, 40, 100, 100), world_from_cam=street.actors[0].trajectory.at(START_US) @ mount.world_from_cam)
+    shot = Shot(replace(camera, time_us=START_US), lambda width, height: np.zeros((height, width, 3), np.uint8))
+    assert len(list(_views([shot], street.actors[0].trajectory, SIZE))) == kept
+
+
+def test_what_the_recording_car_hides_is_no_photo(street):
+    below = np.arange(144)[:, None] >= np.full((1, 256), 60)
+    assert _of_mover(street, [7], ego=below)[1] == ()
 
 
 def test_photos_of_one_direction_are_few_and_apart(parked_street):
