@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
 from recon.log import Log
 from recon.sfm.colmap import extract_features, mapping_options, pycolmap, verification_options, visible_points
 from render.progress import Progress
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
-from scenes.poses import inverse
+from scenes.poses import inverse, nearest_rotation
 
 FEATURES = 4096
 """At most, of a picture: where poses are known, features only have to give depths."""
@@ -150,8 +151,7 @@ def _aligned(poses: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> dict
     if not poses:
         return poses
     new, old = (np.linalg.inv(np.stack([of[name] for name in poses])) for of in (poses, given))
-    u, _, v = np.linalg.svd((old[:, :3, :3] @ new[:, :3, :3].transpose(0, 2, 1)).sum(0))
     back = np.eye(4)
-    back[:3, :3] = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    back[:3, :3] = nearest_rotation(torch.from_numpy((old[:, :3, :3] @ new[:, :3, :3].transpose(0, 2, 1)).mean(0))).numpy()
     back[:3, 3] = old[:, :3, 3].mean(0) - back[:3, :3] @ new[:, :3, 3].mean(0)
     return dict(zip(poses, np.linalg.inv(back @ new), strict=True))

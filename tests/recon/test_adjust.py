@@ -10,6 +10,8 @@ from recon.ready import readied
 from recon.registration.adjust import adjusted
 from recon.registration.align import about
 from recon.registration.corrected import MOVED, as_corrected, moved
+from recon.sfm import posed
+from recon.sfm.colmap import pycolmap
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -57,3 +59,27 @@ def test_poses_by_which_pictures_meet_stay_as_they_are(bare, jittered):
     name = next(iter(bare.cameras))
     assert adjusted(bare, name, ALL, SIZE) is bare
     assert adjusted(jittered, name, (0, 600_000), SIZE) is jittered, "too few to tell"
+
+
+@pytest.mark.parametrize(("spread", "kept"), [(0.1, False), (1e-4, True)])
+def test_poses_move_as_far_as_positions_may_be_off_and_the_lens_stays(spread, kept, tmp_path, monkeypatch):
+    """A hundred points in ten pictures, whose lens is a hundredth too long and which stand some centimetres off."""
+    colmap = pycolmap()
+    options = colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=10, num_points2D_without_point3D=0)
+    options.camera_model_id, options.camera_params = colmap.CameraModelId.PINHOLE, [1000.0, 1000.0, 512.0, 384.0]
+    made = colmap.synthesize_dataset(options)
+    truth = {image.name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in made.images.values()}
+    dice, given = np.random.default_rng(0), {}
+    for image in made.images.values():
+        given[image.name] = truth[image.name].copy()
+        given[image.name][:3, 3] += dice.normal(0, 0.03, 3)
+        image.frame.set_cam_from_world(image.camera_id, colmap.Rigid3d(given[image.name][:3]))
+    (camera,) = made.cameras.values()
+    camera.params = [1010.0, 1010.0, 512.0, 384.0]
+    made.update_point_3d_errors()
+    monkeypatch.setattr(posed, "_match", lambda *_: None)
+    monkeypatch.setattr(posed, "_at_poses", lambda *_: made)
+    found, before, after = posed.adjust(posed.Posed(tmp_path, {}, given, []), spread)
+    places, were, are = (np.stack([np.linalg.inv(of[name])[:3, 3] for name in truth]) for of in (found, given, truth))
+    assert after < before and (np.abs(places - were).max() < 0.03) == kept and (np.abs(places - are).max() < 0.03) != kept
+    assert camera.params.tolist() == [1010.0, 1010.0, 512.0, 384.0]

@@ -6,7 +6,9 @@ from painted import SIZE, depth_of, drive
 from recon.readers.colmap import lens_of
 from recon.readers.colmap_model import ModelCamera
 from recon.seeds.triangulate import matched, triangulated
-from recon.sfm.posed import colmap_lens
+from recon.sfm import posed
+from recon.sfm.colmap import pycolmap
+from recon.sfm.posed import Posed, colmap_lens
 from recon.views.frames import load_frames
 from recon.views.project import project
 from recon.views.view import View
@@ -50,6 +52,17 @@ def test_the_same_pictures_have_the_same_points_each_time(bare, found):
 def test_pictures_held_out_show_no_points(found):
     frames, points = found
     assert [len(points.seen[frames.names[v.camera]][v.index]) for v in frames.held_out()] == [0, 0, 0, 0]
+
+
+def test_a_picture_that_matches_no_other_shows_no_points(tmp_path, monkeypatch):
+    colmap = pycolmap()
+    made = colmap.synthesize_dataset(colmap.SyntheticDatasetOptions(num_rigs=1, num_points3D=20))
+    names = [image.name for image in made.images.values()]
+    monkeypatch.setattr(posed, "_match", lambda *_: None)
+    monkeypatch.setattr(posed, "_at_poses", lambda *_: made)
+    xyz, seen = posed.triangulate(Posed(tmp_path, {}, dict.fromkeys([*names, "alone"], np.eye(4)), []))
+    assert len(xyz) == 20 and seen.pop("alone").tolist() == []
+    assert seen.keys() == set(names) and all(shown.tolist() == list(range(20)) for shown in seen.values())
 
 
 def test_pictures_are_matched_with_the_next_ones_and_with_those_of_their_moment():
