@@ -99,7 +99,7 @@ def sight_of(views: Views, box: Trajectory, size: torch.Tensor) -> Sight:
             part = {name: float(shown[outwards @ way > 0].double().mean()) for name, way in SIDES.items()}
             least = {name: max(LEAST, SHOWN * float(held[outwards @ way > 0].double().mean())) for name, way in SIDES.items()}
             for side, beside in (("left", float(eye[1])), ("right", -float(eye[1]))):
-                sides[side] += part[side] * max(0.0, beside - float(size[1]) / 2) / float(at[i].norm()) ** 3
+                sides[side] += part[side] * (beside - float(size[1]) / 2) / float(at[i].norm()) ** 3
             if seen := " ".join(name for name in sector(float(eye[0]), float(eye[1])).split() if part[name] >= least[name]):
                 count += 1
                 sectors[seen] += 1

@@ -3,6 +3,7 @@ import math
 from collections import Counter
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -310,6 +311,17 @@ def test_what_stands_behind_a_wall_was_not_seen(parked_street):
     parked = sight(beside(parked_street, box((4.2, 1.8, 1.5), (0.2, 0.2, 0.8)), (4.4, 3.5, 0.0)))
     assert 0 < parked.views <= free.views and parked.left > 0.95 * free.left and parked.nearest == free.nearest
     assert parked.sectors["left"] == parked.views > free.sectors["left"]
+
+
+@pytest.mark.parametrize(("beside", "left", "right"), [(3.0, 0, 1), (-3.0, 1, 0), (-0.5, 0, 0)])
+def test_a_side_appears_as_large_as_its_solid_angle_is(street, beside, left, right):
+    """From 8 m behind, and from over there; all of the side is in the picture. From right behind none is."""
+    front = replace(street.rig[CAMERA], times_us=street.rig[CAMERA].times_us[:1])
+    scene = replace(street, rig={CAMERA: front})
+    views = SimpleNamespace(scene=scene, at=lambda *at: (scene.camera(*at), torch.full((54, 96), torch.inf)))
+    sight = sight_of(views, Trajectory(torch.zeros(1, dtype=torch.int64), translation(9.0, beside, 0.0)[None]), SIZE)
+    part = (abs(beside) - 0.9) / (8**2 + beside**2 + (1.5 - 0.75) ** 2) ** 1.5
+    assert (sight.left, sight.right) == pytest.approx((left * part, right * part))
 
 
 def test_a_scene_without_objects_says_so(street, tmp_path):
