@@ -88,11 +88,12 @@ def range_image(points: LidarPoints, ego: Trajectory, mount: np.ndarray) -> Rang
     knots = np.unique(np.linspace(times.min(), times.max(), TURN + 1).round().astype(np.int64))
     poses = np.stack([ego.near(int(t)).numpy() for t in knots])
     eyes = poses[:, :3, :3] @ mount + poses[:, :3, 3]
-    cell = float(np.clip(np.sqrt(PER_CELL * 360 * BAND / len(times)), *CELL))
+    columns = round(360 / float(np.clip(np.sqrt(PER_CELL * 360 * BAND / len(times)), *CELL)))
+    cell = 360 / columns
     away, row, column = _cells(points.xyz - _at(times, knots, eyes), cell)
     lowest = int(row.min()) - 1
     row = row - lowest
-    shape = int(row.max()) + 2, int(360 / cell) + 1
+    shape = int(row.max()) + 2, columns
     seen = np.full(shape, np.inf, np.float32)
     np.minimum.at(seen, (row, column), away)
     around = {"size": 3, "mode": ("nearest", "wrap")}
@@ -114,7 +115,7 @@ def _cells(towards: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np
     away = np.linalg.norm(towards, axis=1)
     elevation = np.degrees(np.arcsin(np.clip(towards[:, 2] / np.maximum(away, np.float32(1e-6)), -1, 1)))
     azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
-    return away, ((elevation + 90) / cell).astype(np.int64), ((azimuth + 180) / cell).astype(np.int64)
+    return away, ((elevation + 90) / cell).astype(np.int64), ((azimuth + 180) / cell).astype(np.int64) % round(360 / cell)
 
 
 def tally(xyz: np.ndarray, time_us: int, others: list[tuple[int, RangeImage]]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,8 @@ import torch
 from made_sweeps import MOUNT, Box, drive, standing
 
 from recon.log import LidarPoints, Sweep, Track
-from recon.movers.boxing import boxed, headings, smoothed
-from recon.movers.following import Cluster
+from recon.movers.boxing import _fitted, boxed, headings, smoothed
+from recon.movers.following import Cluster, Followed, Patience
 from recon.movers.freespace import range_image, tally
 from recon.movers.search import with_movers
 from recon.ready import annotated
@@ -179,6 +179,49 @@ def test_votes_tell_free_space_from_what_is_hidden():
     others = [(s.time_us, range_image(s.read(), log.ego, MOUNT)) for s in log.sweeps]
     through, there = tally(np.array([[15.0, 3, 1.5], [19.5, 3, 1.5]]), 0, others)
     assert through.tolist() == [1, 0] and there.tolist() == [0, 1]  # the sweep 0.2 s later; its neighbour saw the same
+
+
+def around(pole: int) -> tuple[LidarPoints, Trajectory]:
+    """A wall 20 m around a lidar that stands, a point each two degrees; in one column a pole 5 m away stands before it."""
+    azimuth, up = (np.radians(v.ravel()) for v in np.meshgrid(np.arange(-179, 180, 2), np.arange(-9, 10, 2)))
+    towards = np.stack([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)], 1)
+    far = np.where(np.tile(np.arange(180), 10) == pole, 5, 20)
+    still = Trajectory(torch.tensor([0, 100_000]), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+    return LidarPoints(far[:, None] * towards, np.zeros(1800, np.int64), np.zeros(1800, np.int64)), still
+
+
+@pytest.mark.parametrize("pole", [90, 0, 179])
+def test_beside_a_pole_nobody_saw_through_also_where_azimuths_begin_anew(pole):
+    points, still = around(pole)
+    image = range_image(points, still, np.zeros(3))
+    through, _ = image.votes(0.75 * points.xyz[5 * 180 + (pole + np.array([-2, -1, 1, 2])) % 180])
+    assert image.range_m.shape[1] == 180 and through.tolist() == [True, False, False, True]
+
+
+def test_the_farther_away_the_farther_must_others_have_seen():
+    """At 20 m, 0.5 m and a fiftieth of the way."""
+    points, still = around(-1)
+    through, there = range_image(points, still, np.zeros(3)).votes(points.xyz[900] / 20 * np.array([[18.9], [19.3], [20.8], [21.1]]))
+    assert through.tolist() == [True, False, False, False] and there.tolist() == [False, True, True, False]
+
+
+@pytest.mark.parametrize("turned", [0.0, 2.0])
+def test_a_box_reaches_away_from_the_lidar_behind_the_end_that_is_seen(turned):
+    """A car of which only the rear was seen, from behind, and only the front, from ahead."""
+    turn = yaw(turned).numpy()[:3, :3]
+    end = np.stack(np.meshgrid([0.0], np.linspace(-0.9, 0.9, 8), [0.5, 1.0]), -1).reshape(-1, 3) @ turn.T
+    for behind in (1, -1):
+        size, placed = _fitted([Cluster(end, 0, turn @ [-20.0 * behind, 0.0, 0.0])], np.array([turned]), np.zeros((1, 2)))
+        assert size.tolist() == pytest.approx([4.3, 1.8]) and placed[0] == pytest.approx(behind * 2.15 * turn[:2, 0])
+
+
+def test_what_moved_in_few_of_its_sweeps_is_not_believed():
+    places = [Cluster(np.zeros((1, 3)), i, np.zeros(3), moved=i < 6) for i in range(25)]
+    thing = Followed(places[0], Patience((0.5, 1.0), 5, 3))
+    thing.clusters = places[:24]
+    assert thing.believed
+    thing.clusters = places
+    assert not thing.believed
 
 
 def test_a_smoothed_way_keeps_what_is_straight_and_leaves_out_what_is_odd():
