@@ -139,7 +139,7 @@ def _outlined(edges: np.ndarray) -> np.ndarray | None:
     if on.sum() < WIDE * width or worth[line, np.arange(width)][on].mean() < 1 - BROKEN - LOST:
         return None
     line = ndimage.median_filter(line, 2 * round(SMOOTH * width / 2) + 1, mode="nearest")
-    found = np.arange(height)[:, None] >= np.where(on, line, height) - round(RIM * width)
+    found = on & (np.arange(height)[:, None] >= line - round(RIM * width))
     return found if found.mean() <= MOST else None
 
 
