@@ -31,7 +31,7 @@ def shade(track: Track, ground: Ground, sh_count: int) -> Gaussians:
     at = track.world_from_box[:, :3, 3]
     height = float((ground.height(at[:, :2].float()).double() - at[:, 2]).median()) + ABOVE
     half = track.size[:2] / 2 + BESIDE
-    x, y = (np.linspace(-h, h, max(2, round(2 * h / SPACING) + 1)) for h in half)
+    x, y = (np.linspace(-h, h, round(2 * h / SPACING) + 1) for h in half)
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
     means = np.column_stack([xy, np.full(len(xy), height)])
     return alike(means, BLACK, (WIDE * SPACING, WIDE * SPACING, THICK), LOGIT, sh_count)

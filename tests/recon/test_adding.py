@@ -8,6 +8,7 @@ from street import box, car, street
 
 from recon.assets import adding
 from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
+from recon.assets.overturned import overturned
 from scenes import Asset, Databank, Gaussians, save
 from scenes.poses import matrix_from_quat
 from scenes.sizes import SIZES, odd_size
@@ -193,3 +194,12 @@ def test_the_scale_that_is_advised_counts_the_one_that_was_given():
     assert "the scale is not the file's; give --scale 1" in odd_size("car", [1000 * v for v in metres], scale=1000.0).replace(":", ";")
     advised = float(odd_size("car", [0.1 * v for v in metres], scale=0.1).split("--scale ")[1].split()[0])
     assert 0.7 < advised < 1.4
+
+
+@pytest.mark.parametrize("metres", [0.1, 4.0])
+def test_what_is_longer_above_than_below_is_overturned_however_large(metres):
+    z, x = (v.flatten() for v in torch.meshgrid(torch.linspace(0, 1, 20), torch.linspace(-0.5, 0.5, 20), indexing="ij"))
+    cone = metres * torch.stack([x * (1 - 0.7 * z), 0 * x, z], 1)
+    turned = cone * torch.tensor([1.0, 1.0, -1.0])
+    assert overturned("cone", turned) and not overturned("cone", cone) and not overturned("truck", turned)
+    assert not overturned("cone", cone[:0])

@@ -12,10 +12,12 @@ from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
 from recon.registration.align import about, aligned
 from recon.registration.corrected import MOVED, REMOUNTED, TURNED, as_corrected, moved
 from scenes.lenses import Pinhole
-from scenes.poses import inverse
+from scenes.poses import CAM_FROM_FLU, inverse, small_poses, translation, yaw
 from scenes.trajectory import Trajectory
 
 COUNT, STEP_US = 36, 100_000
+UP = small_poses(torch.tensor([0, -0.3, 0, 0, 0, 0]))
+"""Turns a body's nose up."""
 
 
 def street(centre: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -124,6 +126,38 @@ def test_all_that_was_corrected_is_so_again_in_the_order_in_which_it_was_found()
     for one, other in ((at_once.ego, one_by_one.ego), (at_once.tracks[0].trajectory(), one_by_one.tracks[0].trajectory())):
         assert torch.equal(one.world_from_body, other.world_from_body)
     assert torch.equal(at_once.camera("front").world_from_cam, one_by_one.camera("front").world_from_cam)
+
+
+def on_a_slope() -> Log:
+    """A car that goes along y at 10 m/s, nose up by 0.3 rad; its camera is 1 m before its middle, 1.5 m up, and looks ahead."""
+    log, times = drifting(height=0.0)[0], torch.tensor([0, 100_000])
+    body = torch.stack([translation(4.0, 10 * t / 1e6, 2.0) for t in times.tolist()]) @ yaw(np.pi / 2) @ UP
+    camera = replace(log.camera("front"), times_us=times, world_from_cam=body @ translation(1.0, 0.0, 1.5) @ inverse(CAM_FROM_FLU))
+    return replace(log, cameras={"front": camera}, ego=Trajectory(torch.tensor([-100_000, 0, 100_000, 200_000]), torch.cat([
+        translation(0.0, -1.0, 0.0)[None] @ body[:1], body, translation(0.0, 1.0, 0.0)[None] @ body[1:]])))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("motion", "place", "turned"), [([0, 0, 0, 0.1, 0.2, 0.3], (1.3, -0.1, 1.3), 0), ([0, 0.4, 0] + [0] * 3, (1, 0, 1.5), 0.4)]
+)
+def test_a_camera_that_was_late_and_is_fixed_otherwise_moves_along_and_on_its_mount(motion, place, turned):
+    """50 ms later it is 0.5 m farther on; it stands 0.1 m farther right, 0.2 m down and 0.3 m ahead, or looks 0.4 rad farther right."""
+    log = on_a_slope()
+    camera = as_corrected(log, {TURNED: {"front": [*motion, 0.05], "gone": [0.0] * 7}}).camera("front")
+    assert camera.times_us.tolist() == [50_000, 150_000]
+    for k, y in enumerate((0.5, 1.5)):
+        at = inverse(translation(4.0, y, 2.0) @ yaw(np.pi / 2) @ UP) @ camera.world_from_cam[k]
+        assert at[:3, 3].tolist() == pytest.approx(place)
+        assert at[:3, 2].tolist() == pytest.approx([np.cos(turned), -np.sin(turned), 0])
+
+
+def test_a_camera_that_is_remounted_goes_up_on_its_car_and_looks_farther_up():
+    log = on_a_slope()
+    camera = as_corrected(log, {REMOUNTED: {"front": [0.2, 0.1], "gone": [1.0, 1.0]}}).camera("front")
+    at = inverse(log.ego.near_each(camera.times_us)) @ camera.world_from_cam
+    for pose in at:
+        assert pose[:3, 3].tolist() == pytest.approx([1.0, 0, 1.7])
+        assert pose[:3, 2].tolist() == pytest.approx([np.cos(0.1), 0, np.sin(0.1)])
 
 
 def test_lidars_that_turn_together_are_laid_on_others_together():

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -158,6 +159,19 @@ def test_a_sky_that_something_always_hid_is_spread_from_where_it_was_seen():
     there = torch.nn.functional.max_pool2d(looked[None, None].float(), 3, 1, 1)[0, 0] > 0
     told = seen_sky(open_, finer(there, HIDDEN)).linear
     assert (told[looked] - blue).abs().max() < 1e-3, "with no splats before it, but of which photos say that it never shows"
+
+
+def test_a_sky_that_shines_through_in_few_looks_was_not_seen(monkeypatch):
+    """In one of 30 all of it, on the left; on the right in two of 30."""
+    left, right = np.zeros((2, 60, 80), bool)
+    left[:, :40], right[:, 40:] = True, True
+    looks = [left | right, right, *28 * [left & right]]
+    monkeypatch.setattr("recon.views.skies.looks_of", lambda _: [(look, camera()) for look in looks])
+    own = torch.zeros(64, 128, 3)
+    own[:, :64, 0], own[:, 64:, 2] = 1, 1  # red on the left, blue on the right
+    nowhere = torch.zeros(HIDDEN, 2 * HIDDEN, dtype=torch.bool)
+    seen = seen_sky(SimpleNamespace(sky=Sky(own)), nowhere).linear
+    assert (seen - torch.tensor([0.0, 0.0, 1.0])).abs().max() < 1e-5
 
 
 def test_directions_in_which_no_look_shows_the_sky_are_known():

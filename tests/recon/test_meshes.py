@@ -1,6 +1,7 @@
 """Meshes become assets: axes and scale, the tracer against what is known of a box, and the fit against the tracer."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,12 @@ def test_splats_lie_flat_on_what_can_be_seen(tmp_path):
     axis = off.argmax(1)
     normals = matrix_from_quat(splats.quats)[:, :, 2].abs()
     assert (normals[torch.arange(len(axis)), axis] > 0.999).all()
+
+
+def test_a_surface_that_faces_inwards_is_seen_from_outside_all_the_same(box):
+    mesh = read_mesh(box)
+    inwards = replace(mesh, faces=mesh.faces[:, ::-1].copy())
+    assert len(splats_of_mesh(inwards, 500)) == len(splats_of_mesh(mesh, 500)) > 400
 
 
 def test_a_fitted_asset_looks_as_its_mesh_does_from_views_it_never_saw(box):

@@ -14,6 +14,7 @@ from scipy import ndimage
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
 from recon.registration.corrected import TURNED, as_corrected
 from recon.registration.mounts_by_surfaces import mounts_by_surfaces
+from recon.registration.patches import _sampled
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
@@ -25,6 +26,11 @@ STILL = (0.0,) * 6
 LENS = Pinhole(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 PLANES = (((0, 0, 0), (0, 0, 1)), ((0, 7, 0), (0, 1, 0)), ((0, -5, 0), (0, 1, 0)), ((34, 0, 0), (1, 0, 0)))
 """A point and the normal of each: the road, house fronts at both sides, and one where the street ends."""
+
+
+def test_a_picture_is_sampled_at_the_middles_of_its_pixels():
+    across, down = np.meshgrid(np.arange(8.0), np.arange(6.0))
+    assert _sampled(across + 10 * down, np.array([[0.5, 0.5], [3.5, 2.5], [3.75, 2.5], [-2.0, 2.5]])).tolist() == [0, 23, 23.25, 0]
 
 
 @lru_cache

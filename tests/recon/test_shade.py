@@ -47,6 +47,8 @@ def test_an_asset_brings_it_where_it_lies_beside_the_box_and_not_by_being_black(
     """Else a black car that is put in elsewhere would cast no shadow."""
     laid, size = shade(driving(0.0), FLAT, 1), torch.tensor([4.0, 2.0, 1.5])
     assert has_shade(Asset(laid, size, "car"))
+    across = laid.select(laid.means[:, 0].abs() < 2)
+    assert has_shade(Asset(across, size, "car")), "at its corners it may have faded"
     assert not has_shade(Asset(replace(laid, means=laid.means / 3 * torch.tensor([1.0, 1.0, 0.0])), size, "car"))
 
 

@@ -1,6 +1,7 @@
 """Painted cars that go along a painted street, which pictures alone show."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import painted
@@ -149,6 +150,12 @@ def test_what_does_not_go_where_it_seems_to_is_not_believed():
     assert not believed([sighted(t, 12.0, 6.0) for t in times], times)
     assert not believed([sighted(t, 12 - 6 * t / 1e6, 6.0) for t in times], times)
     assert not believed([sighted(t, 12 + 6 * t / 1e6, 6.0) for t in times[::2]], times)  # half of the pictures do not show it
+
+
+@pytest.mark.parametrize("part", ["worth", "grounded"])
+def test_what_looks_as_if_it_stood_or_were_no_thing_is_not_believed(part):
+    times = np.arange(12) * 100_000
+    assert not believed([replace(sighted(t, 12 + 6 * t / 1e6, 6.0), **{part: 0.05}) for t in times], times)
 
 
 def test_a_car_that_passes_us_keeps_its_box_until_it_is_behind_us():

@@ -44,6 +44,15 @@ def test_a_lattice_on_a_gpu_is_the_same():
     torch.testing.assert_close(lattice._by_hats(places), lattice.at(points), atol=1e-5, rtol=1e-5)
 
 
+def test_what_bends_stands_as_in_the_middle_of_a_readout():
+    scene = bending()
+    actor = scene.actors[0]
+    for readout_us in (0, 50_000, -50_000):
+        bent = scene.placed(START_US + STEP_US, readout_us)[1]
+        leans = actor.deformation.at(START_US + STEP_US + readout_us // 2).at(actor.asset.gaussians.means)
+        torch.testing.assert_close(bent.gaussians.means - actor.asset.gaussians.means, leans, atol=1e-5, rtol=0)
+
+
 def test_a_lattice_is_linear_between_nodes_and_held_beyond():
     points = torch.tensor([[0.3, 0.2, 0.5], [-2.0, 0.9, 2.0], [9.0, -4.0, 7.0], [0.0, 0.0, -3.0]])
     moved = Lattice(CORNERS, leaning()).at(points)
