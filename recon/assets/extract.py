@@ -14,7 +14,7 @@ import torch
 
 from recon.assets.cleaning import cleaned
 from recon.assets.closing import closed
-from recon.assets.looking import looking_at
+from recon.assets.looking import corners_of, looking_at
 from recon.assets.photos import photos_of
 from recon.assets.sight import FARTHEST, Sight, Views, sight_of
 from recon.objects.mirror import mirrored, within_box
@@ -26,6 +26,7 @@ from scenes.databank import Databank
 from scenes.files import kind_of
 from scenes.gaussians import Gaussians
 from scenes.harmonics import rgb_from_sh, turned
+from scenes.lenses import Pinhole
 from scenes.match import ground_linear
 from scenes.opening import scene_folder
 from scenes.poses import inverse, matrix_from_quat, quat_from_matrix
@@ -40,7 +41,9 @@ FEWEST_VIEWS = 10
 FULL_SIDE = 0.85
 """Part of a whole side that must be there: of a car that only its tail was seen of, half is missing."""
 
-THUMB = (320, 240)
+THUMB, FILLED = (320, 240), 0.9
+"""Pixels of a picture of an asset, and the part of their width or height that its box takes up."""
+
 CORNERS = {3: 145, 1: 35, 5: 215, 7: 325}
 """Degrees to the left of its nose from which a corner of `SECTORS` is pictured."""
 
@@ -238,6 +241,10 @@ def thumbnail(asset: Asset) -> bytes:
     azimuth, elevation = math.radians(CORNERS[corner]), math.radians(18)
     direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     camera = looking_at(centre, centre + distance * torch.tensor(direction, dtype=torch.float64), *THUMB)
+    box = camera.lens.project((corners_of(asset.size) - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3])
+    off = float((2 * box / torch.tensor(THUMB) - 1).abs().max())  # of what is tall as of what is long nothing is cut off
+    focal = camera.lens.focal()[0] * FILLED / off
+    camera = replace(camera, lens=Pinhole(focal, focal, camera.width / 2, camera.height / 2))
     with torch.no_grad():
         frame = rasterize(asset.gaussians, camera, ("rgb",), background=torch.tensor([0.72, 0.73, 0.75]), model=asset.model)
     assert isinstance(frame, Frame) and frame.rgb is not None

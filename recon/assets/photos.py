@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from recon.assets.looking import looking_at
+from recon.assets.looking import corners_of, looking_at
 from render import Frame, rasterize, render_frame
 from render.rays import camera_rays
 from render.references import Shot
@@ -82,7 +82,7 @@ def photos_of(asset: Asset, scene: Scene, shots: Sequence[Shot], box: Trajectory
 
 def _views(shots: Iterable[Shot], box: Trajectory, size: torch.Tensor) -> Iterable[_View]:
     """The shots in which most of the box lies, from beside it, and large enough."""
-    corners, middle = _corners(size), torch.tensor([0, 0, float(size[2]) / 2], dtype=torch.float64)
+    corners, middle = corners_of(size), torch.tensor([0, 0, float(size[2]) / 2], dtype=torch.float64)
     for shot in shots:
         if not box.covers(shot.camera.time_us):
             continue
@@ -138,14 +138,8 @@ def _cut(asset: Asset, scene: Scene, view: _View, world_from_asset: torch.Tensor
 
 def _framed(camera: Camera, size: torch.Tensor, focal: float) -> Camera:
     """A camera that looks the same way, with a focal length in pixels, and just as large as the box `[3]` that it looks at needs."""
-    local = (_corners(size) - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3]
+    local = (corners_of(size) - camera.world_from_cam[:3, 3]) @ camera.world_from_cam[:3, :3]
     pixels = focal * local[:, :2] / local[:, 2:].clamp_min(0.1)
     low, high = (pixels.amin(0) - 2).floor(), (pixels.amax(0) + 2).ceil()
     width, height = (int(v) for v in (high - low).clamp_max(2 * MOST_PIXELS))
     return replace(camera, lens=Pinhole(focal, focal, -float(low[0]), -float(low[1])), width=width, height=height)
-
-
-def _corners(size: torch.Tensor) -> torch.Tensor:
-    """The corners `[8, 3]` of a box `[3]` that stands on its base centre."""
-    signs = torch.tensor([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (0.0, 1.0)], dtype=torch.float64)
-    return signs * size

@@ -24,7 +24,7 @@ from render.references import Shot
 from render.video import from_bytes, to_bytes
 from scenes import Asset, Databank, Gaussians, Pinhole, Placed, Trajectory, load, save
 from scenes.edit import Edit
-from scenes.harmonics import evaluate
+from scenes.harmonics import evaluate, sh_from_rgb
 from scenes.poses import inverse, translation, yaw
 from scenes.report import validate
 from scenes.usd.edit import add_change
@@ -78,7 +78,7 @@ def test_a_car_seen_from_one_side_is_completed_by_its_mirror_image():
     here = evaluate(half.sh, torch.nn.functional.normalize(torch.tensor([[1.0, 2, 0.5]]), dim=1).expand(len(half), 3))
     torch.testing.assert_close(there, here, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(whole.means[len(half) :], half.means * flip)
-    same, untouched = completed(body(), 1.0, 0.5)
+    same, untouched = completed(body(), 1.0, 0.34)
     assert not untouched and len(same) == len(body())
 
 
@@ -97,6 +97,39 @@ def test_a_mirrored_picture_is_the_picture_of_the_mirrored_car():
 def test_a_tail_has_less_silhouette_than_a_car():
     g = body()
     assert silhouette(g, SIZE) > 0.95 > 0.5 > silhouette(g.select(g.means[:, 0] < -1.4), SIZE)
+
+
+@pytest.mark.parametrize("seen", ["front left", "rear left", "rear right", "front right"])
+def test_a_thumbnail_shows_the_corner_that_was_seen_most(seen):
+    """Of a car whose nose is white, its tail black, its left red, its right green."""
+    g = box(SIZE.tolist(), (0, 0, 0), step=0.1)
+    sides = {"front": (1, 1, 1), "rear": (0, 0, 0), "left": (1, 0, 0), "right": (0, 1, 0)}
+    way = g.means[:, :2] / SIZE[:2]
+    side = torch.where(way[:, 0].abs() > way[:, 1].abs(), (way[:, 0] < 0).long(), 2 + (way[:, 1] < 0).long())
+    painted = replace(g, sh=sh_from_rgb(torch.tensor(list(sides.values())).float()[side])[:, None])
+    pixels = np.asarray(Image.open(io.BytesIO(thumbnail(Asset(painted, SIZE, "car", meta={"sectors": {seen: 5}})))))
+    end, flank = (255 * np.array(sides[word]) for word in seen.split())
+    assert [(np.abs(pixels.astype(int) - colour).max(-1) < 60).sum() > 5000 for colour in (end, flank)] == [True, True]
+
+
+def test_a_parked_car_is_cut_out_in_whatever_frame_the_background_stands(parked_street):
+    there = translation(3.0, -7.0, 1.0) @ yaw(0.5)
+    background = Placed(moved(parked_street.background.gaussians, inverse(there), torch.tensor([1e3] * 3)), there)
+    one, other = (
+        next(c.asset for c in candidates(replace(s, actors=(), rig={})) if c.track == "veh_7")
+        for s in (parked_street, replace(parked_street, background=background))
+    )
+    torch.testing.assert_close(other.gaussians.means, one.gaussians.means, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("size", [(4.2, 1.8, 1.5), (0.7, 0.7, 1.75), (12.0, 2.6, 3.3)], ids=["car", "pedestrian", "bus"])
+def test_a_thumbnail_shows_all_of_its_asset(size):
+    skin = box(size, (1.0, 0, 0), step=0.1)
+    red = replace(skin, log_scales=skin.log_scales - 1)
+    pixels = np.asarray(Image.open(io.BytesIO(thumbnail(Asset(red, size, "car"))))).astype(int)
+    row, column = np.nonzero(pixels[..., 0] - pixels[..., 2] > 100)
+    assert row.min() > 0 and row.max() < 239 and column.min() > 0 and column.max() < 319
+    assert max(np.ptp(row) / 240, np.ptp(column) / 320) > 0.7
 
 
 def test_a_thumbnail_shows_the_asset_on_grey():
