@@ -132,10 +132,9 @@ def sightings(
         hidden = _beside(of_ground[rows][before].mean(0), across) - hiding(standing[:, rows][:, before], inverse_depths * z, across)
         fits = (worth > WORTH) & (grounded > GROUNDED) & (hidden < HIDDEN) & (np.abs(speeds[best]) >= SLOWEST)
         for x in np.flatnonzero(fits):
-            ray = np.array([(x + 0.5 - plate.centre[0]) / plate.focal[0], 0.0, 1.0]) @ plate.cam_from_world[:3, :3]
             cut = not across < x < len(stands[0]) - across
             told = float(z), float(speeds[best[x]]), 0.0, float(worth[x]), float(grounded[x])
-            one = Sighting(time_us, (eye + z * ray)[:2], along, *told, cut)
+            one = Sighting(time_us, eye[:2], along, *told, cut)  # its outline tells where it is
             score = float(worth[x] + min(grounded[x], worth[x]))
             found.append(_Found(score, one, int(x), across, slice(rows.start, rows.start + bottom), worths[best[x]]))
     kept: list[_Found] = []

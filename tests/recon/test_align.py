@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
-from recon.registration.align import about, aligned
+from recon.registration.align import _solved, about, aligned
 from recon.registration.corrected import MOVED, REMOUNTED, TURNED, as_corrected, moved
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse, small_poses, translation, yaw
@@ -71,6 +71,17 @@ def test_a_path_that_drifts_is_bent_back(capsys):
     for k in (1, 30):
         way = (inverse(body[:-k]) @ body[k:])[:, :3, 3]
         assert float((way - torch.tensor([0.8 * k, 0, 0], dtype=torch.float64)).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_corrections_of_sweeps_farther_apart_may_differ_more(step):
+    """Where the second of two is drawn 1 m along x, as surely as sweeps differ by 1 cm."""
+    drawn, towards = np.zeros((12, 12)), np.zeros(12)
+    drawn[9, 9] = towards[9] = 1 / 0.01**2
+    first, second = _solved(np.zeros((2, 6)), [(0, 1)], [(drawn, towards)], step)[:, 3]
+    whole, steady, drawn = 1 / 2.0**2, 1 / (step * 0.01**2), 1 / 0.01**2
+    assert (whole + steady) * first == pytest.approx(steady * second)
+    assert (whole + steady + drawn) * second == pytest.approx(steady * first + drawn)
 
 
 def test_a_drive_whose_sweeps_meet_is_left_alone(capsys):

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,15 +14,18 @@ from quick_fit import CONFIG, SIZE
 
 from recon import open_log, reconstruct
 from recon.begin import begin
-from recon.log import Packed
+from recon.log import LidarPoints, Log, Packed, Sweep
+from recon.views import exposed as exposure
 from recon.views.frames import load_frames
 from recon.views.gains import gains_along
+from recon.views.view import View
 from render import render_frame
 from render.compare import psnr
 from scenes import load
 from scenes.camera import Camera, RigCamera
 from scenes.lenses import Pinhole
 from scenes.report import validate
+from scenes.trajectory import Trajectory
 
 TRUE = np.exp(-0.13 * np.arange(8)) * [1, 1, 1.1, 1, 1, 0.9, 1, 1]
 """Gains of eight frames, from 1 to 0.4, not all of which fall evenly."""
@@ -47,6 +51,22 @@ def test_frames_that_share_nothing_are_not_told():
     picture = torch.full((48, 64, 3), 100, dtype=torch.uint8)
     away = Camera(Pinhole(50.0, 50.0, 32.0, 24.0), 64, 48, torch.eye(4, dtype=torch.float64))
     assert np.isnan(gains_along([picture, picture // 2], [away, away], [np.array([[0.0, 0, -5]])] * 2)).all()
+
+
+def test_a_picture_is_compared_by_the_points_that_were_measured_nearest_to_its_moment(monkeypatch):
+    """Of those within reach of its camera."""
+    nothing = torch.zeros(0)
+    views = [View(0, i, t, nothing, False, nothing) for i, t in enumerate((40_000, 160_000, 310_000))]
+
+    def sweep(i: int) -> Sweep:
+        xyz = np.array([[30.0, 0, i], [50.0, 0, i]])
+        return Sweep(i, 100_000 * i, lambda: LidarPoints(xyz, np.zeros(2, np.int64), np.zeros(2, np.int64)))
+
+    still = Trajectory(torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None])
+    log = Log("made", Path("made"), {}, tuple(map(sweep, range(4))), (), still, {})
+    camera = Camera(Pinhole(50.0, 50.0, 32.0, 24.0), 64, 48, torch.eye(4, dtype=torch.float64))
+    monkeypatch.setattr(exposure, "_gained", lambda log, names, views, points: [points(v, camera).tolist() for v in views])
+    assert exposure.exposed(log, ["front"], views) == [[[30, 0, 0]], [[30, 0, 2]], [[30, 0, 3]]]
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from made_glb import rewritten
 
 from recon.assets.looking import looking_at
 from recon.assets.mesh_files import read_mesh, turn_to_asset
-from recon.assets.mesh_splats import splats_of_mesh
+from recon.assets.mesh_splats import sampled, splats_of_mesh
 from recon.assets.meshes import MeshFit, asset_of_mesh, likeness, views_around
 from render.rays import camera_rays
 from render.tracer import Blockers, TracedMesh, fibonacci, lit
@@ -248,6 +248,21 @@ def test_a_texture_of_sixteen_bits_is_shown_as_eight(tmp_path):
 
     file = wide_box(tmp_path / "a.glb", 0.5, baseColorTexture=Image.fromarray(np.full((4, 4), 100 * 257, np.uint16)))
     assert read_mesh(file).textures[0].reshape(-1, 4).tolist() == 16 * [[100, 100, 100, 255]]
+
+
+def test_a_texture_of_an_obj_file_is_upright(tmp_path):
+    """Its v goes up: a board whose picture is red above and blue below."""
+    from PIL import Image
+
+    Image.fromarray(np.repeat(np.uint8([[[200, 0, 0]], [[0, 0, 200]]]), 4, 0).repeat(8, 1)).save(tmp_path / "paint.png")
+    (tmp_path / "board.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    corners = [(-1, 0), (1, 0), (1, 2), (-1, 2)]
+    places = "".join(f"v {x} {y} 0\nvt {(x + 1) / 2} {y / 2}\n" for x, y in corners)
+    (tmp_path / "board.obj").write_text(f"mtllib board.mtl\n{places}usemtl paint\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n")
+    splats = sampled(read_mesh(tmp_path / "board.obj"), 200)
+    red, _, blue = rgb_from_sh(splats.sh[:, 0]).T
+    within = splats.means[:, 2] > 0  # at v = 1 the picture begins anew
+    assert ((red > blue) == (splats.means[:, 2] > 1))[within].all() and 80 < (red > blue).sum() < 120
 
 
 @pytest.mark.parametrize("textured", [False, True], ids=["no coordinates", "coordinates"])

@@ -4,6 +4,8 @@ import io
 import json
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +15,10 @@ from scipy import ndimage
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
 from recon.registration.corrected import TURNED, as_corrected
-from recon.registration.mounts_by_surfaces import mounts_by_surfaces
-from recon.registration.patches import _sampled
+from recon.registration.mounts_by_surfaces import _improved, mounts_by_surfaces
+from recon.registration.patches import CameraPictures, Matches, _sampled
 from scenes.lenses import Pinhole
-from scenes.poses import inverse, small_poses
+from scenes.poses import inverse, small_poses, translation
 from scenes.trajectory import Trajectory
 
 COUNT, STEP_US, SPEED = 12, 100_000, 10.0
@@ -31,6 +33,23 @@ PLANES = (((0, 0, 0), (0, 0, 1)), ((0, 7, 0), (0, 1, 0)), ((0, -5, 0), (0, 1, 0)
 def test_a_picture_is_sampled_at_the_middles_of_its_pixels():
     across, down = np.meshgrid(np.arange(8.0), np.arange(6.0))
     assert _sampled(across + 10 * down, np.array([[0.5, 0.5], [3.5, 2.5], [3.75, 2.5], [-2.0, 2.5]])).tolist() == [0, 23, 23.25, 0]
+
+
+def test_a_pixel_is_transferred_from_where_its_row_was_read_to_where_it_is_read_again():
+    """A camera that goes to its right at 10 m/s past a wall 10 m away; what a row at 3/4 shows was read 25 ms late."""
+    times = torch.tensor([-100_000, 0, 200_000, 300_000])
+    poses = torch.stack([translation(1e-5 * t, 0.0, 0.0) for t in times.tolist()])
+    ego, files = Trajectory(times, poses), (Path("none"),) * 2
+    camera = LogCamera("aside", Pinhole(100.0, 100.0, 100.0, 50.0), 200, 100, files, times[1:3], poses[1:3], "rows", 100_000)
+    pictures = CameraPictures(SimpleNamespace(ego=ego), camera, np.zeros(0), lambda _: None, 1)
+    wall, normal = np.array([[3.0, 1.0, 10.0]]), np.array([[0.0, 0.0, 1.0]])
+    pixels = np.array([[[100.0, 75.0], [100.0, 25.0]]])
+    np.testing.assert_allclose(pictures._transferred(0, 1, pixels, wall, normal, np.zeros(7)), [[[80, 75], [80, 25]]], atol=1e-6)
+
+
+def test_what_no_patch_tells_is_likely_to_be_as_recorded():
+    silent = Matches(np.zeros((5, 2, 7)), np.zeros((5, 2)), np.tile(np.eye(2), (5, 1, 1)), np.zeros((5, 2, 7)))
+    np.testing.assert_allclose(_improved([silent], np.full(7, 0.1))[0], 0, atol=1e-12)
 
 
 @lru_cache

@@ -10,7 +10,7 @@ from recon.log import LidarPoints, Sweep, Track
 from recon.movers.boxing import _fitted, boxed, headings, smoothed
 from recon.movers.following import Cluster, Followed, Patience
 from recon.movers.freespace import range_image, tally
-from recon.movers.search import with_movers
+from recon.movers.search import _read, with_movers
 from recon.ready import annotated
 from scenes.ground import Ground
 from scenes.poses import translation, yaw
@@ -139,6 +139,15 @@ def test_two_lidars_that_turn_at_one_moment_see_one_thing_once():
     both = replace(log, sweeps=(*first, *second), lidars={0: MOUNT, 1: MOUNT})
     (track,) = with_movers(both, both.sweeps).tracks
     assert np.median(misses(track, MOVING["oncoming"])[0]) < 0.2 and track.trajectory().covers(1_000_000)
+
+
+def test_sweeps_of_lidars_that_turn_at_other_moments_are_read_by_time():
+    def sweep(time_us: int, x: float) -> Sweep:
+        return Sweep(0, time_us, lambda: LidarPoints(np.full((2, 3), x), np.full(2, time_us), np.zeros(2, np.int64)))
+
+    read = _read([sweep(0, 1), sweep(200, 2), sweep(100, 3), sweep(200, 4)])
+    assert {time: points.xyz[:, 0].tolist() for time, points in read.items()} == {0: [1, 1], 100: [3, 3], 200: [2, 2, 4, 4]}
+    assert list(read) == [0, 100, 200] and read[200].times_us.tolist() == 4 * [200]
 
 
 def half(sweep: Sweep, sensor: int) -> LidarPoints:

@@ -1,0 +1,57 @@
+"""What structure from motion is asked, and which of its answers is taken."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from recon.sfm import solve as sfm
+from recon.sfm.colmap import pycolmap
+
+pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+
+
+def test_a_known_angle_is_that_across_also_of_pictures_that_stand(tmp_path, monkeypatch):
+    Image.fromarray(np.zeros((60, 40, 3), np.uint8)).save(tmp_path / "a.png")
+    asked = []
+    monkeypatch.setattr(sfm, "extract_features", lambda *given: asked.append(given[4].camera_params))
+    monkeypatch.setattr(sfm, "_match_neighbours", lambda *_: None)
+    monkeypatch.setattr(sfm, "_largest", lambda *_: (None, 0))
+    with pytest.raises(ValueError, match="only 0 of 1 pictures"):
+        sfm.solve(tmp_path, ["a.png"], tmp_path, True, math.radians(90), "a")
+    (focal, *rest) = map(float, asked[0].split(","))
+    assert focal == pytest.approx(20) and rest == [20, 30, 0]
+
+
+def test_a_lens_that_is_found_is_no_wider_than_any():
+    options = sfm._solving_options(pycolmap(), None)
+    assert options.min_focal_length_ratio == pytest.approx(0.3004, abs=1e-4) and options.ba_refine_focal_length  # 0.5 / tan(59 deg)
+    assert not sfm._solving_options(pycolmap(), 1.0).ba_refine_focal_length
+
+
+@pytest.mark.parametrize(("size", "degrees"), [((800, 600), 60), ((600, 800), 46.83)])
+def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path):
+    colmap, database = pycolmap(), tmp_path / "database.db"
+    with colmap.Database.open(database) as opened:
+        opened.write_camera(colmap.Camera(model="SIMPLE_RADIAL", width=size[0], height=size[1], params=[500, *size, 0.1]))
+    assert math.degrees(sfm._fix_lens(colmap, database, sfm._solving_options(colmap, None))) == pytest.approx(degrees, abs=0.01)
+    with colmap.Database.open(database) as opened:
+        (camera,) = opened.read_all_cameras()
+    assert camera.params.tolist() == pytest.approx([400 / math.tan(math.radians(30)), size[0] / 2, size[1] / 2, 0])
+
+
+def test_the_largest_of_several_models_is_taken(tmp_path):
+    small, large = (SimpleNamespace(num_reg_images=lambda n=n: n) for n in (3, 7))
+    told = []
+
+    def mapping(*_, initial_image_pair_callback, next_image_callback):
+        initial_image_pair_callback()
+        next_image_callback()
+        return {0: small, 1: large}
+
+    found = sfm._largest(SimpleNamespace(incremental_mapping=mapping), tmp_path, tmp_path, tmp_path / "made", None, told.append)
+    assert found == (large, 7) and told == [2, 3] and not (tmp_path / "made").exists()
+    none = SimpleNamespace(incremental_mapping=lambda *_, **__: {})
+    assert sfm._largest(none, tmp_path, tmp_path, tmp_path / "made", None, told.append) == (None, 0)
