@@ -53,6 +53,15 @@ def test_frames_that_share_nothing_are_not_told():
     assert np.isnan(gains_along([picture, picture // 2], [away, away], [np.array([[0.0, 0, -5]])] * 2)).all()
 
 
+def test_a_view_is_seen_as_if_its_camera_had_exposed_it_as_all_others():
+    picture = torch.tensor([[[51, 102, 204], [0, 0, 255]]], dtype=torch.uint8)
+    view = View(0, 0, 0, picture, False, torch.zeros(0), gain=torch.tensor([2.0, 1.0, 0.5]))
+    assert view.evenly() == pytest.approx(np.array([[[0.1, 0.4, 1.6], [0, 0, 2]]]))
+    assert view.evenly(np.array([0]), np.array([1])) == pytest.approx(np.array([[0, 0, 2]]))
+    assert replace(view, gain=None).evenly() == pytest.approx(np.array([[[0.2, 0.4, 0.8], [0, 0, 1]]]))
+    assert exposure._divided(view, torch.tensor([2.0, 1.0, 0.5])).image.tolist() == [[[26, 102, 255], [0, 0, 255]]]
+
+
 def test_a_picture_is_compared_by_the_points_that_were_measured_nearest_to_its_moment(monkeypatch):
     """Of those within reach of its camera."""
     nothing = torch.zeros(0)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from made_sweeps import MOUNT, Box, drive, standing
 from recon.log import LidarPoints, Sweep, Track
 from recon.movers.boxing import _fitted, boxed, headings, smoothed
 from recon.movers.following import Cluster, Followed, Patience
-from recon.movers.freespace import range_image, tally
-from recon.movers.search import _read, with_movers
+from recon.movers.freespace import OFFSETS, range_image, tally
+from recon.movers.search import _read, clusters, with_movers
 from recon.ready import annotated
 from scenes.ground import Ground
 from scenes.poses import translation, yaw
@@ -139,6 +140,16 @@ def test_two_lidars_that_turn_at_one_moment_see_one_thing_once():
     both = replace(log, sweeps=(*first, *second), lidars={0: MOUNT, 1: MOUNT})
     (track,) = with_movers(both, both.sweeps).tracks
     assert np.median(misses(track, MOVING["oncoming"])[0]) < 0.2 and track.trajectory().covers(1_000_000)
+
+
+@pytest.mark.parametrize(("through", "there", "moves"), [(2, 6, True), (2, 7, False), (1, 0, False)])
+def test_what_most_sweeps_saw_standing_there_did_not_move(through, there, moves):
+    """Whatever two of them seem to have seen through: leaves, or a fence."""
+    points = np.random.default_rng(0).uniform((10, 0, 0.5), (10.4, 0.4, 1.5), (60, 3))
+    votes = [(True, False)] * through + [(False, True)] * there
+    images = [(time, SimpleNamespace(cell=0.5, votes=lambda xyz, says=says: [np.full(len(xyz), v) for v in says])) for time, says in
+              zip((1_000_000 * t for t in OFFSETS), votes, strict=False)]  # fmt: skip
+    assert len(clusters(0, points, images, np.zeros(3))) == moves
 
 
 def test_sweeps_of_lidars_that_turn_at_other_moments_are_read_by_time():
