@@ -105,7 +105,7 @@ def boxes_touch(a: Actor, b: Actor, time_us: int) -> bool:
     poses = [x.trajectory.at(time_us) for x in (a, b)]
     low, high = [], []
     for x, pose in zip((a, b), poses, strict=True):
-        low.append(float(pose[2, 3]) + SLACK)
+        low.append(float(pose[2, 3]))
         high.append(float(pose[2, 3] + x.asset.size[2]) - SLACK)
     if low[0] > high[1] or low[1] > high[0]:
         return False

@@ -7,14 +7,14 @@ import pytest
 import torch
 from street import START_US, STEP_US, box, car
 
-from scenes import Gaussians, Ground, Placed, Trajectory
-from scenes.collide import boxes_touch, collisions
+from scenes import Actor, Gaussians, Ground, Placed, Trajectory
+from scenes.collide import boxes_touch, collisions, into
 from scenes.harmonics import evaluate, rgb_from_sh, sh_from_rgb
 from scenes.insert import insert
 from scenes.lane import Lane
 from scenes.match import ground_linear, matched, relit
 from scenes.placement import Placement, parse_placement
-from scenes.poses import translation, yaw, yaw_of
+from scenes.poses import inverse, translation, yaw, yaw_of
 from scenes.sky import linear_from_srgb, srgb_from_linear
 
 RADIUS = 30.0
@@ -93,6 +93,26 @@ def test_boxes_touch_as_the_plane_says(street):
         assert boxes_touch(mine, other, START_US) is boxes_touch(other, mine, START_US) is touch, (x, y)
     high = replace(mine, trajectory=Trajectory(torch.tensor([START_US]), (pose @ translation(z=5.0))[None]))
     assert not boxes_touch(high, other, START_US)
+
+
+@pytest.mark.parametrize(("metres", "touch"), [(1.35, True), (1.45, False)])
+def test_what_stands_on_another_touches_it_where_their_heights_overlap(metres, touch):
+    """By more than the air that annotators leave; cars are 1.5 m high."""
+    below, above = (
+        Actor(car(), Trajectory(torch.tensor([START_US]), translation(0.0, 0.0, z)[None]), name) for name, z in (("a", 0.0), ("b", metres))
+    )
+    assert boxes_touch(below, above, START_US) == boxes_touch(above, below, START_US) == touch
+
+
+def test_what_stands_in_the_way_is_met_in_whatever_frame_the_background_stands(street):
+    there = translation(3.0, -7.0, 1.0) @ yaw(0.5)
+    back = inverse(there).float()
+    splats = street.background.gaussians
+    turned = replace(street, background=Placed(replace(splats, means=splats.means @ back[:3, :3].T + back[:3, 3]), there))
+    poses = torch.stack([translation(12.0, y, 0.0) for y in (4.0, 8.0, 9.0)])
+    actor = Actor(car(), Trajectory(START_US + STEP_US * torch.arange(3), poses), "new")
+    hits = [into(scene, actor, actor.trajectory.times_us.tolist()) for scene in (street, turned)]
+    assert hits[0] is not None and hits[0] == hits[1] and hits[0][0] > START_US
 
 
 def test_standing_in_a_house_is_said_and_a_kerb_and_a_bridge_above_are_not(street):
