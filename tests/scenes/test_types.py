@@ -239,3 +239,12 @@ def test_a_part_of_a_path_is_as_the_whole_within_its_span():
         assert part.times_us.tolist() == kept, span
         assert all(torch.equal(part.at(t), path.at(t)) for t in kept)
     assert len(Trajectory(times[:1], poses[:1]).within((500, 600))) == 1
+
+
+@pytest.mark.parametrize("readout_us", [50_000, -50_000])
+def test_a_camera_that_reads_upwards_ends_where_its_body_was_before(readout_us):
+    ego = Trajectory(torch.tensor([0, 200_000]), torch.stack([translation(0.0, 0.0, 0.0), translation(2.0, 0.0, 0.0)]))
+    camera = RigCamera(Pinhole(50.0, 50.0, 32.0, 24.0), 64, 48, translation(0.5, 0.0, 1.0), shutter="rows", readout_us=readout_us)
+    seen = camera.along(ego, 100_000)
+    assert seen.world_from_cam[:3, 3].tolist() == pytest.approx([1.5, 0, 1])
+    assert seen.world_from_cam_end[:3, 3].tolist() == pytest.approx([1.5 + readout_us / 100_000, 0, 1])
