@@ -12,7 +12,7 @@ from recon.registration.align import about
 from recon.registration.corrected import MOVED, as_corrected, moved
 from recon.sfm import posed
 from recon.sfm.colmap import pycolmap
-from scenes.poses import inverse
+from scenes.poses import inverse, translation, yaw
 from scenes.trajectory import Trajectory
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
@@ -83,3 +83,20 @@ def test_poses_move_as_far_as_positions_may_be_off_and_the_lens_stays(spread, ke
     places, were, are = (np.stack([np.linalg.inv(of[name])[:3, 3] for name in truth]) for of in (found, given, truth))
     assert after < before and (np.abs(places - were).max() < 0.03) == kept and (np.abs(places - are).max() < 0.03) != kept
     assert camera.params.tolist() == [1010.0, 1010.0, 512.0, 384.0]
+
+
+@pytest.mark.parametrize(("metres", "moves"), [(0.9, True), (1.1, False)])
+def test_a_path_goes_where_its_pictures_meet_but_not_far(bare, metres, moves, monkeypatch):
+    """To its left and turned a little, all of it, though the first picture meets no other."""
+    name, motion = next(iter(bare.cameras)), translation(0.0, metres, 0.0) @ yaw(0.01)
+
+    def met(pictures, spread):
+        poses = {file: np.linalg.inv(motion.numpy() @ np.linalg.inv(pose)) for file, pose in list(pictures.poses.items())[1:]}
+        return poses, 1.0, 0.1
+
+    monkeypatch.setattr("recon.registration.adjust.adjust", met)
+    better = adjusted(bare, name, ALL, SIZE)
+    assert (better is not bare) == moves
+    if moves:
+        torch.testing.assert_close(better.ego.world_from_body, motion @ bare.ego.world_from_body)
+        torch.testing.assert_close(better.camera(name).world_from_cam, motion @ bare.camera(name).world_from_cam)
