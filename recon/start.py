@@ -21,7 +21,7 @@ from recon.seeds.actors import actor_seeds, times_of
 from recon.seeds.aside import seen_from_aside
 from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
-from recon.seeds.dense import agreeing, cloud_from_pictures, points_of
+from recon.seeds.dense import Depths, agreeing, cloud_from_pictures, points_of
 from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
@@ -109,11 +109,7 @@ def prepare(
     movers = [t for t in log.tracks if t.moving and t.times_us[-1] >= span_us[0] and t.times_us[0] <= span_us[1]]
     known = None if exposures is None else exposures.diagonal(dim1=1, dim2=2).double().numpy()
     if sparse is not None:
-        agreed = agreeing(log, frames, sparse, estimate_ground(sparse.xyz, driven))
-        road = road_by_pictures(log, frames.names, driven, span_us, points_of(agreed), estimate_ground(points_of(agreed), driven))
-        lies = np.zeros((0, 3))
-        if road is not None:
-            agreed, lies = [own.on(road) for own in agreed], road.points()
+        agreed, lies = _seen_by_pictures(log, frames, sparse, driven, span_us)
         if not log.tracks:
             movers = list(traffic(log, frames, estimate_ground(np.concatenate([points_of(agreed), lies]), driven)))
     report("sorting lidar points")
@@ -157,6 +153,20 @@ def prepare(
     of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
     ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(shown, ground, STRAY_IN_PICTURES)
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(street.measured), swept, *of_views)
+
+
+def _seen_by_pictures(
+    log: Log, frames: Frames, sparse: SparsePoints, driven: Trajectory, span_us: tuple[int, int]
+) -> tuple[list[Depths], np.ndarray]:
+    """Depths on which pictures agree, and points `[N, 3]` of the road where it takes more than these to tell it."""
+    agreed = agreeing(log, frames, sparse, estimate_ground(sparse.xyz, driven))
+    points = points_of(agreed)
+    road = road_by_pictures(log, frames.names, driven, span_us, points, estimate_ground(points, driven))
+    if road is None:
+        return agreed, np.zeros((0, 3))
+    lies = road.points()
+    ground = estimate_ground(np.concatenate([points, lies]), driven)  # under which nothing is looked for
+    return [own.on(road) for own in agreeing(log, frames, sparse, ground)], lies
 
 
 def _lidar_street(

@@ -112,6 +112,7 @@ def road_by_pictures(
     """The road along a body's path `ego`, which points `[N, 3]` show roughly, and the pictures of the cameras `names` in a span; in the
     cells of a `guess` of the ground. None where points do not tell it."""
     path = Path(ego)
+    points = points[np.isfinite(path.tree.query(points[:, :2], distance_upper_bound=DRIVEN + 1.0)[0])]
     along, left, level = path.beside(points[:, :2])
     eyes = np.concatenate([log.camera(name).world_from_cam[:, :3, 3].numpy() for name in names])
     mount = float(np.median(eyes[:, 2] - path.beside(eyes[:, :2])[2]))
