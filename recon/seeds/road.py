@@ -45,12 +45,15 @@ TOLD, EVERY = 200, 4.0
 WAVES = 0.06
 """Metres off its middle up to which the road is taken to be where points show it."""
 
+MOVED = 0.05
+"""Metres from a place of the path to the next, at least."""
+
 WIDE, LONG = 4.0, 12.0
 """Metres beside the path, and beyond its ends, up to which the road is known."""
 
 DRIVEN, OFF, KERB, NOISE = 1.5, 0.6, 0.2, 2.5
-"""Metres beside the path where the car drove: what is no more metres than this off the road is the road; farther aside so many at least,
-or times how far points are off it in the median."""
+"""Metres beside the path where the car drove: what is no more metres than this off the road, or half of the cameras' height, is the road;
+farther aside so many at least, or times how far points are off it in the median."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,7 @@ class Path:
     """A body's path `[N, 3]`, a point every metre, and straight on beyond its ends for `LONG`."""
 
     def __init__(self, ego: Trajectory):
-        places = ego.world_from_body[:, :3, 3].numpy()
-        moved = np.concatenate([[True], np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 0.05])
-        places = places[moved]
+        places = _apart(ego.world_from_body[:, :3, 3].numpy())
         way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1))])
         at = np.arange(0.0, way[-1] + 1.0)
         inner = np.stack([np.interp(at, way, places[:, k]) for k in range(3)], 1)
@@ -106,6 +107,15 @@ class Path:
         return along, left, np.interp(along, np.arange(len(self.places)), self.places[:, 2])
 
 
+def _apart(places: np.ndarray) -> np.ndarray:
+    """Those of places `[N, 3]` that are off the last one that stays: who stands shakes, and of many poses a second all are close."""
+    stay = [0]
+    for i, place in enumerate(places[:, :2]):
+        if np.linalg.norm(place - places[stay[-1], :2]) > MOVED:
+            stay.append(i)
+    return places[stay]
+
+
 def road_by_pictures(
     log: Log, names: Sequence[str], ego: Trajectory, span_us: tuple[int, int], points: np.ndarray, guess: Ground
 ) -> Road | None:
@@ -124,10 +134,11 @@ def road_by_pictures(
     stretch = (along / EVERY).astype(np.int64)
     middles = np.array([np.median(under[stretch == k]) for k in np.unique(stretch)])
     waves = float(np.median(np.abs(middles - below)))
-    if waves < WAVES:
-        return None  # nothing to do: it goes along with the path as it is
+    off = min(OFF, (below + mount) / 2)  # what is as high as a low camera is not the road
+    if not WAVES < waves < off:
+        return None  # it goes along with the path as it is, or the path does not go along it: of one who climbs, or flies
     alike = [p for name in names for p in _pieces(log, log.camera(name), span_us, path, below, below + mount)]
-    return _laid(path, guess, below - (below + mount) * _rise(alike), min(OFF, max(KERB, NOISE * waves)))
+    return _laid(path, guess, below - (below + mount) * _rise(alike), off, min(off, max(KERB, NOISE * waves)))
 
 
 def _rise(alike: Sequence[np.ndarray]) -> float:
@@ -200,8 +211,8 @@ def _alike(
     return (one * other).sum((1, 2)) / np.maximum(1e-6, np.linalg.norm(one, axis=(1, 2)) * np.linalg.norm(other, axis=(1, 2)))
 
 
-def _laid(path: Path, guess: Ground, below: float, beside: float) -> Road:
-    """The road so many metres below a path, in a ground's cells; beside: its slack where the car did not drive."""
+def _laid(path: Path, guess: Ground, below: float, driven: float, beside: float) -> Road:
+    """The road so many metres below a path, in a ground's cells; its slack where the car drove, and beside."""
     rows, columns = guess.heights.shape
     x, y = (origin + guess.cell * np.arange(n) for origin, n in zip(guess.origin, (columns, rows), strict=True))
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -211,5 +222,5 @@ def _laid(path: Path, guess: Ground, below: float, beside: float) -> Road:
     heights, slack = guess.heights.numpy().astype(np.float64).ravel(), np.zeros(rows * columns)
     heights[cells] = level - below  # also of the cells around those that are known, between which heights are linear
     within = (np.abs(left) < WIDE) & (along > 1) & (along < len(path.places) - 2)
-    slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, OFF, beside)
+    slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, driven, beside)
     return Road(replace(guess, heights=torch.from_numpy(heights.reshape(rows, columns)).float()), slack.reshape(rows, columns))

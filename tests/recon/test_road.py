@@ -9,13 +9,14 @@ from painted import HEIGHT, SIZE, drive
 
 from recon.ground import estimate_ground
 from recon.seeds.dense import Depths
-from recon.seeds.road import KERB, OFF, WIDE, Road, road_by_pictures
+from recon.seeds.road import KERB, OFF, WIDE, Path, Road, road_by_pictures
 from recon.seeds.stereo import plate_of
 from recon.views.view import View
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.lenses import Pinhole
 from scenes.poses import CAM_FROM_FLU, inverse, translation
+from scenes.trajectory import Trajectory
 
 EVER = (0, 10**9)
 
@@ -33,8 +34,8 @@ def points(log, waves: float, off: float = 0.0) -> np.ndarray:
     return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
 
 
-def found(log, shown: np.ndarray):
-    return road_by_pictures(log, ["front"], log.ego, EVER, shown, estimate_ground(shown, log.ego))
+def found(log, shown: np.ndarray, span=EVER):
+    return road_by_pictures(log, ["front"], log.ego, span, shown, estimate_ground(shown, log.ego))
 
 
 def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log):
@@ -51,6 +52,31 @@ def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log):
 def test_where_points_show_it_well_nothing_is_done(log):
     assert found(log, points(log, 0.0)) is None
     assert found(log, points(log, 0.25)[:: 40 * 40]) is None, "too few"
+
+
+def test_a_path_that_does_not_go_along_the_road_tells_nothing_of_it(log):
+    """Of one who flies: what lies under it where it is high would be taken to be under the road, and dropped."""
+    poses = log.ego.world_from_body.clone()
+    poses[:, 2, 3] += torch.arange(len(poses)) / 2
+    flown = replace(log, ego=replace(log.ego, world_from_body=poses))
+    assert found(flown, points(log, 0.01), span=(0, 0)) is None
+
+
+def test_a_slow_drive_with_many_poses_a_second_has_a_path():
+    places = torch.stack([translation(0.03 * i, 0.0, HEIGHT) for i in range(1000)])
+    path = Path(Trajectory(10_000 * torch.arange(1000), places))
+    assert abs(path.length - 29.97) < 0.1
+    shaken = places.clone()
+    shaken[:, 0, 3] = 0.02 * (torch.arange(1000) % 2)
+    assert Path(Trajectory(10_000 * torch.arange(1000), shaken)).length == 0, "stands"
+
+
+def test_what_is_as_high_as_a_low_camera_is_not_the_road(log):
+    down = translation(0, 0, -0.9)
+    low = {name: replace(c, world_from_cam=down @ c.world_from_cam) for name, c in log.cameras.items()}
+    ego = replace(log.ego, world_from_body=down @ log.ego.world_from_body)
+    road = found(replace(log, cameras=low, ego=ego), points(log, 0.25), span=(0, 0))
+    assert 0.2 < road.slack.max() < 0.45
 
 
 def test_pictures_that_show_nothing_leave_it_where_points_are_in_the_middle(log):
