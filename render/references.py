@@ -20,6 +20,7 @@ import torch
 import warp as wp
 from torch.nn import functional as F
 
+from render.flat_field import in_flat_field
 from render.frame import render_frame
 from render.frame_types import Frame
 from render.kernels.detail import add_photo, carry_over
@@ -220,14 +221,15 @@ class References:
 
 
 def _gain(scene: Scene, frame: Frame) -> torch.Tensor:
-    """How many times as bright as a scene's splats are they are shown, `[H, W, 3]` or `[3]`: what a photo adds is shown alike."""
+    """How many times as bright as a scene's splats are they are shown, `[H, W, 3]`: what a photo adds is shown alike."""
     assert frame.rgb is not None and frame.instance is not None
     exposure, followed = frame.camera.exposure, scene.followed(frame.camera.time_us)
     gain = torch.ones(3, dtype=torch.float32) if exposure is None else exposure[:, :3].diagonal().clamp_min(DARKEST)
-    if followed is None:
-        return gain.to(frame.rgb)
-    lit = torch.stack([gain, *(gain / followed if actor.recorded else gain for actor in scene.actors)])
-    return lit.to(frame.rgb)[frame.instance.long().clamp_min(0)]
+    lit = gain.to(frame.rgb).expand_as(frame.rgb)
+    if followed is not None:
+        each = torch.stack([gain, *(gain / followed if actor.recorded else gain for actor in scene.actors)])
+        lit = each.to(frame.rgb)[frame.instance.long().clamp_min(0)]
+    return in_flat_field(lit, frame.camera.flat_field)
 
 
 def _id_of(asset: Asset, instance: int, shown: Asset | None) -> int:

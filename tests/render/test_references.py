@@ -81,6 +81,17 @@ def test_from_where_a_photo_was_taken_it_is_seen_pixel_by_pixel(street, shrink):
     assert (found.reference - photo)[told].abs().max() < 1e-3
 
 
+def test_what_a_photo_adds_in_its_dark_corner_is_as_much_where_the_frame_is_light(street):
+    """The detail of a photo whose lens halves all light, in a frame of one that does not."""
+    camera, base = at_hand(street), render_frame(street, at_hand(street), READS)
+    dim = replace(camera, flat_field=torch.full((2, 2, 3), 0.5))
+    half = to_bytes(render_frame(street, dim).rgb + 0.05)
+    (found,) = References([Shot(dim, lambda w, h: half)], street).along([base])
+    told = (found.trust > 0) & (base.rgb < 0.85).all(-1) & (base.rgb > 0).all(-1)
+    added = (found.reference - base.rgb)[told]
+    assert told.float().mean() > 0.3 and abs(float(added.median()) - 0.1) < 0.01
+
+
 def test_a_wider_view_gets_of_a_photo_what_its_own_pixels_average(street):
     """As wide in pixels as the photo, it has half as many a radian: in its middle it shows the photo at half the size."""
     camera = at_hand(street)
