@@ -11,7 +11,7 @@ import torch
 from recon.fit.densify import hold_shade, shade_of
 from recon.fit.descent import rates_at
 from recon.fit.develop import developed
-from recon.fit.flat_field import FlatField, due
+from recon.fit.flat_field import FEWEST, FlatField, due
 from recon.fit.limbs import Limbs
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
@@ -83,6 +83,7 @@ class Fit:
         self.measured = [m.to(self.device) for m in measured]
         self.sky, self.exposures = sky.to(self.device), exposures.to(self.device)
         self.first_sky, self.flat_fields = self.sky.clone(), flat_fields
+        self.evened = self._evened()
         self.step_count = 0
         self.training = [view.to(self.device) for view in frames.training()]
         self.generator = torch.Generator().manual_seed(self.config.seed)
@@ -148,7 +149,7 @@ class Fit:
         outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
         drawn = self._render(by_lot, shot, sky, shift, outputs, blank)
         rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
-        if self._evening():
+        if view.camera in self.evened:
             self.flat_fields[view.camera].compare(rgb, target)
         lattice = (STEP, *torch.randint(0, STEP, (2,), generator=self.generator).tolist())
         loss = PictureLoss.apply(rgb, target, self.config.dissimilarity, lattice)
@@ -281,15 +282,16 @@ class Fit:
             self.population.grow(self.progress)
         if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
             self._refill()
-        if self._evening() and due(self.step_count, self.config.steps):
-            for field in self.flat_fields:
-                field.follow()
+        if due(self.step_count, self.config.steps):
+            for camera in self.evened:
+                self.flat_fields[camera].follow()
         if self.population.guessed is None and self.progress >= GUESSED_FROM:
             self.population.guess(self.shown)
 
-    def _evening(self) -> bool:
-        """Whether cameras' flat fields are found on the way."""
-        return "flat fields" in self.config.refine
+    def _evened(self) -> list[int]:
+        """The cameras whose flat fields are found on the way."""
+        cameras = range(len(self.flat_fields)) if "flat fields" in self.config.refine else ()
+        return [c for c in cameras if len(self.frames.of(c)) >= FEWEST]
 
     def _blaming(self) -> bool:
         """Whether this step asks which splats show what is wrong."""

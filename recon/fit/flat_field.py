@@ -29,6 +29,9 @@ FOLLOWS = 0.5
 ALIKE = 0.1
 """Pixels of which a colour is farther off than this show something else than what is rendered."""
 
+FEWEST = 5
+"""Training pictures that a camera needs: what renders of one are off by is the street's."""
+
 BRIGHT = 0.97
 """Colours from which on a picture may be clipped."""
 
@@ -65,7 +68,8 @@ class FlatField:
         every = max(1, rgb.shape[1] // SAMPLES)
         pair = torch.stack([rgb[::every, ::every], target[::every, ::every]])
         told = ((pair[0] - pair[1]).abs() < ALIKE).all(-1) & (pair < BRIGHT).all(-1).all(0)
-        planes = (pair * told[..., None]).permute(0, 3, 1, 2)
+        # darker than black, as an exposure may make what is rendered of a night, is black: sums below 0 have no logarithm
+        planes = torch.where(told[..., None], pair.clamp_min(0), 0.0).permute(0, 3, 1, 2)
         share = planes[0, 0].numel() / self.gains[..., 0].numel()  # of the pixels, that of a cell
         self.sums += share * F.adaptive_avg_pool2d(planes, (self.gains.shape[0], self.gains.shape[1])).permute(0, 2, 3, 1)
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ import torch
 from PIL import Image
 from quick_fit import CONFIG, SIZE
 
+import render.flat_field
 from recon import open_log, reconstruct
 from recon.begin import begin
 from recon.evaluation.road import photo_at, road_errors, road_points
+from recon.fit.fit import Fit
 from recon.fit.flat_field import FlatField
 from recon.views.frames import load_frames
 from render import render_frame
@@ -51,6 +54,38 @@ def test_what_is_clipped_or_not_alike_says_nothing():
     field.compare(street, photo)
     field.follow()
     assert field.found() is None
+
+
+def test_a_night_that_is_rendered_darker_than_black_leaves_a_field_of_numbers():
+    """As an exposure with an offset renders it."""
+    field = FlatField.even(320, 180, HOST)
+    for _ in range(20):
+        field.compare(torch.full((180, 320, 3), -0.03), torch.full((180, 320, 3), 0.01))
+    field.follow()
+    assert field.gains.isfinite().all() and field.found() is None, "alike everywhere"
+
+
+def test_a_picture_that_is_not_alike_and_no_number_is_left_out():
+    field = FlatField.even(320, 180, HOST)
+    render = torch.full((180, 320, 3), 0.5)
+    render[0, 0] = torch.nan
+    field.compare(render, torch.full((180, 320, 3), 0.5))
+    assert field.sums.isfinite().all()
+
+
+def test_of_a_field_the_grid_goes_to_a_device_and_not_the_picture(monkeypatch):
+    sent = []
+    monkeypatch.setattr(render.flat_field, "upload", lambda t, device: sent.append(t.numel()) or t)
+    field = darker_towards_corners(9, 16).expand(9, 16, 3).contiguous()
+    for _ in range(3):
+        in_flat_field(torch.ones(180, 320, 3), field)
+    assert sent == [field.numel()]
+
+
+def test_few_pictures_of_a_camera_tell_nothing_of_its_lens():
+    """Of two cameras the first has four pictures to be fitted to, the other five."""
+    frames, fields = SimpleNamespace(of=lambda c: range(4 + c)), [FlatField.even(96, 54, HOST)] * 2
+    assert Fit._evened(SimpleNamespace(frames=frames, flat_fields=fields, config=CONFIG)) == [1]
 
 
 @pytest.fixture(scope="module")
