@@ -38,6 +38,9 @@ BRIGHT = 0.97
 DOUBT = 50.0
 """White pixels that are right, for every cell: one of which little is seen stays as it is."""
 
+MOST = 4.0
+"""How many times darker or brighter than on average a part of a picture may be: what is black in all of them is no lens's doing."""
+
 SEEN = 0.01
 """A field that nowhere changes more than this part of the light is left out of the scene."""
 
@@ -78,7 +81,8 @@ class FlatField:
         """Take half of what renders were off by."""
         rendered, recorded = blurred(self.sums) + DOUBT
         log = self.gains.log() + FOLLOWS * (recorded / rendered).log()
-        self.gains = (log - log.mean((0, 1))).exp()  # how bright all of its pictures are is the exposure's
+        # how bright all of its pictures are is the exposure's
+        self.gains = (log - log.mean((0, 1))).exp().clamp(1 / MOST, MOST)
         self.sums.zero_()
 
     def tensors(self) -> list[torch.Tensor]:

@@ -73,7 +73,10 @@ class Depths:
     def on(self, road: Road) -> Depths:
         """The depths with what may be the road on it, and without what is under it."""
         off, slack = road.off(self.points())
-        depth = np.where(np.abs(off) < slack, ground_depth(self.plate, road.ground, 0.0), self.depth)
+        met = ground_depth(self.plate, road.ground, 0.0)
+        met[np.isinf(met)] = np.nan
+        known = road.off(replace(self, depth=met).points())[1] > 0  # a ray that hardly falls may meet it far beyond
+        depth = np.where((np.abs(off) < slack) & known, met, self.depth)
         return replace(self, depth=np.where((off < -slack) & (slack > 0), np.nan, depth))
 
     def points(self) -> np.ndarray:

@@ -88,6 +88,17 @@ def test_few_pictures_of_a_camera_tell_nothing_of_its_lens():
     assert Fit._evened(SimpleNamespace(frames=frames, flat_fields=fields, config=CONFIG)) == [1]
 
 
+def test_corners_that_are_black_do_not_brighten_the_rest():
+    field, street = FlatField.even(320, 180, HOST), torch.full((180, 320, 3), 0.08)
+    for _ in range(60):
+        photo = street.clone()
+        photo[:60, :100] = 0.0
+        for _ in range(6):
+            field.compare(field.over(street), photo)
+        field.follow()
+    assert field.gains.min() >= 1 / 4 and field.gains.max() < 2
+
+
 @pytest.fixture(scope="module")
 def darkened(drive, tmp_path_factory):
     """The made-up drive through a lens that darkens corners."""

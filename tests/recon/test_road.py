@@ -98,7 +98,7 @@ def test_depths_that_may_be_the_road_lie_on_it_and_none_are_under_it():
     far = (down < 15) & (rays[..., 2] < -0.05)
     for part, kept in ((0.9, True), (1.1, True), (0.5, False), (1.8, False)):
         own = Depths(view, camera, plate, np.where(far, part * down, np.nan)).on(road)
-        within = far & (np.abs(part * down * rays[..., 1]) < 4.5)
+        within = far & (np.abs(max(part, 1.0) * down * rays[..., 1]) < 4.5)
         depth, road_depth = own.depth[within], down[within]
         if kept:
             assert np.abs(depth / road_depth - 1).max() < 1e-3
