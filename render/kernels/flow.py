@@ -41,7 +41,9 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
                 i = ways.shape[0] - 1
             else:
                 ray = wp.float64(depth[row, column]) * ray
-            start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
+            start = wp.vec3d()  # of the sky only the way there counts
+            if not sky:
+                start = wp.vec3d(origins[wp.min(top + row, origins.shape[0] - 1), wp.min(left + column, origins.shape[1] - 1)])
             bend = bends[wp.min(row, bends.shape[0] - 1), wp.min(column, bends.shape[1] - 1)]
             p = start + ray + wp.vec3d(bend)
             v = wp.transform_point(ways[i, powers - 1, line], p)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from render import RenderConfig, rasterize
-from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
+from scenes import Camera, Gaussians, Orthographic, Pinhole, Placed, SplatModel
 from scenes.harmonics import sh_from_rgb
 from scenes.poses import inverse, matrix_from_quat, pose_from, translation
 from tests import oracle
@@ -161,6 +161,18 @@ def test_what_is_hidden_in_the_other_frame_is_not_visible_there():
     assert bool(frame.visible_next[20, 55]) and bool(frame.visible_next[20, 20])
     hidden = (frame.instance[20] == 0) & ~frame.visible_next[20]
     assert hidden[26:36].sum() >= 3 and not hidden[45:].any() and hidden[:4].all()  # the leftmost pixels leave the picture
+
+
+def test_the_sky_behind_a_map_flows_to_where_its_parallel_rays_lead():
+    """All of them to one point of the sky, wherever on the plane they begin."""
+    behind = Gaussians(torch.tensor([[0, 0, -9.0]]), torch.eye(4)[:1], torch.zeros(1, 3), torch.zeros(1), torch.ones(1, 1, 3))
+    placed = [Placed(behind, translation(0, 0, 0))]
+    here = Camera(Orthographic(8.0, 8.0, 20.0, 10.0), 40, 20, translation(1.0, 0, 0))
+    there = Camera(Pinhole(40.0, 40.0, 21.0, 11.0), 40, 20, translation(0, 2.0, 0))
+    frame = rasterize(placed, here, ("instance", "flow_next"), flow_to={"next": (placed, there)})
+    assert (frame.instance == -1).all()
+    expected = torch.tensor([21.0, 11.0]) - here.pixel_centres().float()
+    assert (frame.flow_next - expected).abs().max() < 1e-4
 
 
 def test_where_nothing_moves_everything_is_visible_through_thin_splats_too():
