@@ -74,7 +74,7 @@ def correspond(
     with stage(device):
         told = [view(*t) if isinstance(t, tuple) else t for t in kept]
         results = [view(found.pixels, wp.vec2d), view(found.flow, wp.vec2), view(found.depth, float)]
-        kernel, optics = carry_kernel(LENS_FUNCTIONS[other.lens.kind]), optics_of(other.lens)
+        kernel, optics = carry_kernel(LENS_FUNCTIONS[other.lens.kind]), optics_of(other.lens, other.width)
 
         def carried(share: torch.Tensor) -> torch.Tensor:
             run_pixels(kernel, depth.numel(), [*told, view(share, wp.float64), optics, *results], device)

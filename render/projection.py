@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 NEAR = 0.1
 """Metres in front of the camera within which a splat's centre is not drawn; around it, for a lens that sees all around."""
 
+WIDEST = 1.01
+"""Turns that an equirectangular image may be wide: each splat is drawn once more beyond the seam, not twice. One in full, and a little for
+lenses that are optimised."""
+
 LARGEST_TURN = math.radians(60)
 """How far a pose may turn while the image is read out: where camera and instance both do, against each other, what the kernels write
 their motion by (`kernels/motion.py`) is off by 1e-4 of a radian."""
@@ -111,6 +115,11 @@ def check_ends(camera: Camera, placed: Sequence[Placed]) -> None:
 def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel) -> None:
     """ValueError naming what this camera cannot draw, and the way out."""
     check_ends(camera, placed)
+    if isinstance(camera.lens, Equirectangular) and camera.width > WIDEST * abs(float(camera.lens.period())):
+        raise ValueError(
+            f"an equirectangular image shows one turn at most, which is {abs(float(camera.lens.period())):.1f} pixels wide with "
+            f"fx {float(camera.lens.fx):g}, got width {camera.width}; make fx {camera.width / (2 * math.pi):g} or the image narrower"
+        )
     if not moves(camera, placed):
         return
     if model.projection != "ut":
@@ -167,7 +176,7 @@ def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -
         rows = [rotation.reshape(-1, 9), translation, eye, np.array(settings.instances, dtype=np.float64)[:, None]]
         return [view, torch.from_numpy(np.concatenate(rows, 1))]
     instances = torch.tensor(settings.instances, dtype=torch.float64)[:, None]
-    optics = optics_of(lens)
+    optics = optics_of(lens, settings.width)
     powers = torch.cat([poses[..., :3, :3].flatten(2), poses[..., :3, 3]], 2)
     powers = torch.nn.functional.pad(powers, (0, 0, 0, POWERS - powers.shape[1])).flatten(1)
     by_rows = settings.shutter != "columns"
@@ -176,12 +185,13 @@ def uniforms(settings: Settings, lens: Lens, poses: torch.Tensor, copies: int) -
     return [view, optics, torch.cat(rows)]
 
 
-def optics_of(lens: Lens) -> Optics:
-    """A lens as kernels are told of it."""
+def optics_of(lens: Lens, width: int) -> Optics:
+    """The lens of a picture as kernels are told of it."""
     optics = Optics()
     optics.p = vec_params(*lens.params().tolist(), *([0.0] * (PARAMS - len(lens.params()))))
     optics.cos_limit, optics.sin_limit = math.cos(lens.limit()), math.sin(lens.limit())
     optics.period = float(lens.period()) if isinstance(lens, Equirectangular) else 0.0
+    optics.middle = 0.5 * width
     return optics
 
 

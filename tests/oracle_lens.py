@@ -164,7 +164,9 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
         weights = torch.tensor([2.0] + [1 / 6] * 6, dtype=torch.float64)
         covariance = torch.einsum("k,nki,nkj->nij", weights, d, d)
     if isinstance(lens, Equirectangular) and model.response == "conic":  # a ray meets a splat once, on whichever side of the seam
-        other = torch.where(mean[:, :1] < lens.cx, lens.period(), -lens.period())
+        whole = ((0.5 * camera.width - mean[:, :1]) / lens.period()).detach().round() * lens.period()  # to where the picture is
+        mean = mean + torch.cat([whole, torch.zeros_like(whole)], 1)
+        other = torch.where(mean[:, :1] < 0.5 * camera.width, lens.period(), -lens.period())
         copies = torch.cat([mean, mean + torch.cat([other, torch.zeros_like(other)], 1)])
         rows, points, axes, sight, covariance = (torch.cat([t, t]) for t in (rows, points, axes, sight, covariance))
         mean = copies

@@ -53,6 +53,8 @@ def carry_kernel(lens: LensFunctions) -> wp.Kernel:
             to = wp.vec2d(wp.float64(wp.nan), wp.float64(wp.nan))
             if v[2] > optics.cos_limit * distance and wp.length_sq(ray) > wp.float64(0.0):
                 to = pixel(optics, v)
+                if optics.period > wp.float64(0.0):
+                    to[0] = to[0] + wp.round((optics.middle - to[0]) / optics.period) * optics.period
             pixels[row, column] = to
             here = wp.vec2d(wp.float64(left + column) + wp.float64(0.5), wp.float64(top + row) + wp.float64(0.5))
             flow[row, column] = wp.vec2(to - here)

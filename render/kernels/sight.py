@@ -201,12 +201,13 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
 
     @wp.func
     def turns(o: Optics, m: Motion, x: wp.float64):
-        """Whole turns by which a copy stands beside its original, across the seam."""
+        """Whole turns by which a splat is moved to where the picture is, or its copy to the picture's other side, across the seam."""
+        whole = nearest(o, o.middle - x)
         if m.copy == 0:
-            return wp.float64(0.0)
-        if x < o.p[2]:
-            return wp.float64(1.0)
-        return wp.float64(-1.0)
+            return whole
+        if x + whole * o.period < o.middle:
+            return whole + wp.float64(1.0)
+        return whole - wp.float64(1.0)
 
     @wp.func
     def ellipse(o: Optics, m: Motion, q: Pixels):

@@ -201,6 +201,34 @@ def test_a_splat_at_the_seam_is_drawn_on_both_sides(projection):
     assert (picture.roll(48, 1) - turned).abs().max() < 2e-4
 
 
+@pytest.mark.parametrize("response", ["conic", "ray"])
+@pytest.mark.parametrize("turns", [0.5, 1.25, -2.25])
+def test_a_sphere_whose_middle_lies_far_beside_the_image_is_drawn_as_if_the_camera_was_turned(response, turns):
+    """Up to half a turn beside it, where the copies of what stands at the seam were lost, and beyond, where nothing was drawn."""
+    lens, model = Equirectangular.whole(96, 48), SplatModel(response=response)
+    g = random_splats(150, 4)
+    level = torch.tensor([1.0, 0.35, 1.0])
+    away = torch.linspace(3, 6, 150)[:, None]
+    g = replace(g, means=away * torch.nn.functional.normalize(g.means * level, dim=1), log_scales=g.log_scales.clamp_max(-1.2))
+    camera = at_origin(lens, 96, 48)
+    half = -math.pi * turns  # of how far the camera turns around y
+    turned = replace(camera, world_from_cam=pose_from([math.cos(half), 0.0, math.sin(half), 0.0], [0.0, 0.0, 0.0]))
+    aside = replace(camera, lens=replace(lens, cx=48 + 96 * turns))
+    expected = rasterize(g, turned, ("rgb", "flow_next"), model=model, flow_to={"next": (g, camera)})
+    found = rasterize(g, aside, ("rgb", "flow_next"), model=model, flow_to={"next": (g, camera)})
+    assert (found.rgb - expected.rgb).abs().max() < 2e-4
+    assert (found.flow_next - expected.flow_next).abs().max() < 1e-2
+    back = rasterize(g, camera, ("flow_next",), model=model, flow_to={"next": (g, aside)})
+    at = back.flow_next[..., 0] + torch.arange(96) + 0.5
+    assert at.min() >= -1e-3 and at.max() <= 96.001, "what flows there falls into the picture"
+
+
+def test_a_sphere_that_is_shown_more_than_once_is_refused():
+    lens = Equirectangular.whole(96, 48)
+    with pytest.raises(ValueError, match=r"shows one turn at most, which is 96.0 pixels wide .* got width 120"):
+        rasterize(random_splats(5, 0), at_origin(lens, 120, 48))
+
+
 @pytest.mark.parametrize("projection", ["ut", "ewa"])
 def test_an_opencv_lens_without_distortion_is_a_pinhole(projection):
     """Splats beside and behind the camera too: the rules for sigma points that go too near are the same."""

@@ -19,3 +19,4 @@ class Optics:
     cos_limit: wp.float64
     sin_limit: wp.float64
     period: wp.float64  # pixels of a whole turn, 0 for a lens that does not close on itself
+    middle: wp.float64  # the picture's, along x
