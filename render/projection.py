@@ -115,10 +115,11 @@ def check_ends(camera: Camera, placed: Sequence[Placed]) -> None:
 def check_projection(camera: Camera, placed: Sequence[Placed], model: SplatModel) -> None:
     """ValueError naming what this camera cannot draw, and the way out."""
     check_ends(camera, placed)
-    if isinstance(camera.lens, Equirectangular) and camera.width > WIDEST * abs(float(camera.lens.period())):
+    turn = abs(float(camera.lens.period().detach())) if isinstance(camera.lens, Equirectangular) else math.inf
+    if camera.width > WIDEST * turn:
         raise ValueError(
-            f"an equirectangular image shows one turn at most, which is {abs(float(camera.lens.period())):.1f} pixels wide with "
-            f"fx {float(camera.lens.fx):g}, got width {camera.width}; make fx {camera.width / (2 * math.pi):g} or the image narrower"
+            f"an equirectangular image shows one turn at most, which is {turn:.1f} pixels wide with this fx, got width {camera.width}; "
+            f"make fx {camera.width / (2 * math.pi):g} or the image narrower"
         )
     if not moves(camera, placed):
         return
