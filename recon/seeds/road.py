@@ -7,6 +7,7 @@ out at ever other heights, as two pictures show them, and correlated (a plane sw
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -120,7 +121,9 @@ def road_by_pictures(
     log: Log, names: Sequence[str], ego: Trajectory, span_us: tuple[int, int], points: np.ndarray, guess: Ground
 ) -> Road | None:
     """The road along a body's path `ego`, which points `[N, 3]` show roughly, and the pictures of the cameras `names` in a span; in the
-    cells of a `guess` of the ground. None where points do not tell it."""
+    cells of a `guess` of the ground. None where points do not tell it, or are not metric."""
+    if not log.meta.get("metric", True):
+        return None
     path = Path(ego)
     points = points[np.isfinite(path.tree.query(points[:, :2], distance_upper_bound=DRIVEN + 1.0)[0])]
     along, left, level = path.beside(points[:, :2])
@@ -138,7 +141,10 @@ def road_by_pictures(
     if not WAVES < waves < off:
         return None  # it goes along with the path as it is, or the path does not go along it: of one who climbs, or flies
     alike = [p for name in names for p in _pieces(log, log.camera(name), span_us, path, below, below + mount)]
-    return _laid(path, guess, below - (below + mount) * _rise(alike), off, min(off, max(KERB, NOISE * waves)))
+    below -= (below + mount) * _rise(alike)
+    told = f"{below + mount:.2f} m below the cameras, all along their path, as its pictures show of it on the whole"
+    print(f"{log.path}: points show its road in waves of {100 * waves:.0f} cm, so it is taken to be {told}", file=sys.stderr)
+    return _laid(path, guess, below, off, min(off, max(KERB, NOISE * waves)))
 
 
 def _rise(alike: Sequence[np.ndarray]) -> float:

@@ -38,8 +38,10 @@ def found(log, shown: np.ndarray, span=EVER):
     return road_by_pictures(log, ["front"], log.ego, span, shown, estimate_ground(shown, log.ego))
 
 
-def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log):
+def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log, capsys):
     road = found(log, points(log, 0.25, -0.1))
+    told = capsys.readouterr().err
+    assert "road in waves of" in told and "taken to be 1.5" in told
     assert np.abs(road.ground.heights.numpy()[road.slack > 0]).max() < 0.02, "not where points are in the mean"
     lies = road.points()
     assert len(lies) > 400 and np.abs(lies[:, 2]).max() < 0.02
@@ -47,6 +49,10 @@ def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log):
     assert across.max() < WIDE + 0.5 and (lies[:, 0] > 18).any(), "goes on beyond the last picture"
     beside = road.slack[(road.slack > 0) & (road.slack < OFF)]
     assert KERB < beside.min() == beside.max() < OFF
+
+
+def test_a_world_of_no_metres_is_left_as_it_is(log):
+    assert found(replace(log, meta={"metric": False}), points(log, 0.25, -0.1)) is None
 
 
 def test_where_points_show_it_well_nothing_is_done(log):
