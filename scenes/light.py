@@ -10,7 +10,7 @@ import torch
 
 from scenes.harmonics import rgb_from_sh
 from scenes.scene import Scene
-from scenes.sky import LUMINANCE, Sky, linear_from_srgb
+from scenes.sky import LUMINANCE, Sky, linear_from_srgb, texels
 
 SUN_RADIUS = math.radians(0.266)
 """Of the sun's disc; haze and coarse images only make it wider."""
@@ -79,7 +79,7 @@ def sun_of_sky(sky: Sky) -> torch.Tensor | None:
     It is the middle of what within 12 degrees of the brightest pixel exceeds the sky around, or that pixel where a coarse image, or a wide
     sun, leaves no such sky.
     """
-    directions, solid = _directions(*sky.linear.shape[:2])
+    directions, solid = texels(*sky.linear.shape[:2])
     up = directions[..., 2] > 0
     luminance = sky.linear.double() @ torch.tensor(LUMINANCE, dtype=torch.float64)
     mean = float((luminance * solid)[up].sum() / solid[up].sum())
@@ -140,7 +140,7 @@ def disc(middle: torch.Tensor, radius: float, count: int) -> torch.Tensor:
 def _drawn(luminance: torch.Tensor, count: int) -> torch.Tensor:
     """`count` directions `[count, 3]` into the upper half of an equirectangular image `[H, W]`, drawn by the light that each pixel sheds on
     level ground: a column by even steps, then a row by the golden ratio's, as evenly spread as a sky of any brightness allows."""
-    directions, solid = _directions(*luminance.shape)
+    directions, solid = texels(*luminance.shape)
     weight = luminance * solid * directions[..., 2].clamp_min(0)
     if not weight.sum() > 0:
         return _drawn(torch.ones_like(luminance), count)
@@ -202,14 +202,3 @@ def solar_position(time_us: int, latitude: float, longitude: float) -> tuple[flo
 def _direction(yaw: float, elevation: float) -> torch.Tensor:
     level = math.cos(elevation)
     return torch.tensor([level * math.cos(yaw), level * math.sin(yaw), math.sin(elevation)], dtype=torch.float64)
-
-
-def _directions(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """World directions `[H, W, 3]` of an equirectangular image's pixels (see `Sky`), and the solid angles `[H, W]` that they cover."""
-    azimuth = math.pi * (1 - (2 * torch.arange(width, dtype=torch.float64) + 1) / width)
-    edges = math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
-    middle = (edges[:-1] + edges[1:]) / 2
-    elevation, around = torch.meshgrid(middle, azimuth, indexing="ij")
-    directions = torch.stack([elevation.cos() * around.cos(), elevation.cos() * around.sin(), elevation.sin()], -1)
-    ring = (edges[:-1].sin() - edges[1:].sin()) * 2 * math.pi / width
-    return directions, ring[:, None].expand(height, width)

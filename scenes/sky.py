@@ -40,6 +40,17 @@ class Sky:
         return sample_equirect(srgb_from_linear(self.linear), directions)
 
 
+def texels(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit world directions `[H, W, 3]` of an equirectangular image's pixels, and the solid angles `[H, W]` that they cover; float64."""
+    azimuth = torch.pi * (1 - (2 * torch.arange(width, dtype=torch.float64) + 1) / width)
+    edges = torch.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
+    middle = (edges[:-1] + edges[1:]) / 2
+    elevation, around = torch.meshgrid(middle, azimuth, indexing="ij")
+    directions = torch.stack([elevation.cos() * around.cos(), elevation.cos() * around.sin(), elevation.sin()], -1)
+    ring = (edges[:-1].sin() - edges[1:].sin()) * 2 * torch.pi / width
+    return directions, ring[:, None].expand(height, width)
+
+
 def sample_equirect(image: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """Bilinear lookup in an equirectangular image `[H, W, C]`; columns wrap around, rows end at the poles."""
     x, y, z = directions.to(torch.float32).unbind(-1)

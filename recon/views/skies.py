@@ -13,7 +13,7 @@ from render import render_frame
 from render.rays import camera_rays
 from scenes.camera import Camera
 from scenes.scene import Scene
-from scenes.sky import Sky, linear_from_srgb, srgb_from_linear
+from scenes.sky import Sky, linear_from_srgb, srgb_from_linear, texels
 from scenes.spread import spread
 
 LOOKS = 12
@@ -27,6 +27,13 @@ HIDDEN = 128
 
 EVEN = 3.0
 """Levels a pixel by which the sky changes at most, but for clouds' edges."""
+
+TRACE = 1e-3
+"""Weight from which on a direction counts as seen."""
+
+COARSE, FALLS, NEAREST = 4, 4, 1e-5
+"""Directions a side that are taken together to tell the others; the power of distance by which they tell less, and the least square of it:
+0.2 degrees."""
 
 WIRE = 80
 """Of a picture's width, how wide wires are at most."""
@@ -124,20 +131,36 @@ class SkyPicture:
         np.add.at(self.count, (row, column), weight)
 
     def picture(self) -> torch.Tensor:
-        """sRGB float32 `[H, 2H, 3]`: averages, spread into the unseen from ever wider surroundings, and from all where those tell too
-        little; all as `otherwise` without any sample."""
-        if not self.count.any():
+        """sRGB float32 `[H, 2H, 3]`: averages where anything was seen, and elsewhere those of all directions that were, the nearer the more
+        (inverse distance weighting, Shepard 1968), which leaves no edge; all as `otherwise` without any sample."""
+        known = self.count > TRACE
+        if not known.any():
             return torch.from_numpy(np.broadcast_to(self.otherwise, self.sum.shape).copy()).float()
-        out = np.full(self.sum.shape, np.nan)
-        sigma = 0.0
-        while np.isnan(out).any() and sigma < len(out):
-            modes = ("nearest", "wrap")
-            blur = [ndimage.gaussian_filter(a, sigma, mode=modes) if sigma else a for a in (*np.moveaxis(self.sum, -1, 0), self.count)]
-            take = np.isnan(out[..., 0]) & (blur[3] > 1e-3)
-            out[take] = np.stack(blur[:3], -1)[take] / blur[3][take][:, None]
-            sigma = max(1.5, sigma * 2)
-        mean = self.sum.sum((0, 1)) / self.count.sum()
-        return torch.from_numpy(np.where(np.isnan(out), mean, out)).float()
+        out = torch.from_numpy(self.sum / np.maximum(self.count, TRACE)[..., None]).float()
+        towards = texels(*known.shape)[0].float()
+        colours, seen, of_seen = self._samples()
+        for row in np.flatnonzero(~known.all(1)):
+            unseen = torch.from_numpy(~known[row])
+            near = (2 - 2 * towards[row, unseen] @ of_seen.T).clamp_min(NEAREST).pow(-FALLS / 2) * seen
+            out[row, unseen] = near @ colours / near.sum(1, keepdim=True)
+        return out
+
+    def _samples(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Of cells of `COARSE` x `COARSE` directions in which anything was seen: mean colours `[N, 3]`, weights `[N]`, by how much of the
+        sphere they cover and less where little was seen, and unit directions `[N, 3]`."""
+        side = COARSE if len(self.count) % COARSE == 0 else 1
+        count, *sums = (_summed(plane, side) for plane in (self.count, *np.moveaxis(self.sum, -1, 0)))
+        there = count > TRACE
+        towards, solid = texels(*there.shape)
+        colours, count = np.stack(sums, -1)[there] / count[there][:, None], count[there]
+        weights = count / (count + np.median(count)) * solid.numpy()[there]
+        return torch.from_numpy(colours).float(), torch.from_numpy(weights).float(), towards[torch.from_numpy(there)].float()
+
+
+def _summed(plane: np.ndarray, side: int) -> np.ndarray:
+    """Sums of blocks of `side` x `side`."""
+    height, width = plane.shape
+    return plane.reshape(height // side, side, width // side, side).sum((1, 3))
 
 
 def _cells(camera: Camera, height: int) -> tuple[np.ndarray, np.ndarray]:

@@ -43,6 +43,19 @@ def test_a_sky_spreads_across_the_seam_behind():
     assert red > 0.9 and blue < 0.1
 
 
+def test_a_sky_has_no_edge_where_it_was_not_seen():
+    sky = SkyPicture(64, GREY)
+    for rows, columns, rgb in ((slice(16, 30), slice(20, 40), (0.2, 0.4, 0.8)), (slice(20, 31), slice(80, 90), (0.9, 0.8, 0.6))):
+        sky.count[rows, columns], sky.sum[rows, columns] = 30, np.multiply(rgb, 30)
+    picture, seen = sky.picture(), torch.from_numpy(sky.count > 0)
+    for step in (picture.diff(dim=0)[~(seen[1:] | seen[:-1])], picture.diff(dim=1)[~(seen[:, 1:] | seen[:, :-1])]):
+        assert step.abs().max() < 0.06
+    assert (picture[seen] - torch.tensor([0.2, 0.4, 0.8])).abs().amax(-1).lt(1e-4).any()
+    assert (picture[0] - picture[0].mean(0)).abs().max() < 0.02  # all of the top row looks up
+    above, between = picture[12, 30], picture[24, 60]
+    assert above[2] > above[0] + 0.4 and 0.3 < between[0] < 0.8
+
+
 def test_sky_is_what_is_smooth_and_blue_down_from_the_top():
     image = house_under_sky()
     mask = sky_mask(image)
