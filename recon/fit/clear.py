@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from recon.fit.model import Splats
@@ -39,6 +40,13 @@ class Clear:
         """By some of a log's sweeps within a span of time."""
         asked = spread(log.sweeps_within(span_us), LOOKS)
         return Clear([image for _, image in range_images(log, ((s.time_us, s.read()) for s in asked))], ground)
+
+    def struck(self, points: np.ndarray) -> np.ndarray:
+        """Whether more than `THERE` of the sweeps saw something where points `[N, 3]` are; bool `[N]`, of none where there is no lidar."""
+        there = np.zeros(len(points), np.int64)
+        for image in self.images:
+            there += image.votes(points)[1]
+        return there > THERE * len(self.images)
 
     def holds(self, splats: Splats) -> torch.Tensor:
         """Mask `[N]` of the splats of the background whose middles lie where lidars looked through."""

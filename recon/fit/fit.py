@@ -13,6 +13,7 @@ from recon.fit.descent import rates_at
 from recon.fit.develop import developed
 from recon.fit.flat_field import FEWEST, FlatField, due
 from recon.fit.limbs import Limbs
+from recon.fit.lines import LOOKS, STRAIGHTENED_AT, StreetLines
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
 from recon.fit.motion import Shot
@@ -33,6 +34,7 @@ from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
 from scenes.sky import sample_equirect
+from scenes.spread import spread
 
 SKY_PRIOR = 3e-6
 """Weight, in a step's gradient, of the squared distance of the sky from its initial picture: a twentieth of what a picture's sky weighs,
@@ -282,6 +284,8 @@ class Fit:
             self.population.grow(self.progress)
         if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
             self._refill()
+        if self.step_count in [round(part * self.config.steps) for part in STRAIGHTENED_AT]:
+            self._straighten()
         if due(self.step_count, self.config.steps):
             for camera in self.evened:
                 self.flat_fields[camera].follow()
@@ -312,6 +316,12 @@ class Fit:
             search = Search(views, cameras, gain, there.ground, self.motion.tracks)
             for more in missed(search, self.frames, lambda v: self._drawn(v.to(self.device), "rgb", "alpha", "depth"), sh_count):
                 there.add(more, path)
+
+    def _straighten(self) -> None:
+        """Let what lies along the street in pictures lie along it in space."""
+        of_cameras = ([v for v in self.training if v.camera == c] for c in range(len(self.frames.names)))
+        cameras = [self.motion.camera(view) for views in of_cameras for view in spread(views, LOOKS)]
+        StreetLines(self.motion.path(), cameras, self.population.clear.struck).straighten(self.splats)
 
     def shown(self, splats: Splats | None = None) -> Shown:
         """What the pictures show of each splat; of others that stand in their place, where these are given."""

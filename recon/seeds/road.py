@@ -15,10 +15,10 @@ from functools import lru_cache
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from recon.log import Log, LogCamera
 from recon.registration.mounts_by_road import far_pairs, laid_out
+from recon.way import LONG, Path
 from scenes.ground import Ground
 from scenes.trajectory import Trajectory
 
@@ -46,11 +46,8 @@ TOLD, EVERY = 200, 4.0
 WAVES = 0.06
 """Metres off its middle up to which the road is taken to be where points show it."""
 
-MOVED = 0.05
-"""Metres from a place of the path to the next, at least."""
-
-WIDE, LONG = 4.0, 12.0
-"""Metres beside the path, and beyond its ends, up to which the road is known."""
+WIDE = 4.0
+"""Metres beside the path up to which the road is known; beyond its ends that is as far as it goes straight on."""
 
 DRIVEN, OFF, KERB, NOISE = 1.5, 0.6, 0.2, 2.5
 """Metres beside the path where the car drove: what is no more metres than this off the road, or half of the cameras' height, is the road;
@@ -79,42 +76,6 @@ class Road:
         quarters = self.ground.cell / 4 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         xy = (middles[:, None] + quarters).reshape(-1, 2)
         return np.column_stack([xy, self.ground.height(torch.from_numpy(xy)).numpy()])
-
-
-class Path:
-    """A body's path `[N, 3]`, a point every metre, and straight on beyond its ends for `LONG`."""
-
-    def __init__(self, ego: Trajectory):
-        places = _apart(ego.world_from_body[:, :3, 3].numpy())
-        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1))])
-        at = np.arange(0.0, way[-1] + 1.0)
-        inner = np.stack([np.interp(at, way, places[:, k]) for k in range(3)], 1)
-        # as it goes over the first and last metres: a single pose shakes
-        steps = min(len(inner) - 1, 5)
-        ends = [(inner[e] - inner[o]) / max(1, steps) for e, o in ((0, steps), (-1, -1 - steps))]
-        on = np.arange(1.0, LONG + 1.0)[:, None]
-        self.places = np.concatenate([(inner[0] + on * ends[0])[::-1], inner, inner[-1] + on * ends[1]])
-        self.length = way[-1]
-        self.tree = cKDTree(self.places[:, :2])
-
-    def beside(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of points `[N, 2]` how far along the path they are in metres, how far to its left, and how high it is there."""
-        nearest = self.tree.query(xy)[1].clip(1, len(self.places) - 2)
-        ahead = self.places[nearest + 1, :2] - self.places[nearest - 1, :2]
-        ahead /= np.maximum(1e-9, np.linalg.norm(ahead, axis=1))[:, None]
-        off = xy - self.places[nearest, :2]
-        along = nearest + (off * ahead).sum(1)
-        left = ahead[:, 0] * off[:, 1] - ahead[:, 1] * off[:, 0]
-        return along, left, np.interp(along, np.arange(len(self.places)), self.places[:, 2])
-
-
-def _apart(places: np.ndarray) -> np.ndarray:
-    """Those of places `[N, 3]` that are off the last one that stays: who stands shakes, and of many poses a second all are close."""
-    stay = [0]
-    for i, place in enumerate(places[:, :2]):
-        if np.linalg.norm(place - places[stay[-1], :2]) > MOVED:
-            stay.append(i)
-    return places[stay]
 
 
 def road_by_pictures(

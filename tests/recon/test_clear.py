@@ -74,3 +74,10 @@ def test_along_the_road_and_far_away_lidar_is_not_asked():
     image = SimpleNamespace(middle=np.zeros(3), votes_with_silence=lambda xyz: np.tile([[True], [False]], len(xyz)))
     places = (5.0, 0.0, ABOVE - 0.1), (5.0, 0.0, ABOVE + 0.1), (FAR - 1, 0.0, 1.0), (FAR + 1, 0.0, 1.0)
     assert Clear([image] * LOOKS, FLAT).holds(splats(*places)).tolist() == [False, True, True, False]
+
+
+def test_what_lidar_struck():
+    log = drive(THINGS, count=12)
+    places = np.array([(29.4, 3.0, 2.0), (20.0, 4.0, 1.5), (18.0, -1.0, 1.2), (34.0, 3.0, 2.0), (18.0, -1.0, 9.0)])
+    assert Clear.of(log, EVER, FLAT).struck(places).tolist() == [True, True, False, False, False]
+    assert not Clear.of(replace(log, sweeps=()), EVER, FLAT).struck(places).any()

@@ -9,9 +9,10 @@ from painted import HEIGHT, SIZE, drive
 
 from recon.ground import estimate_ground
 from recon.seeds.dense import Depths
-from recon.seeds.road import KERB, OFF, WIDE, Path, Road, road_by_pictures
+from recon.seeds.road import KERB, OFF, WIDE, Road, road_by_pictures
 from recon.seeds.stereo import plate_of
 from recon.views.view import View
+from recon.way import Path
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.lenses import Pinhole
