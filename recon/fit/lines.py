@@ -81,12 +81,12 @@ class StreetLines:
         may = (torch.sigmoid(fields["logits"]) > FAINT) & (scales.amax(1) > LONGER * scales.amin(1))
         which = np.flatnonzero(may.numpy())
         along, around, away, ways, asked = self._about(means[which])
+        which, along, around, away, ways = _only(asked, which, along, around, away, ways)
         eyes, seen = _nearest_eyes(means[which], self.cameras)
-        kept = seen & asked
-        which, along, around, away, ways, eyes = (each[kept] for each in (which, along, around, away, ways, eyes))
+        which, along, around, away, ways, eyes = _only(seen, which, along, around, away, ways, eyes)
         axes = (matrix_from_quat(fields["quats"][which]) * scales[which, None]).numpy()
         turned, lengths, long = _turned(means[which] - eyes, axes, ways)
-        which, along, around, away, eyes = (each[long] for each in (which, along, around, away, eyes))
+        which, along, around, away, eyes = _only(long, which, along, around, away, eyes)
         if not len(which):
             return 0
         weights = (torch.sigmoid(fields["logits"][which]) * scales[which].amax(1).sqrt()).numpy()
@@ -114,6 +114,10 @@ class StreetLines:
         left /= np.linalg.norm(left, axis=1).clip(1e-9)[:, None]
         aside, up = (off * left).sum(1), (off * np.cross(ways, left)).sum(1)
         return nearest + on, np.arctan2(up, aside), np.hypot(aside, up), ways, (up > ABOVE) & self.straight[nearest]
+
+
+def _only(mask: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+    return [array[mask] for array in arrays]
 
 
 def _nearest_eyes(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
