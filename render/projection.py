@@ -207,6 +207,7 @@ def _view(settings: Settings, lens: Lens) -> View:
         left, right, top, bottom = view_box(lens, settings.width, settings.height)
         half_x, half_y = 0.15 * (right - left), 0.15 * (bottom - top)  # the 0.3 of 1.3 tan, on either side
         v.clamp_left, v.clamp_right, v.clamp_top, v.clamp_bottom = left - half_x, right + half_x, top - half_y, bottom + half_y
+        v.middle, v.per_half = wp.vec2d((left + right) / 2, (top + bottom) / 2), wp.vec2d(2 / (right - left), 2 / (bottom - top))
         margin = 4 * math.sqrt(settings.model.widening) + 1
         v.left, v.right, v.top, v.bottom = view_box(lens, settings.width, settings.height, margin)
     v.tile_left, v.tile_top, v.tiles_x, v.tiles_y = settings.tile_left, settings.tile_top, settings.tiles_x, settings.tiles_y

@@ -21,7 +21,6 @@ from scenes.poses import inverse, matrix_from_quat
 from tests import oracle_lens
 
 NEAR = 0.1
-NEAREST = 0.5
 REACH = 3.33
 PART = 12  # pixels on a side of a part of a large picture
 BEYOND = 9.0  # sigma: exp(-40) is below float64's rounding of 1
@@ -69,15 +68,16 @@ def project_ewa(points: torch.Tensor, covariance: torch.Tensor, lens: torch.Tens
 
 
 def project_ut(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, width: int, height: int):
-    """Sigma points at +-sqrt(3) along `axes` (columns, scaled); one nearer than half the centre's depth lies at that half."""
+    """Sigma points at +-sqrt(3) along `axes` (columns, scaled); one nearer than `oracle_lens.least_depth` of the centre's lies there."""
     fx, fy, cx, cy = lens
     root = math.sqrt(3.0)
     centre = points[:, :2] / points[:, 2:]
     n = clamped(points, lens, width, height)
+    nearest = oracle_lens.least_depth(n, sides(lens, width, height, 0.0)) * points[:, 2]
     sigma = []
     for sign in (root, -root):
         offset = sign * axes.transpose(1, 2)  # [N, 3 axes, 3]
-        depth = torch.maximum(points[:, None, 2] + offset[..., 2], NEAREST * points[:, None, 2])
+        depth = torch.maximum(points[:, None, 2] + offset[..., 2], nearest[:, None])
         # the offset from the sight line n = xy / z is divided by the sigma point's own depth
         sigma.append(centre[:, None] + (offset[..., :2] - n[:, None] * offset[..., 2:]) / depth[..., None])
     pixels = torch.cat([centre[:, None], *sigma], 1) * torch.stack([fx, fy]) + torch.stack([cx, cy])  # [N, 7, 2]

@@ -64,9 +64,19 @@ def readout(lens: Lens, camera: Camera, pose: PoseAt, x: torch.Tensor, shift: to
     return torch.where(inside, s + (where(s) - s) / (1 - rate), s)
 
 
-def pulled_back(lens: Lens, centre: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+def least_depth(n: torch.Tensor, box: tuple[float, float, float, float]) -> torch.Tensor:
+    """`[N]`: how near sigma points come, in parts of their centre's depth, of centres at xy / z = `n` `[N, 2]` of a camera that sees `box`
+    (left, right, top, bottom): half, and from the view's sides on more, up to all at 1.3 times half the view."""
+    left, right, top, bottom = box
+    middle = torch.tensor([left + right, top + bottom], dtype=torch.float64) / 2
+    half = torch.tensor([right - left, bottom - top], dtype=torch.float64) / 2
+    out = ((n - middle) / half).abs().amax(-1)
+    return 0.5 + 0.5 * ((out - 1) / 0.3).clamp(0, 1)
+
+
+def pulled_back(lens: Lens, centre: torch.Tensor, offset: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
     """How many sigma `[N, 6]`, up to sqrt(3), each sigma point goes from `centre` `[N, 1, 3]` along `offset` `[N, 6, 3]`: no nearer than
-    half the centre's depth, and not out of the lens's domain."""
+    `least` `[N, 1]` of the centre's depth, and not out of the lens's domain."""
     edge = math.cos(lens.limit())
 
     def margins(tau):
@@ -74,9 +84,9 @@ def pulled_back(lens: Lens, centre: torch.Tensor, offset: torch.Tensor) -> torch
         if isinstance(lens, Orthographic):
             half = torch.ones_like(tau)
         elif isinstance(lens, Pinhole | OpenCV):
-            half = y[..., 2] - 0.5 * centre[..., 2]
+            half = y[..., 2] - least * centre[..., 2]
         else:
-            half = (y * centre).sum(-1) - 0.5 * centre.square().sum(-1)
+            half = (y * centre).sum(-1) - least * centre.square().sum(-1)
         seen = y[..., 2] - edge * y.norm(dim=-1)
         inside = centre[..., 2] > edge * centre.norm(dim=-1)
         return half, torch.where(inside, seen, torch.ones_like(seen))
@@ -99,7 +109,8 @@ def pulled_back(lens: Lens, centre: torch.Tensor, offset: torch.Tensor) -> torch
     half, seen = margins(tau)
     at = torch.where(by_half, half, seen)
     rate = torch.ones_like(tau) if rate is None else rate.detach()
-    return torch.where(bad, tau - at / torch.where(bad, rate, torch.ones_like(rate)), tau)
+    # only the gradient of Newton's step: where a point may come no nearer than its centre, the step itself leads to 0
+    return torch.where(bad, tau - (at - at.detach()) / torch.where(bad, rate, torch.ones_like(rate)), tau)
 
 
 def aimed(lens: Lens, camera: Camera, points: torch.Tensor) -> torch.Tensor:
@@ -148,7 +159,10 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
         signs = torch.tensor([1.0, -1.0], dtype=torch.float64)
         offsets = (local.transpose(1, 2)[:, :, None] * signs[:, None]).flatten(1, 2)  # [n, 6, 3], local
         in_camera = (at[rows, None, :3, :3] @ offsets[..., None])[..., 0]
-        tau = pulled_back(lens, aim[:, None], in_camera)
+        least = torch.full_like(aim[:, 0], 0.5)
+        if isinstance(lens, Pinhole | OpenCV):
+            least = least_depth(aim[:, :2] / aim[:, 2:], view_box(lens, camera.width, camera.height))
+        tau = pulled_back(lens, aim[:, None], in_camera, least[:, None])
         shift = (aim - points)[:, None]
         x = torch.cat([means[:, None], means[:, None] + tau[..., None] * offsets], 1)  # [n, 7, 3]
         seven = readout(lens, camera, pose, x, shift, moving)

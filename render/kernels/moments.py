@@ -7,13 +7,14 @@ r = sqrt(3) / (z +- sqrt(3) o_z): exact for a pinhole and free of cancellation, 
     covariance = sum_k w_k e_k e_k' + mu mu',   mu = sum_k b_k e_k,   w = (r+^2 + r-^2) / 6,  b = (r+ - r-) / 6
 
 and its determinant is a sum of squares (Cauchy-Binet), so that needles keep all their digits. Near the camera plane the moments of
-a perspective Gaussian diverge and a splat beside the car would flood the image, so: a sigma point nearer than half the centre's
-depth, or behind the camera, is projected as if it lay at that half, and n is taken no further out than 1.3 times half the view.
-All continuous where it can be seen.
+a perspective Gaussian diverge and a splat beside the car would flood the image, so: a sigma point nearer than a share of the centre's
+depth (sigma.py), or behind the camera, is projected as if it lay at that share, and n is taken no further out than 1.3 times half the
+view. All continuous where it can be seen.
 """
 
 import warp as wp
 
+from render.kernels.sigma import least_depth
 from render.kernels.types import HALF, ONE, ROOT3, TWO, View
 
 SIXTH_OF_ROOT3 = wp.constant(wp.float64(3.0**0.5 / 6.0))
@@ -39,6 +40,7 @@ class Footprint:
 
     along: wp.vec2d  # where the centre's ray meets the plane z = 1
     n: wp.vec2d  # where the Jacobian is taken there
+    least: wp.float64  # the share of its depth that its sigma points keep
     u: Axis
     v: Axis
     w: Axis
@@ -55,7 +57,7 @@ def cross2(a: wp.vec2d, b: wp.vec2d):
 
 
 @wp.func
-def project_axis(offset: wp.vec3d, n: wp.vec2d, z: wp.float64, view: View):
+def project_axis(offset: wp.vec3d, n: wp.vec2d, z: wp.float64, floor: wp.float64, view: View):
     a = Axis()
     a.offset = offset
     a.e = wp.vec2d(view.lens[0] * (offset[0] - n[0] * offset[2]), view.lens[1] * (offset[1] - n[1] * offset[2]))
@@ -63,8 +65,8 @@ def project_axis(offset: wp.vec3d, n: wp.vec2d, z: wp.float64, view: View):
         a.w = ONE / (z * z)
         a.b = wp.float64(0.0)
     else:
-        a.far_z = wp.max(z + ROOT3 * offset[2], HALF * z)
-        a.near_z = wp.max(z - ROOT3 * offset[2], HALF * z)
+        a.far_z = wp.max(z + ROOT3 * offset[2], floor)
+        a.near_z = wp.max(z - ROOT3 * offset[2], floor)
         both = ONE / (a.near_z * a.far_z)  # one division for all: they are what takes the time here
         a.w = HALF * (a.near_z * a.near_z + a.far_z * a.far_z) * both * both
         a.b = SIXTH_OF_ROOT3 * (a.near_z - a.far_z) * both
@@ -78,9 +80,13 @@ def footprint(t: wp.vec3d, axes: wp.mat33d, scale: wp.vec3d, view: View):
     z = t[2]
     f.along = wp.vec2d(t[0] / z, t[1] / z)
     f.n = wp.vec2d(wp.clamp(f.along[0], view.clamp_left, view.clamp_right), wp.clamp(f.along[1], view.clamp_top, view.clamp_bottom))
-    f.u = project_axis(scale[0] * wp.vec3d(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, view)
-    f.v = project_axis(scale[1] * wp.vec3d(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, view)
-    f.w = project_axis(scale[2] * wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, view)
+    f.least = HALF
+    if view.unscented != 0:
+        f.least = least_depth(f.n, view)
+    floor = f.least * z
+    f.u = project_axis(scale[0] * wp.vec3d(axes[0, 0], axes[1, 0], axes[2, 0]), f.n, z, floor, view)
+    f.v = project_axis(scale[1] * wp.vec3d(axes[0, 1], axes[1, 1], axes[2, 1]), f.n, z, floor, view)
+    f.w = project_axis(scale[2] * wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2]), f.n, z, floor, view)
     f.mu = f.u.b * f.u.e + f.v.b * f.v.e + f.w.b * f.w.e
     f.xx = f.u.w * f.u.e[0] * f.u.e[0] + f.v.w * f.v.e[0] * f.v.e[0] + f.w.w * f.w.e[0] * f.w.e[0] + f.mu[0] * f.mu[0]
     f.xy = f.u.w * f.u.e[0] * f.u.e[1] + f.v.w * f.v.e[0] * f.v.e[1] + f.w.w * f.w.e[0] * f.w.e[1] + f.mu[0] * f.mu[1]
@@ -113,9 +119,12 @@ def gradient_of_quadratic(xx: wp.float64, xy: wp.float64, yy: wp.float64, v: wp.
 
 
 @wp.func
-def axis_backward(a: Axis, g_e: wp.vec2d, g_w: wp.float64, g_b: wp.float64, n: wp.vec2d, z: wp.float64, view: View):
-    """d loss / d (offset, n, z, f) packed as a vector of 8."""
+def axis_backward(
+    a: Axis, g_e: wp.vec2d, g_w: wp.float64, g_b: wp.float64, n: wp.vec2d, z: wp.float64, least: wp.float64, rise: wp.vec2d, view: View
+):
+    """d loss / d (offset, n, z, f) packed as a vector of 8; rise: d least / d n."""
     g_z = wp.float64(0.0)
+    g_floor = wp.float64(0.0)
     g_oz = wp.float64(0.0)
     if view.unscented == 0:
         g_z = -TWO * a.w / z * g_w
@@ -124,20 +133,21 @@ def axis_backward(a: Axis, g_e: wp.vec2d, g_w: wp.float64, g_b: wp.float64, n: w
         r_near = ROOT3 / a.near_z
         g_far = -(g_w * r_far / wp.float64(3.0) + g_b / wp.float64(6.0)) * r_far / a.far_z
         g_near = -(g_w * r_near / wp.float64(3.0) - g_b / wp.float64(6.0)) * r_near / a.near_z
-        if z + ROOT3 * a.offset[2] >= HALF * z:
+        if z + ROOT3 * a.offset[2] >= least * z:
             g_z += g_far
             g_oz += ROOT3 * g_far
         else:
-            g_z += HALF * g_far
-        if z - ROOT3 * a.offset[2] >= HALF * z:
+            g_floor += g_far
+        if z - ROOT3 * a.offset[2] >= least * z:
             g_z += g_near
             g_oz -= ROOT3 * g_near
         else:
-            g_z += HALF * g_near
+            g_floor += g_near
+        g_z += least * g_floor
     gx = view.lens[0] * g_e[0]
     gy = view.lens[1] * g_e[1]
     g_oz -= gx * n[0] + gy * n[1]
     return vec_axis(
-        gx, gy, g_oz, -gx * a.offset[2], -gy * a.offset[2], g_z,
+        gx, gy, g_oz, z * g_floor * rise[0] - gx * a.offset[2], z * g_floor * rise[1] - gy * a.offset[2], g_z,
         g_e[0] * (a.offset[0] - n[0] * a.offset[2]), g_e[1] * (a.offset[1] - n[1] * a.offset[2]),
     )  # fmt: skip

@@ -19,8 +19,9 @@ from render.kernels.moments import (
     vec_axis,
 )
 from render.kernels.ray_bound import pinhole_bound
+from render.kernels.sigma import least_depth_gradient
 from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, write_splat
-from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
+from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, HALF, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
 
@@ -142,9 +143,12 @@ def project_backward(
             g_eu += cross_gradient(f.v.e, g_uv) + cross_gradient(f.w.e, g_uw) + cross_gradient(f.mu, g_um)
             g_ev += cross_gradient(f.w.e, g_vw) - cross_gradient(f.u.e, g_uv) + cross_gradient(f.mu, g_vm)
             g_ew += cross_gradient(f.mu, g_wm) - cross_gradient(f.u.e, g_uw) - cross_gradient(f.v.e, g_vw)
-            a_u = axis_backward(f.u, g_eu, g_wu, wp.dot(g_mu, f.u.e), f.n, z, view)
-            a_v = axis_backward(f.v, g_ev, g_wv, wp.dot(g_mu, f.v.e), f.n, z, view)
-            a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), f.n, z, view)
+            rise = wp.vec2d()
+            if f.least > HALF:
+                rise = least_depth_gradient(f.n, view)
+            a_u = axis_backward(f.u, g_eu, g_wu, wp.dot(g_mu, f.u.e), f.n, z, f.least, rise, view)
+            a_v = axis_backward(f.v, g_ev, g_wv, wp.dot(g_mu, f.v.e), f.n, z, f.least, rise, view)
+            a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), f.n, z, f.least, rise, view)
 
             # the centre: pixel = f n + c + mu, with n not clamped; the Jacobian's n is clamped under EWA
             nx = f.along[0]

@@ -14,8 +14,8 @@ from render.kernels.lenses.optics import PARAMS, Optics, params
 from render.kernels.motion import POWERS, motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
-from render.kernels.sight import column, sight_functions
-from render.kernels.sigma import ROOT6, covariance_backward, reach, reach_backward
+from render.kernels.sight import column, perspective, sight_functions
+from render.kernels.sigma import ROOT6, covariance_backward, least_depth_gradient, reach, reach_backward
 from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, ROOT3, View
 
@@ -68,7 +68,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     """The kernels of a lens under a global or a moving shutter."""
     pixel, jacobian, params_gradient, depth = lens
     planar, around, parallel = depth == PLANAR, depth == ROUND, depth == PARALLEL
-    readout, placed, pixel_backward, nearest, sighted, spread, turns, ellipse = sight_functions(lens, rolling)
+    readout, placed, pixel_backward, nearest, sighted, least_of, spread, turns, ellipse = sight_functions(lens, rolling)
     bound = lens_bound(lens, rolling)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
@@ -96,7 +96,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if wp.static(planar):
                     ahead = in_view(wp.vec3(c.t), wp.mat33(c.rotation * axes), wp.vec3(1.0), view)
                 if ahead:
-                    e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view.unscented))
+                    e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view))
                     shows = fade(e, opacity, view)
                     if view.along_rays != 0 and shows[1] > 0.0:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
@@ -146,7 +146,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 x = wp.vec3d(means[i])
                 c = sighted(optics, motion, x, view)
                 axes = scaled_axes(quats[i], log_scales[i])
-                q = spread(optics, motion, x, axes, c, view.unscented)
+                q = spread(optics, motion, x, axes, c, view)
                 e = ellipse(optics, motion, q)
                 g = gather(e, logit_opacities[i], view, slots, starts[j], counts[j])
                 g_logit_opacities[i] = g.logit
@@ -179,6 +179,8 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         g_lens += over * (params_gradient(optics, ahead, g_e) - params_gradient(optics, behind, g_e))
                 else:
                     g_aimed = wp.vec2d()
+                    g_least = wp.float64(0.0)
+                    least = least_of(c, view)
                     g_shared = (g_mean_px + wp.vec2d(g_v[6, 0], g_v[6, 1])) / wp.float64(6.0)
                     for k in range(7):  # the sigma points, then what they are measured from
                         local = wp.vec3d()
@@ -189,7 +191,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                             local = column(axes, k // 2)
                             if k % 2 == 1:
                                 local = -local
-                            r = reach(optics, c.aim, c.rotation * local, wp.static(depth))
+                            r = reach(optics, c.aim, c.rotation * local, wp.static(depth), least)
                             tau = wp.float64(r.tau)
                             rule = int(r.rule)
                             stretch = ROOT3 / r.tau
@@ -236,6 +238,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                             g_tau = wp.dot(g_point, local) - wp.dot(g_d, d) / tau
                             back = reach_backward(optics, c.aim, o, wp.static(depth), tau, rule, g_tau)
                             g_aim += back.centre
+                            g_least += back.least
                             g_rotation += wp.outer(back.offset, local)
                             g_local += wp.transpose(c.rotation) * back.offset
                         if k % 2 == 1:
@@ -243,6 +246,9 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         if k < 6:
                             for a in range(3):
                                 g_axes[a, k // 2] = g_axes[a, k // 2] + g_local[a]
+                    if wp.static(planar):
+                        g_n = g_least * least_depth_gradient(perspective(c.aim), view)
+                        g_aim += wp.vec3d(g_n[0], g_n[1], -wp.dot(g_n, perspective(c.aim))) / c.aim[2]
 
                 # the centre: what hangs on t beside its pixel, then the pixel
                 g_aim += g_shift

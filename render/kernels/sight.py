@@ -20,9 +20,9 @@ import warp as wp
 from render.kernels.lenses import PLANAR, ROUND, LensFunctions
 from render.kernels.lenses.optics import Optics
 from render.kernels.motion import Motion, rotation_at, rotation_rate, translation_at, translation_rate
-from render.kernels.sigma import ROOT6, determinant, inside, mat72d, reach
+from render.kernels.sigma import ROOT6, determinant, inside, least_depth, mat72d, reach
 from render.kernels.splat import Ellipse
-from render.kernels.types import FARTHEST, ROOT3, View
+from render.kernels.types import FARTHEST, HALF, ROOT3, View
 
 STILL = wp.constant(wp.float64(1.0e-7))
 STEPS = wp.constant(50)
@@ -38,6 +38,7 @@ class SightFunctions(NamedTuple):
     pixel_backward: wp.Function
     nearest: wp.Function
     sighted: wp.Function
+    least_of: wp.Function
     spread: wp.Function
     turns: wp.Function
     ellipse: wp.Function
@@ -67,6 +68,12 @@ class Pixels:
 @wp.func
 def column(m: wp.mat33d, k: int):
     return wp.vec3d(m[0, k], m[1, k], m[2, k])
+
+
+@wp.func
+def perspective(t: wp.vec3d):
+    """Where the ray to t meets the plane z = 1."""
+    return wp.vec2d(t[0] / t[2], t[1] / t[2])
 
 
 @wp.func
@@ -168,25 +175,33 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         return c
 
     @wp.func
-    def spread(o: Optics, m: Motion, x: wp.vec3d, axes: wp.mat33d, c: Sight, unscented: int):
+    def least_of(c: Sight, view: View):
+        """The share of its depth that a splat's sigma points keep."""
+        if wp.static(planar):
+            return least_depth(perspective(c.aim), view)
+        return HALF
+
+    @wp.func
+    def spread(o: Optics, m: Motion, x: wp.vec3d, axes: wp.mat33d, c: Sight, view: View):
         """axes: the splat's scaled axes in its local frame, as columns."""
         out = Pixels()
         out.centre = pixel(o, c.t)
         shift = c.aim - c.t
-        if unscented == 0:
+        if view.unscented == 0:
             j = jacobian(o, c.aim)
             for k in range(3):
                 e = j * (c.rotation * column(axes, k))
                 out.v[k, 0] = e[0]
                 out.v[k, 1] = e[1]
         else:
+            least = least_of(c, view)
             s = readout(o, m, x, shift)
             out.aimed = pixel(o, placed(m, x, shift, s))
             for i in range(6):
                 local = column(axes, i // 2)
                 if i % 2 == 1:
                     local = -local
-                r = reach(o, c.aim, c.rotation * local, wp.static(depth))
+                r = reach(o, c.aim, c.rotation * local, wp.static(depth), least)
                 point = x + r.tau * local
                 s = readout(o, m, point, shift)
                 d = pixel(o, placed(m, point, shift, s)) - out.aimed
@@ -228,4 +243,4 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         e.det0 = determinant(q.v)
         return e
 
-    return SightFunctions(readout, placed, pixel_backward, nearest, sighted, spread, turns, ellipse)
+    return SightFunctions(readout, placed, pixel_backward, nearest, sighted, least_of, spread, turns, ellipse)

@@ -1,20 +1,24 @@
 """How far a sigma point may go, and the covariance of what the sigma points give, for any lens; in float64.
 
-A sigma point at +-sqrt(3) along an axis that would come nearer than half the centre's depth, or leave the lens's domain, is pulled
+A sigma point at +-sqrt(3) along an axis that would come nearer than a share of the centre's depth, or leave the lens's domain, is pulled
 back to where it would, at tau < sqrt(3), and what it moves the pixel by is stretched by sqrt(3) / tau. So nothing behind the camera
 or past the fold-over enters the moments, and they stay continuous: as tau goes to 0 they become EWA's. For a pinhole this is the
 clamp of moments.py.
+
+That share is a half. Of a lens that sees what lies before it, it grows beside the view, to 1 where the centre is no further followed
+(1.3 times half the view): the ground beside a wide camera would flood the image from half its depth.
 """
 
 import warp as wp
 
 from render.kernels.lenses import PLANAR, ROUND
 from render.kernels.lenses.optics import Optics
-from render.kernels.types import ROOT3
+from render.kernels.types import HALF, ONE, ROOT3, View
 
 ROOT6 = wp.constant(wp.float64(2.449489742783178))
 LEAST = wp.constant(wp.float64(1.0e-6))
-FULL, AT_HALF_DEPTH, AT_EDGE = (wp.constant(i) for i in range(3))
+RISE = wp.constant(wp.float64(0.5 / 0.3))  # of the share, from a half at the view's sides to 1 at 1.3 times half the view
+FULL, AT_DEPTH, AT_EDGE = (wp.constant(i) for i in range(3))
 _PLANAR, _ROUND = wp.constant(PLANAR), wp.constant(ROUND)
 
 mat72d = wp.types.matrix(shape=(7, 2), dtype=wp.float64)
@@ -32,6 +36,35 @@ class Reach:
 class ReachGradient:
     centre: wp.vec3d
     offset: wp.vec3d
+    least: wp.float64
+
+
+@wp.func
+def half_views(n: wp.vec2d, view: View):
+    """How far out a ray through n on the plane z = 1 lies, in half views: 1 at the view's sides."""
+    return wp.vec2d(view.per_half[0] * (n[0] - view.middle[0]), view.per_half[1] * (n[1] - view.middle[1]))
+
+
+@wp.func
+def least_depth(n: wp.vec2d, view: View):
+    """The share of its depth that the sigma points keep of a splat whose centre lies on the ray through n on the plane z = 1."""
+    out = half_views(n, view)
+    if wp.abs(out[0]) <= ONE and wp.abs(out[1]) <= ONE:
+        return HALF
+    return wp.min(HALF + RISE * (wp.max(wp.abs(out[0]), wp.abs(out[1])) - ONE), ONE)
+
+
+@wp.func
+def least_depth_gradient(n: wp.vec2d, view: View):
+    """d least_depth / d n, up to the clamp."""
+    out = half_views(n, view)
+    g = wp.vec2d()
+    k = int(0)
+    if wp.abs(out[1]) > wp.abs(out[0]):
+        k = int(1)
+    if wp.abs(out[k]) > ONE:
+        g[k] = RISE * view.per_half[k] * wp.sign(out[k])
+    return g
 
 
 @wp.func
@@ -64,23 +97,22 @@ def at_edge(o: Optics, centre: wp.vec3d, offset: wp.vec3d, tau: wp.float64):
 
 
 @wp.func
-def reach(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int):
-    """How far a sigma point goes from `centre` along `offset` (one sigma); depth: which depth the lens has."""
-    half = wp.float64(0.5)
+def reach(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int, least: wp.float64):
+    """How far a sigma point goes from `centre` along `offset` (one sigma). depth: which the lens has; least: the share of it to keep."""
     out = Reach()
     out.tau = ROOT3
     out.rule = FULL
     room = wp.float64(0.0)
     rate = wp.float64(-1.0)
     if depth == _PLANAR:
-        room = half * centre[2]
+        room = (ONE - least) * centre[2]
         rate = -offset[2]
     if depth == _ROUND:
-        room = half * wp.dot(centre, centre)
+        room = (ONE - least) * wp.dot(centre, centre)
         rate = -wp.dot(centre, offset)
     if rate * ROOT3 > room:
-        out.tau = room / rate
-        out.rule = AT_HALF_DEPTH
+        out.tau = wp.max(room / rate, LEAST)
+        out.rule = AT_DEPTH
     if not inside(o, centre + out.tau * offset) and inside(o, centre):
         tau = at_edge(o, centre, offset, out.tau)
         if tau < out.tau:
@@ -94,8 +126,9 @@ def reach_backward(o: Optics, centre: wp.vec3d, offset: wp.vec3d, depth: int, ta
     out = ReachGradient()
     two = wp.float64(2.0)
     zero = wp.float64(0.0)
-    if rule == AT_HALF_DEPTH:
+    if rule == AT_DEPTH:
         if depth == _PLANAR:
+            out.least = g * centre[2] / offset[2]
             out.centre = wp.vec3d(zero, zero, g * tau / centre[2])
             out.offset = wp.vec3d(zero, zero, -g * tau / offset[2])
         else:

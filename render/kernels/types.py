@@ -94,6 +94,8 @@ class View:
     clamp_right: wp.float64
     clamp_top: wp.float64
     clamp_bottom: wp.float64
+    middle: wp.vec2d  # of the view, and one over half of it, as these
+    per_half: wp.vec2d
     tile_left: int  # the tiles that are drawn
     tile_top: int
     tiles_x: int
