@@ -40,6 +40,10 @@ LONGER, PLAIN = 2.5, 1e-3
 REACHES = 0.1
 """Of its distance, the standard deviation along the street that it may get: what would have to be longer is too much foreshortened."""
 
+ROOM = 8.0
+"""Times what it measures in the plane of it and the eye, which no picture shows, that it may be long: less than `LONGEST`
+(`recon/fit/densify.py`), so that it can grow until the next time. With what it was, wires were dotted lines."""
+
 SMOOTH = 9
 """Metres of the path over which its direction is averaged."""
 
@@ -149,7 +153,7 @@ def _turned(rays: np.ndarray, axes: np.ndarray, ways: np.ndarray) -> tuple[np.nd
     lengths = long / np.maximum(foreshortened, 1e-9)
     which = (off < ALIGNED) & (long > LONGER * wide) & (long > PLAIN * away) & (lengths < REACHES * away)
     rotations = np.stack([ways, across, np.cross(ways, across)], 2)[which]
-    thin = np.minimum(wide, np.linalg.norm(axes, axis=1).min(1))
+    thin = np.maximum(np.minimum(wide, np.linalg.norm(axes, axis=1).min(1)), lengths / ROOM)
     return rotations, np.stack([lengths, wide, thin], 1)[which], which
 
 
