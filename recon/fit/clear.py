@@ -51,15 +51,22 @@ class Clear:
     def holds(self, splats: Splats) -> torch.Tensor:
         """Mask `[N]` of the splats of the background whose middles lie where lidars looked through."""
         mask = torch.zeros_like(splats.reach, dtype=torch.bool)
-        means = splats.fields["means"][: splats.sizes[0]].detach().double().cpu()
-        asked = (means[:, 2] - self.ground.height(means[:, :2]) > ABOVE).nonzero()[:, 0]
-        through, there = torch.zeros(2, len(asked), dtype=torch.int64)
+        middles = splats.fields["means"][: splats.sizes[0]].detach().double().cpu().numpy()
+        mask[: splats.sizes[0]] = torch.from_numpy(self.seen_through(middles)).to(mask.device)
+        return mask
+
+    def seen_through(self, points: np.ndarray) -> np.ndarray:
+        """Whether points `[N, 3]` lie where lidars looked through; bool `[N]`."""
+        above = points[:, 2] - self.ground.height(torch.from_numpy(points[:, :2])).numpy()
+        asked = np.flatnonzero(above > ABOVE)
+        through, there = np.zeros((2, len(asked)), np.int64)
         for image in self.images:
-            near = ((means[asked] - torch.from_numpy(image.middle)).norm(dim=1) < FAR).nonzero()[:, 0]
-            beyond, struck = image.votes_with_silence(means[asked[near]].numpy())
-            through[near] += torch.from_numpy(beyond)
-            there[near] += torch.from_numpy(struck)
+            near = np.flatnonzero(np.linalg.norm(points[asked] - image.middle, axis=1) < FAR)
+            beyond, struck = image.votes_with_silence(points[asked[near]])
+            through[near] += beyond
+            there[near] += struck
             left = there <= THERE * len(self.images)  # others have been struck too often, whatever is still to come
             asked, through, there = asked[left], through[left], there[left]
-        mask[asked[(through >= THROUGH) & (there <= THERE * through)].to(mask.device)] = True
-        return mask
+        found = np.zeros(len(points), bool)
+        found[asked[(through >= THROUGH) & (there <= THERE * through)]] = True
+        return found

@@ -321,7 +321,7 @@ class Fit:
         """Let what lies along the street in pictures lie along it in space."""
         of_cameras = ([v for v in self.training if v.camera == c] for c in range(len(self.frames.names)))
         cameras = [self.motion.camera(view) for views in of_cameras for view in spread(views, LOOKS)]
-        StreetLines(self.motion.path(), cameras, self.population.clear.struck).straighten(self.splats)
+        StreetLines(self.motion.path(), cameras, self.population.clear).straighten(self.splats)
 
     def shown(self, splats: Splats | None = None) -> Shown:
         """What the pictures show of each splat; of others that stand in their place, where these are given."""

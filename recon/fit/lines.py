@@ -9,13 +9,14 @@ streets (Coughlan and Yuille 1999, "Manhattan world").
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from recon.fit.clear import Clear
 from recon.fit.model import Splats
 from recon.way import Path
 from scenes.camera import Camera
@@ -64,9 +65,8 @@ BENDS, OVER = math.radians(10), 10
 class StreetLines:
     """Straightens what of a background lies along a body's path, by how cameras on it see that."""
 
-    def __init__(self, path: Trajectory, cameras: Sequence[Camera], struck: Callable[[np.ndarray], np.ndarray]):
-        """struck: whether lidar saw something where points `[N, 3]` are, bool `[N]`."""
-        self.path, self.cameras, self.struck = Path(path), cameras, struck
+    def __init__(self, path: Trajectory, cameras: Sequence[Camera], clear: Clear):
+        self.path, self.cameras, self.clear = Path(path), cameras, clear
         ways = np.gradient(self.path.places, axis=0)
         ways = ndimage.uniform_filter1d(ways / np.linalg.norm(ways, axis=1).clip(1e-9)[:, None], SMOOTH, axis=0, mode="nearest")
         self.ways = ways / np.linalg.norm(ways, axis=1).clip(1e-9)[:, None]
@@ -94,9 +94,11 @@ class StreetLines:
         if not len(which):
             return 0
         weights = (torch.sigmoid(fields["logits"][which]) * scales[which].amax(1).sqrt()).numpy()
-        held = self.struck(means[which])
+        held = self.clear.struck(means[which])
         off = _off_edges(np.stack([around / BESIDE, along / ALONG], 1), np.log(away), np.where(held, HELD, 1.0) * weights)
         nearer = np.exp(np.where(held, 0.0, PULLED * off))
+        # what came to where lidar looked through would be removed
+        nearer[self.clear.seen_through(eyes + nearer[:, None] * (means[which] - eyes))] = 1.0
         moved = {
             "means": torch.from_numpy(eyes + nearer[:, None] * (means[which] - eyes)),
             "quats": quat_from_matrix(torch.from_numpy(turned)),

@@ -1,6 +1,7 @@
 """What pictures show to lie along the street lies along it in space."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,8 +34,12 @@ def bend():
     )
 
 
-def lines(path, struck=lambda points: np.zeros(len(points), bool)):
-    return StreetLines(path, cameras(path), struck)
+def never(points):
+    return np.zeros(len(points), bool)
+
+
+def lines(path, struck=never, seen_through=never):
+    return StreetLines(path, cameras(path), SimpleNamespace(struck=struck, seen_through=seen_through))
 
 
 def cameras(path, aside=0.0):
@@ -171,6 +176,14 @@ def test_two_wires_one_behind_the_other_stay_two():
     away = (both.fields["means"][:, 1:] - torch.tensor([0, 1.5])).norm(dim=1)
     torch.testing.assert_close(away[:60], torch.full((60,), math.hypot(6, 5)), rtol=0.02, atol=0)
     assert (away[60:] > 1.8 * math.hypot(6, 5)).all()
+
+
+def test_nothing_goes_where_lidar_looked_through():
+    path, (splats, eye) = straight(), wire()
+    first = (splats.fields["means"] - eye).norm(dim=1)
+    lines(path, seen_through=lambda points: np.linalg.norm(points - eye.numpy(), axis=1) < first.numpy() - 1e-3).straighten(splats)
+    after = (splats.fields["means"] - eye).norm(dim=1)
+    assert (after > first - 0.01).all() and (after > first + 0.1).any()
 
 
 def test_what_lidar_saw_stays_where_it_is_and_draws_the_others():
