@@ -282,15 +282,19 @@ class Fit:
         """Add, drop and colour splats, and even cameras out, where it is time to."""
         if self.step_count and self.step_count % self.config.grow_every == 0 and self._growing():
             self.population.grow(self.progress)
-        if self.step_count in [round(part * self.config.steps) for part in REFILLED_AT]:
+        if self._at(REFILLED_AT):
             self._refill()
-        if self.step_count in [round(part * self.config.steps) for part in STRAIGHTENED_AT]:
+        if self._at(STRAIGHTENED_AT):
             self._straighten()
         if due(self.step_count, self.config.steps):
             for camera in self.evened:
                 self.flat_fields[camera].follow()
         if self.population.guessed is None and self.progress >= GUESSED_FROM:
             self.population.guess(self.shown)
+
+    def _at(self, parts: Sequence[float]) -> bool:
+        """Whether the next step is the first of one of these parts of the fit."""
+        return self.step_count in [round(part * self.config.steps) for part in parts]
 
     def _evened(self) -> list[int]:
         """The cameras whose flat fields are found on the way."""

@@ -131,7 +131,8 @@ def _nearest_eyes(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.nda
     eyes, nearest = np.zeros_like(points), np.full(len(points), np.inf)
     for camera in cameras:
         pose = camera.world_from_cam.detach()
-        local = torch.from_numpy(points) @ inverse(pose)[:3, :3].T + inverse(pose)[:3, 3]
+        back = inverse(pose)
+        local = torch.from_numpy(points) @ back[:3, :3].T + back[:3, 3]
         pixels, size = camera.lens.project(local), torch.tensor([camera.width, camera.height])
         away = local.norm(dim=1).numpy()
         has = (camera.lens.valid(local) & ((pixels >= 0) & (pixels < size)).all(1)).numpy() & (away < nearest)
