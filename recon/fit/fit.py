@@ -36,6 +36,9 @@ from scenes.gaussians import Placed
 from scenes.sky import sample_equirect
 from scenes.spread import spread
 
+SKY_RATE, EXPOSURE_RATE = 2e-3, 5e-4
+"""Steps of the sky's colours and of cameras' exposures."""
+
 SKY_PRIOR = 3e-6
 """Weight, in a step's gradient, of the squared distance of the sky from its initial picture: a twentieth of what a picture's sky weighs,
 but more than what shines through a wall, which Adam would turn into noise that a shifted view shows between the houses."""
@@ -107,7 +110,7 @@ class Fit:
         poses, exposures = self.motion.parameters(self.config.refine), [self.exposures] * ("exposures" in self.config.refine)
         for tensor in [self.sky, *exposures, *poses]:
             tensor.requires_grad_(True)
-        self.rest_adam = adam([{"params": [self.sky], "lr": 2e-3}, {"params": exposures, "lr": 5e-4}], eps=1e-12)
+        self.rest_adam = adam([{"params": [self.sky], "lr": SKY_RATE}, {"params": exposures, "lr": EXPOSURE_RATE}], eps=1e-12)
         self.pose_adam = adam([{"params": poses, "lr": 0.03}], eps=1e-12)
 
     @property
@@ -268,6 +271,9 @@ class Fit:
             self.exposures.grad[0] = 0  # the first camera is the reference
         if self.sky.grad is not None:
             self.sky.grad.add_(self.sky.detach() - self.first_sky, alpha=SKY_PRIOR)
+        # at full length to the end, steps would leave a lattice of dots in the sky, whose every other direction each of them moves alike
+        for group, rate in zip(self.rest_adam.param_groups, (SKY_RATE, EXPOSURE_RATE), strict=True):
+            group["lr"] = rate * self._settled()
         self.rest_adam.step()
         if self.progress >= self.config.poses_from:
             self.pose_adam.param_groups[0]["lr"] = 0.03 * max(0.1, 1 - self.progress)
