@@ -188,6 +188,14 @@ def image_size(file: Path) -> tuple[int, int]:
         return picture.size
 
 
+def is_upright(file: Path) -> bool:
+    """Whether an image file is stored as it is to be seen, not turned as phones store portraits. ValueError naming a file that is none."""
+    from scenes.pictures import is_turned, opened
+
+    with opened(file, str(file), FETCH) as picture:
+        return not is_turned(picture)
+
+
 def leading(files: Sequence[Path], what: str = "pictures") -> tuple[Path, ...]:
     """The files that are there of those that time stamps name, where no more than the last are missing. what: they are, for messages.
 

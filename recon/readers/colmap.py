@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import Log, LogCamera, SparsePoints, image_size
+from recon.log import FETCH, Log, LogCamera, SparsePoints, image_size, is_upright
 from recon.readers.colmap_model import Model, ModelCamera, is_model, read_model
 from recon.readers.gauge import find_gauge
 from recon.readers.moments import moments_of
@@ -21,6 +21,7 @@ from recon.readers.order import names_apart
 from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
+from scenes.pictures import opened
 from scenes.poses import CAM_FROM_FLU
 from scenes.trajectory import Trajectory
 
@@ -66,6 +67,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         raise ValueError(f"{where} has its pictures {step:.3g} m from one to the next, which is implausible; {fix}")
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
+    firsts: list[Path] = []
     for key in sorted(names, key=lambda k: (k != lead, names[k])):
         chosen = sorted((k for k, i in enumerate(model.images) if i.camera == key), key=lambda k: moments[k])
         if not any(ego.covers(moments[k]) for k in chosen):
@@ -75,15 +77,20 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         files = tuple(pictures / model.images[k].name for k in chosen)
         for file in files:
             if not file.is_file():
-                raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file)}")
-        found, size = model.cameras[key], image_size(files[0])
-        if size != (found.width, found.height):
-            fix = f"put the pictures that the model was made of into {pictures}, or make a model of these"
-            taken = f"{files[0]} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}"
-            raise ValueError(f"{taken}; {fix}")
+                raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file, files)}")
+        _check_upright(path, files)
+        found = model.cameras[key]
+        for file in files:
+            size = image_size(file)
+            if size != (found.width, found.height):
+                fix = f"put the pictures that the model was made of into {pictures}, or make a model of these"
+                taken = f"{file} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}"
+                raise ValueError(f"{taken}; {fix}")
+        firsts.append(files[0])
         times = torch.tensor([moments[k] for k in chosen])
         cameras[names[key]] = LogCamera(names[key], lens_of(found, where), found.width, found.height, files, times, placed[chosen])
         seen[names[key]] = tuple(model.images[k].points for k in chosen)
+    _tell_masked(firsts, pictures.with_name("masks"))
     about = path.resolve()
     meta: dict = {
         "name": about.parent.name if about.name in ("images", "sparse") else about.name.removesuffix(".sfm"),
@@ -116,6 +123,8 @@ LENSES: dict[str, Callable[..., Lens]] = {
     "RADIAL": lambda f, cx, cy, k1, k2: OpenCV(f, f, cx, cy, k1, k2),
     "OPENCV": OpenCV,
     "FULL_OPENCV": OpenCV,
+    "SIMPLE_FISHEYE": lambda f, cx, cy: Fisheye(f, f, cx, cy),
+    "FISHEYE": Fisheye,
     "SIMPLE_RADIAL_FISHEYE": lambda f, cx, cy, k: Fisheye(f, f, cx, cy, k),
     "RADIAL_FISHEYE": lambda f, cx, cy, k1, k2: Fisheye(f, f, cx, cy, k1, k2),
     "OPENCV_FISHEYE": Fisheye,
@@ -155,5 +164,27 @@ def _picture_folder(path: Path, where: Path, name: str) -> Path:
     raise FileNotFoundError(f"{path / 'images' / name} is missing; put the pictures that the model registers into {path / 'images'}")
 
 
-def _beside(file: Path) -> str:
-    return nearest(file.name, [p.name for p in file.parent.iterdir()] if file.parent.is_dir() else [])
+def _beside(file: Path, registered: tuple[Path, ...]) -> str:
+    there = set(file.parent.iterdir()) if file.parent.is_dir() else set()
+    return nearest(file.name, [p.name for p in there.difference(registered)])
+
+
+def _tell_masked(files: list[Path], masks: Path) -> None:
+    """Say where masks in a folder, as COLMAP takes them, or transparent pixels are to hide something, which they do not here."""
+    masking = [masks] * masks.is_dir()
+    for file in files:
+        with opened(file, str(file), FETCH) as picture:
+            if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[..., 3].min() < 255:
+                masking.append(file)
+    for name in masking:
+        print(f"{name} masks a part of the pictures, which is not heeded: all that they show is fitted", file=sys.stderr)
+
+
+def _check_upright(path: Path, files: tuple[Path, ...]) -> None:
+    """ValueError where COLMAP, which does not ask their EXIF data, took pictures as they are stored, and these say that is not upright:
+    up and the ground would be sought to the side."""
+    turned = next((file for file in files if not is_upright(file)), None)
+    if turned is not None:
+        fix = "turn them and make the model anew, or, if they are upright as they are stored, take the orientation out of their EXIF data"
+        fix = "delete it to begin again" if path.suffix == ".sfm" else fix
+        raise ValueError(f"{path} was made of photos as they are stored, and {turned.name} is not stored upright; {fix}")

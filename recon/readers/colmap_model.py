@@ -61,8 +61,12 @@ def read_model(folder: Path) -> Model:
     try:
         colmap = pycolmap()
         found = colmap.Reconstruction()
-        (found.read_text if lost[".bin"] else found.read_binary)(str(folder))
-    except (RuntimeError, ValueError, IndexError, MemoryError) as problem:
+        if lost[".bin"]:
+            found.read_text(str(folder))
+            _name_whole(found, folder / "images.txt")
+        else:
+            found.read_binary(str(folder))
+    except (RuntimeError, ValueError, LookupError, MemoryError) as problem:
         if MISSING in str(problem):
             raise
         raise ValueError(f"{folder} is not a valid COLMAP model ({_first_line(problem)}); export it again") from None
@@ -80,11 +84,21 @@ def read_model(folder: Path) -> Model:
         raise ValueError(f"{folder} registers no picture; COLMAP found no pose, so there is nothing to reconstruct from")
     twice = next((a.name for a, b in pairwise(images) if a.name == b.name), None)
     if twice is not None:
-        raise ValueError(f"{folder} registers two pictures as {twice}; names in a text model end at their first space: export it as binary")
+        raise ValueError(f"{folder} registers two pictures as {twice}; run COLMAP's mapper again")
     values = np.concatenate([xyz.ravel(), *(i.cam_from_world.ravel() for i in images)])
     if not np.isfinite(values).all():
         raise ValueError(f"{folder} holds a pose or a point that is not finite; run COLMAP's mapper again")
     return Model(cameras, tuple(images), xyz, any(len(rig.non_ref_sensors) > 0 for rig in found.rigs.values()))
+
+
+def _name_whole(found, listed: Path) -> None:
+    """Give the pictures of a text model their names as they are listed: COLMAP itself ends them at their first space."""
+    lines = iter(listed.read_text(encoding="utf-8").split("\n"))
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if words and not words[0].startswith("#"):
+            found.images[int(words[0])].name = words[9].strip()
+            next(lines, None)  # what the picture shows
 
 
 def _first_line(problem: Exception) -> str:

@@ -14,13 +14,14 @@ import shutil
 import sys
 from pathlib import Path
 
+import torch
 from PIL import ImageOps
 
-from recon.log import FETCH, Log, Packed
+from recon.log import FETCH, Log, is_upright
 from recon.readers.colmap import find_model, read_colmap
 from recon.readers.order import recorded
 from recon.sfm.solve import solve
-from scenes.pictures import PICTURES, is_turned, opened, rgb_of, swaps_sides
+from scenes.pictures import PICTURES, opened, rgb_of, swaps_sides
 
 PHOTOS = tuple(suffix for suffix in PICTURES if suffix != ".webp")  # which COLMAP does not read
 UNREAD = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".nef", ".arw")
@@ -88,9 +89,6 @@ def read_photos(
     inside = workspace / "images"
     log = read_colmap(workspace, camera_height, metres_per_unit, inside if inside.is_dir() else path)
     camera = log.camera(log.front[0])
-    lying = next((file for file in camera.files if _turned(file)), None)
-    if lying is not None:
-        raise ValueError(f"{workspace} was made of photos as they are stored, and {lying.name} lies on its side; delete it to begin again")
     found = 2 * math.atan(camera.width / 2 / camera.lens.focal()[0])
     if angle_of_view is not None and abs(found - angle_of_view) > SAME * angle_of_view:
         fix = f"delete it to begin again with {math.degrees(angle_of_view):g}deg"
@@ -126,13 +124,6 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _turned(file: Path | Packed) -> bool:
-    if isinstance(file, Packed):
-        return False
-    with opened(file, str(file), FETCH) as picture:
-        return is_turned(picture)
-
-
 def _check_whole(path: Path, names: list[str]) -> None:
     """ValueError for a photo of which a part is missing, as of a copy that broke off: COLMAP takes what is left of it, and the fit, which
     does not, begins when all poses are found."""
@@ -146,7 +137,7 @@ def _upright(path: Path, names: list[str], folder: Path) -> Path:
 
     They keep the rest of their EXIF, whose focal length COLMAP asks for. One folder, since a model's pictures have one.
     """
-    turned = {name for name in names if _turned(path / name)}
+    turned = {name for name in names if not is_upright(path / name)}
     if not turned:
         return path
     folder.mkdir()
@@ -197,8 +188,18 @@ def _frames(path: Path, folder: Path) -> dict[str, int]:
     for i, (time_us, frame) in enumerate(video.timed()):
         count += 1
         if time_us - last >= apart:
-            write_image(folder / f"{i:06d}.jpg", frame)
+            write_image(folder / f"{i:06d}.jpg", _square(frame, float(video.pixel_aspect)))
             times[f"{i:06d}.jpg"] = last = time_us
     if len(times) < FEWEST:
-        raise ValueError(f"{path} has {count} frames; a reconstruction needs at least {FEWEST}")
+        taken = "" if len(times) == count else f", of which {len(times)} are taken, {RATE:g} a second"
+        frames = f"{count} frame{'s' * (count > 1)}"
+        raise ValueError(f"{path} has {frames}{taken}; a reconstruction needs at least {FEWEST}: give a longer video")
     return times
+
+
+def _square(frame: torch.Tensor, aspect: float) -> torch.Tensor:
+    """A frame `[H, W, 3]` whose pixels are so many times as wide as high, with square ones: a lens has one focal length for both."""
+    height, width = round(frame.shape[0] * max(1, 1 / aspect)), round(frame.shape[1] * max(1, aspect))
+    if (height, width) == frame.shape[:2]:
+        return frame
+    return torch.nn.functional.interpolate(frame.movedim(2, 0)[None], (height, width), mode="bilinear")[0].movedim(0, 2)

@@ -79,7 +79,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     if said:
         print(said, file=sys.stderr)
     if best is None or count < max(FEWEST_PLACED, len(names) // 4):
-        fix = "take them closer together, with more overlap and things that stand still"
+        fix = "take them closer together, with more overlap and things that stand still, while the camera moves"
         raise ValueError(f"only {count} of {len(names)} pictures of {source} could be placed; {fix}")
     (workspace / "sparse" / "0").mkdir(parents=True)
     best.write(workspace / "sparse" / "0")

@@ -19,6 +19,7 @@ from recon.views.gains import picture_gains
 from render import render_clip
 from scenes import Scene, load
 from scenes.insert import insert
+from scenes.pictures import ORIENTATION
 from scenes.placement import Placement
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
@@ -130,26 +131,59 @@ def test_no_camera_takes_anothers_name():
     assert names_apart({1: ["front-left/1.jpg", "front-left/2.jpg"], 2: ["front_left/1.jpg"]}) is None
 
 
-def test_names_with_a_space_in_a_text_model_are_refused_with_the_fix(own):
+def test_names_with_spaces_in_a_text_model_are_read_whole(own, workspace):
+    """COLMAP itself ends them at the first."""
     images = own / "sparse/0/images.txt"
-    images.write_text(re.sub(r"(\d{3}\.png)", r"May \1", images.read_text()))
-    with pytest.raises(
-        ValueError, match="registers two pictures as May; names in a text model end at their first space: export it as binary"
-    ):
-        open_log(own)
+    images.write_text("# some\n\n" + re.sub(r"(\d{3}\.png)", r"1 May, Straße \1", images.read_text()), newline="\r\n")
+    for file in (own / "images").iterdir():
+        file.rename(file.with_name(f"1 May, Straße {file.name}"))
+    found = open_log(own).camera("camera")
+    assert [f.name for f in found.files] == [f"1 May, Straße {i:03d}.png" for i in range(12)]
+    torch.testing.assert_close(found.world_from_cam, open_log(workspace).camera("camera").world_from_cam)
 
 
 def test_pictures_of_another_size_than_the_models_are_named_with_the_fix(own):
-    for file in (own / "images").iterdir():
-        with Image.open(file) as picture:
-            picture.resize((48, 27)).save(file)
-    with pytest.raises(ValueError, match="000.png is 48x27, but the model in .* has a camera of 96x54; put the pictures that the model"):
+    file = own / "images/003.png"
+    with Image.open(file) as picture:
+        picture.resize((48, 27)).save(file)
+    with pytest.raises(ValueError, match="003.png is 48x27, but the model in .* has a camera of 96x54; put the pictures that the model"):
         open_log(own)
 
 
-def test_a_missing_picture_is_named(own):
-    (own / "images/007.png").unlink()
-    with pytest.raises(FileNotFoundError, match="images/007.png is missing"):
+def test_pictures_that_are_not_stored_upright_are_refused_with_the_fix(own):
+    """COLMAP takes them as they are stored: up would be to the side, and the ground a wall."""
+    file = own / "images/003.png"
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    with Image.open(file) as picture:
+        picture.save(file, exif=exif)
+    with pytest.raises(ValueError, match="made of photos as they are stored, and 003.png is not stored upright; turn them and make"):
+        open_log(own)
+
+
+def test_masks_are_said_not_to_be_heeded(own, capsys):
+    open_log(own)
+    assert "masks" not in capsys.readouterr().err
+    (own / "masks").mkdir()
+    file = own / "images/000.png"
+    with Image.open(file) as picture:
+        picture.putalpha(255)
+        picture.save(file)
+        open_log(own)
+        said = capsys.readouterr().err
+        assert "walk/masks masks a part of the pictures, which is not heeded" in said and "000.png" not in said
+        picture.putalpha(Image.linear_gradient("L").resize(picture.size))
+        picture.save(file)
+    open_log(own)
+    assert "images/000.png masks a part of the pictures, which is not heeded" in capsys.readouterr().err
+
+
+def test_a_missing_picture_is_named_with_the_nearest_that_is_not_registered(own):
+    (own / "images/007.png").rename(own / "images/007 (1).png")
+    with pytest.raises(FileNotFoundError, match=r"images/007.png is missing; .* registers it. Did you mean 007 \(1\).png\?"):
+        open_log(own)
+    (own / "images/007 (1).png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"images/007.png is missing; .* registers it\.$"):
         open_log(own)
 
 
@@ -169,7 +203,8 @@ def test_a_model_that_lacks_a_file_or_is_cut_short_is_named(own):
 @pytest.mark.parametrize(
     "line",
     ["SIMPLE_RADIAL 96 54 58 48 27 -0.1", "OPENCV 96 54 58 57 48 27 -0.1 0.02 0.001 -0.002", "RADIAL_FISHEYE 96 54 58 48 27 0.05 -0.01",
-     "FULL_OPENCV 96 54 58 57 48 27 -0.1 0.02 0.001 -0.002 0.01 0.02 0.01 0.003", "OPENCV_FISHEYE 96 54 58 57 48 27 0.1 -0.02 0.01 0.001"],
+     "FULL_OPENCV 96 54 58 57 48 27 -0.1 0.02 0.001 -0.002 0.01 0.02 0.01 0.003", "OPENCV_FISHEYE 96 54 58 57 48 27 0.1 -0.02 0.01 0.001",
+     "SIMPLE_FISHEYE 96 54 58 48 27", "FISHEYE 96 54 58 57 48 27"],
 )  # fmt: skip
 def test_distorted_lenses_project_as_colmaps_do(own, line):
     import pycolmap

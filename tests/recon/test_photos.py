@@ -167,7 +167,7 @@ def test_a_workspace_of_photos_that_lay_on_their_side_is_refused_with_the_fix(wa
     shutil.copytree(walk / "images", tmp_path / "walk")
     open_log(tmp_path / "walk")
     _lie_down(tmp_path / "walk")
-    with pytest.raises(ValueError, match="walk.sfm was made of photos as they are stored, and 001.png lies on its side; delete it"):
+    with pytest.raises(ValueError, match="walk.sfm was made of photos as they are stored, and 001.png is not stored upright; delete it"):
         open_log(tmp_path / "walk")
 
 
@@ -217,6 +217,29 @@ def test_a_video_keeps_its_clock(solved, tmp_path):
     camera = open_log(tmp_path / "drive.mp4").camera("camera")
     assert solved[0] == ([f"{i:06d}.jpg" for i in range(0, 12, 2)], True, None)  # 25 frames a second, every second one
     assert camera.times_us.diff().unique().tolist() == [80_000] and camera.image(1).shape == (54, 96, 3)
+
+
+def test_a_video_of_wide_pixels_is_read_with_square_ones(tmp_path):
+    """As of camcorders that store 1440x1080 of 1920x1080: a lens has one focal length across and down."""
+    for aspect, size in ((Fraction(4, 3), (54, 128)), (Fraction(3, 4), (72, 96))):
+        file, folder = tmp_path / f"{aspect.numerator}.mp4", tmp_path / f"frames{aspect.numerator}"
+        with VideoWriter(file, 10, 96, 54, pixel_aspect=aspect) as video:
+            for _ in range(4):
+                video.write(torch.linspace(0, 1, 96)[None, :, None].expand(54, 96, 3))
+        for name in reader._frames(file, folder):
+            picture = torch.from_numpy(np.array(Image.open(folder / name))).float() / 255
+            assert picture.shape == (*size, 3)
+            # what H.264 and JPEG leave
+            torch.testing.assert_close(picture[:, :, 0].mean(0), torch.linspace(0, 1, size[1]), atol=0.04, rtol=0)
+
+
+def test_a_video_that_is_too_short_is_told_how_many_frames_are_taken(tmp_path):
+    for count, said in ((1, "has 1 frame;"), (12, "has 12 frames, of which 2 are taken, 10 a second;")):
+        with VideoWriter(tmp_path / f"{count}.mp4", 60, 96, 54) as video:
+            for i in range(count):
+                video.write(torch.full((54, 96, 3), i / 12))
+        with pytest.raises(ValueError, match=f"mp4 {said} a reconstruction needs at least 3: give a longer video"):
+            reader._frames(tmp_path / f"{count}.mp4", tmp_path / f"frames{count}")
 
 
 def test_too_few_photos_are_told_from_no_drive_at_all(walk, tmp_path):
