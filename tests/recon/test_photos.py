@@ -338,7 +338,7 @@ def test_pictures_that_do_not_tell_their_lens_are_placed_by_a_usual_one(straight
         return (None, 0) if options.ba_refine_focal_length else really(colmap, database, pictures, made, options, tell)
 
     monkeypatch.setattr(sfm, "_largest", largest)
-    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names) and tried == [True, False]
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names) and tried == [True, True, False]
     camera = next(iter(read_model(tmp_path / "sparse/0").cameras.values()))
     assert camera.params[0] == pytest.approx(160 / math.tan(math.radians(30))) and 0 < abs(camera.params[3]) < sfm.MOST_DISTORTION
     said = capsys.readouterr().err

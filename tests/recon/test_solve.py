@@ -31,6 +31,25 @@ def test_a_lens_that_is_found_is_no_wider_than_any():
     assert not sfm._solving_options(pycolmap(), 1.0).ba_refine_focal_length
 
 
+@pytest.mark.parametrize(
+    ("size", "placed", "asked"), [((480, 270), 5, [2]), ((270, 480), 4, [2, 4]), ((960, 540), 5, [4]), ((1920, 1080), 5, [4])]
+)
+def test_the_pair_that_a_model_begins_with_is_off_by_little_of_a_small_picture(size, placed, asked, tmp_path, monkeypatch):
+    """Unless that places too few: then by as much as COLMAP allows, and what places more is taken."""
+    Image.new("RGB", size).save(tmp_path / "0.png")
+    (tmp_path / "database.db").touch()
+    errors, models = [], iter([placed, 3])
+
+    def largest(*given):
+        errors.append(given[4].mapper.init_max_error)
+        return SimpleNamespace(write=lambda _: None), next(models)
+
+    for name in ("extract_features", "_match_neighbours"):
+        monkeypatch.setattr(sfm, name, lambda *_: None)
+    monkeypatch.setattr(sfm, "_largest", largest)
+    assert sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, 1.0, "a") == placed and errors == asked
+
+
 @pytest.mark.parametrize(("size", "degrees"), [((800, 600), 60), ((600, 800), 46.83)])
 def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path):
     colmap, database = pycolmap(), tmp_path / "database.db"
