@@ -12,9 +12,10 @@ import torch
 from recon.log import Log, SparsePoints, Track
 from recon.seeds.ground_rays import ground_hits
 from recon.seeds.measured import PICTURES, Measured, by_pictures
+from recon.seeds.planes import swept
 from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.road import Road
-from recon.seeds.stereo import Plate, plate_of, swept
+from recon.seeds.stereo import Plate, plate_of
 from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
 from recon.views.project import project

@@ -1,8 +1,4 @@
-"""How far away everything in a picture is, as pictures of the same place from elsewhere tell it.
-
-Plane sweep over inverse depth (Collins 1996), likeness by normalised cross-correlation, smoothed along scanlines by semi-global matching
-(Hirschmüller 2008).
-"""
+"""Pictures as pinhole cameras see them, and how alike they look at a depth, by normalised cross-correlation."""
 
 from __future__ import annotations
 
@@ -19,12 +15,6 @@ from scenes.poses import inverse
 WIDTH = 256
 """Columns at which pictures are compared, at most."""
 
-PLANES = 96
-"""Inverse depths that are tried, in equal steps from 0 (the sky) on."""
-
-CHUNK = 16
-"""Inverse depths that are looked at together: what they need stays in the cache."""
-
 WINDOW = 5
 """Side of the squares that are correlated, in pixels."""
 
@@ -34,23 +24,8 @@ FLAT = 2.0
 GREY = 128.0
 """Level that plates count from: sums of squares lose less."""
 
-NUDGE, JUMP = 0.06, 0.5
-"""What it costs a pixel to be one inverse depth off its neighbour, or any number; a correlation of 1 costs 0, of none 1."""
-
-EDGE = 12.0
-"""Levels between neighbours at which a jump costs half."""
-
 UNSEEN = 0.7
 """What it costs to be where no other picture looks: less than to be far away, where all look, and look like nothing there."""
-
-PINNED = 1.0
-"""What it costs the pixel of a known point to be elsewhere."""
-
-UNDERGROUND, ON_LIMIT = 2.0, 0.25
-"""What it costs to be under the ground, and how many inverse depths above the limit nothing is believed."""
-
-BEYOND = 0.5
-"""Inverse depths up to which things are too far to be told from what moves with the camera."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +45,7 @@ class Plate:
 
     def contrast(self) -> np.ndarray:
         """Standard deviation `[h, w]` of the grey levels in the squares that are compared, noise taken off, in parts of their mean."""
-        mean, spread = _moments(self.grey[None])
+        mean, spread = moments_of(self.grey[None])
         return ((spread.square() - FLAT * FLAT).clamp_min(0).sqrt() / (mean + GREY).clamp_min(1))[0].numpy()
 
     def rays(self) -> torch.Tensor:
@@ -114,118 +89,12 @@ def plate_of(image: torch.Tensor, camera: Camera) -> Plate:
     return Plate(shown, plate.focal, plate.centre, plate.cam_from_world, at * scale, inside.numpy())
 
 
-def swept(plate: Plate, others: list[Plate], nearest: float, points: np.ndarray, deepest: np.ndarray) -> np.ndarray:
-    """Depth z `[h, w]` of a plate's pixels as `others`, of its size, tell it; NaN where they do not.
-
-    nearest: metres to the nearest depth that is tried; points: world points `[N, 3]` that it is known to show; deepest: depth `[h, w]` of
-    the ground, infinite above the horizon.
-    """
-    inverse_depths = torch.linspace(0, 1 / nearest, PLANES)
-    step = float(inverse_depths[1])
-    cost = _costs(plate, others, inverse_depths)
-    nowhere = cost == UNSEEN
-    _pin(cost, plate, points, step)
-    floor = torch.from_numpy(1 / deepest).float() / step
-    cost += UNDERGROUND * (torch.arange(PLANES) < (floor[..., None] - 1.0))
-    cost = _smoothed(cost, plate.grey)
-    best = cost.argmin(2)
-    middle = best.clamp(1, PLANES - 2)
-    before, here, after = (cost.gather(2, (middle + d)[..., None])[..., 0] for d in (-1, 0, 1))
-    bend = (before + after - 2 * here).clamp_min(1e-6)
-    between = torch.where(best == middle, middle + (0.5 * (before - after) / bend).clamp(-0.5, 0.5), best.float())
-    # what would rather be under the ground lies on the limit in all pictures, and what moves with the camera seems infinitely far in all
-    known = ~nowhere.gather(2, best[..., None])[..., 0] & (between > floor + ON_LIMIT) & (between > BEYOND)
-    return torch.where(known, 1 / (between * step).clamp_min(1e-6), torch.nan).numpy()
-
-
-def _costs(plate: Plate, others: list[Plate], inverse_depths: torch.Tensor) -> torch.Tensor:
-    """1 - correlation `[h, w, D]`, the mean of the better half of the others (they may not see the place); `UNSEEN` where none shows it."""
-    h, w = plate.grey.shape
-    rays = plate.rays().contiguous()
-    motions = [torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float() for other in others]
-    rays_there = [(rays @ motion[:3, :3].T).movedim(2, 0) for motion in motions]
-    mean, spread = _moments(plate.grey[None])
-    costs = torch.empty(h, w, len(inverse_depths))
-    for k, part in enumerate(inverse_depths.split(CHUNK)):
-        best = second = torch.full((len(part), h, w), 2.0)
-        for other, motion, turned in zip(others, motions, rays_there, strict=True):
-            x, y, z = (turned[axis] + part[:, None, None] * motion[axis, 3] for axis in range(3))
-            cost, inside = _compared(plate.grey, mean, spread, other, x, y, z)
-            cost = torch.where(inside & (z > 0.1 * part[:, None, None]), cost, UNSEEN)
-            second = torch.minimum(second, torch.maximum(cost, best))
-            best = torch.minimum(cost, best)
-        costs[..., CHUNK * k : CHUNK * k + len(part)] = (best if len(others) < 3 else (best + second) / 2).permute(1, 2, 0)
-    return costs
-
-
-def _compared(
-    own: torch.Tensor, mean: torch.Tensor, spread: torch.Tensor, other: Plate, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """1 - correlation of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]` before it, and whether
-    these are in its view."""
-    h, w = other.grey.shape
-    behind = 1 / z.clamp_min(1e-3)
-    u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
-    v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
-    grid = torch.stack([u, v], -1).clamp_(-3, 3)
-    shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
-    their_mean, their_spread = _moments(shown)
-    return 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
-
-
-def box_means(maps: torch.Tensor) -> torch.Tensor:
-    """Means over squares of `WINDOW` of maps `[N, h, w]`."""
-    half = WINDOW // 2
-    for axis in (1, 2):
-        size = maps.shape[axis]
-        first, last = maps.narrow(axis, 0, 1), maps.narrow(axis, size - 1, 1)
-        wide = torch.cat([*[first] * half, maps, *[last] * half], axis)
-        maps = wide.narrow(axis, 0, size).clone()
-        for shift in range(1, WINDOW):
-            maps += wide.narrow(axis, shift, size)
-    return maps.mul_(1 / WINDOW**2)
-
-
-def _moments(maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Means and standard deviations over squares, the latter with noise."""
-    mean = box_means(maps)
-    return mean, (box_means(maps * maps) - mean * mean).clamp_min(0).add(FLAT * FLAT).sqrt()
-
-
-def _pin(cost: torch.Tensor, plate: Plate, points: np.ndarray, step: float) -> None:
-    """Make the pixels of known points expensive everywhere else; of several in one pixel the last counts."""
-    row, column, z, inside = plate.shown(points)
-    place = torch.from_numpy(1 / z[inside] / step).float()
-    away = (torch.arange(PLANES) - place[:, None]).abs()
-    # NumPy's, since torch's threads write in any order, and which point counts would be left to chance
-    cost.numpy()[row[inside], column[inside]] += (PINNED * (away / 2).clamp_max(1.0)).numpy()
-
-
-def _smoothed(cost: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
-    """Costs `[h, w, D]` summed along paths from the left, right, top and bottom (Hirschmüller 2008, equation 13)."""
-    total = torch.zeros_like(cost)
-    for axis in (0, 1):
-        lines, sums = cost.movedim(axis, 0), total.movedim(axis, 0)
-        jumps = JUMP / (1 + grey.movedim(axis, 0).diff(dim=0).abs() / EDGE)
-        for order, edges in ((range(len(lines)), jumps), (range(len(lines) - 1, -1, -1), jumps.flip(0))):
-            path = torch.zeros_like(lines[0])
-            # the first line has nothing before it: its jump costs nothing
-            for i, jump in zip(order, [edges[0] * 0, *edges], strict=True):
-                least = path.amin(1, keepdim=True)
-                reach = torch.minimum(path, jump[:, None] + least)
-                reach[:, 1:] = torch.minimum(reach[:, 1:], path[:, :-1] + NUDGE)
-                reach[:, :-1] = torch.minimum(reach[:, :-1], path[:, 1:] + NUDGE)
-                path = lines[i] + (reach - least)
-                sums[i] += path
-    return total
-
-
 def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], rows: slice, depth: float | torch.Tensor) -> torch.Tensor:
     """1 - correlation `[N, rows, w]` of a plate's rows, at a depth z or depths `[h, w]`, with others' where what they show has moved by any
     of N ways `[N, 3]` in the world; the mean of each side, of the better one, since the other may not see it."""
     own = plate.grey[None, rows]
     local = plate.rays()[rows].movedim(-1, 0) * (depth if isinstance(depth, float) else depth[rows])
-    mean, spread = _moments(own)
+    moments = moments_of(own)
     of_sides = []
     for side in sides:
         total = count = torch.zeros(())
@@ -233,8 +102,48 @@ def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], ro
             there = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
             moved = torch.from_numpy(ways @ other.cam_from_world[:3, :3].T).float() + there[:3, 3]
             x, y, z = (there[:3, :3] @ local.flatten(1)).reshape(local.shape)[:, None] + moved.T[:, :, None, None]
-            cost, inside = _compared(own, mean, spread, other, x, y, z)
+            cost, inside = compared(own, moments, other, x, y, z)
             seen = inside & (z > 0.5)
             total, count = total + torch.where(seen, cost, 0.0), count + seen
         of_sides.append(torch.where(count > 0, total / count.clamp_min(1), UNSEEN))
     return torch.stack(of_sides).amin(0)
+
+
+def compared(
+    own: torch.Tensor,
+    moments: tuple[torch.Tensor, torch.Tensor],
+    other: Plate,
+    x: torch.Tensor,
+    y: torch.Tensor,
+    z: torch.Tensor,
+    window: int = WINDOW,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """1 - correlation, in squares of a side, of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]`
+    before it, and whether these are in its view."""
+    h, w = other.grey.shape
+    behind = 1 / z.clamp_min(1e-3)
+    u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
+    v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
+    grid = torch.stack([u, v], -1).clamp_(-3, 3)
+    shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
+    (mean, spread), (their_mean, their_spread) = moments, moments_of(shown, window)
+    return 1 - (box_means(shown * own, window) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
+
+
+def box_means(maps: torch.Tensor, window: int = WINDOW) -> torch.Tensor:
+    """Means over squares of a side of maps `[N, h, w]`."""
+    half = window // 2
+    for axis in (1, 2):
+        size = maps.shape[axis]
+        first, last = maps.narrow(axis, 0, 1), maps.narrow(axis, size - 1, 1)
+        wide = torch.cat([*[first] * half, maps, *[last] * half], axis)
+        maps = wide.narrow(axis, 0, size).clone()
+        for shift in range(1, window):
+            maps += wide.narrow(axis, shift, size)
+    return maps.mul_(1 / window**2)
+
+
+def moments_of(maps: torch.Tensor, window: int = WINDOW) -> tuple[torch.Tensor, torch.Tensor]:
+    """Means and standard deviations over squares, the latter with noise."""
+    mean = box_means(maps, window)
+    return mean, (box_means(maps * maps, window) - mean * mean).clamp_min(0).add(FLAT * FLAT).sqrt()

@@ -139,21 +139,6 @@ def test_a_long_way_is_looked_at_more_often():
     assert _chosen(plates, [np.zeros((0, 3))] * 41) == []
 
 
-def test_of_several_points_in_a_pixel_the_last_counts_on_any_number_of_threads():
-    plate = stereo.Plate(torch.zeros(6, 8), (8.0, 8.0), (4.0, 3.0), np.eye(4), torch.zeros(6, 8, 2), np.ones((6, 8), bool))
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 40, 20_000)
-    points = np.stack([rng.uniform(-0.5, 0.5, 20_000), rng.uniform(-0.375, 0.375, 20_000), np.ones(20_000)], 1) * depth[:, None]
-    row, column, z, inside = plate.shown(points)
-    last = np.zeros((6, 8))
-    for r, c, d in zip(row[inside], column[inside], z[inside], strict=True):
-        last[r, c] = d
-    cost = torch.zeros(6, 8, stereo.PLANES)
-    stereo._pin(cost, plate, points, 0.02)
-    away = np.abs(np.arange(stereo.PLANES) - 1 / last[..., None] / 0.02)
-    np.testing.assert_allclose(cost.numpy(), stereo.PINNED * np.minimum(away / 2, 1), atol=1e-4)
-
-
 def test_the_ground_is_as_far_as_rays_have_to_go_to_it():
     heights = torch.zeros(400, 400)
     ground = Ground(heights, (-100.0, -100.0), 0.5)
