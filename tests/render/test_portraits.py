@@ -106,6 +106,36 @@ def test_a_photo_that_splats_explain_adds_nothing_whatever_its_size(street):
     assert (better(found) - frame.rgb.clamp(0, 1)).abs().max() < 2 / 255
 
 
+def told_by(street, taken, pixels):
+    """What a photo with other pixels tells of the car on the street, from where it was taken."""
+    scene = standing(street, replace(car(), photos=(AssetPhoto(taken.camera, lambda: pixels),)))
+    there = replace(taken.camera, world_from_cam=scene.actors[1].trajectory.world_from_body[0] @ taken.camera.world_from_cam)
+    (found,) = References([], scene).along([render_frame(scene, there, READS)])
+    return found
+
+
+def test_of_what_a_photo_shows_in_part_only_nothing_is_told(street):
+    """Half of an asset behind glass, whose colour must not count: as if that half had not been seen at all."""
+    taken = photographed(painted(), 160)
+    whole, glass, hidden = (taken.read().copy() for _ in range(3))
+    right = slice(taken.camera.width // 2, None)
+    glass[:, right, :3], glass[:, right, 3] = (255, 0, 0), (0.8 * glass[:, right, 3]).astype(np.uint8)
+    hidden[:, right] = 0
+    shown, dimmed, absent = (told_by(street, taken, pixels) for pixels in (whole, glass, hidden))
+    assert shown.trust[:, right].max() > 0.5 and dimmed.trust[:, : right.start - 1].max() > 0.5
+    assert not absent.trust[:, right.start + 1 :].any()
+    assert torch.equal(dimmed.trust, absent.trust) and torch.equal(dimmed.reference, absent.reference)
+
+
+def test_what_a_photos_mask_says_beyond_the_splats_does_not_count(street):
+    """A mask that takes in the bright wall behind the asset: its colours would be taken for the asset's light."""
+    taken = photographed(painted(), 160)
+    loose = taken.read().copy()
+    loose[loose[..., 3] == 0] = 255
+    found, wanted = told_by(street, taken, loose), told_by(street, taken, taken.read())
+    assert wanted.trust.max() > 0.5 and torch.equal(found.trust, wanted.trust) and torch.equal(found.reference, wanted.reference)
+
+
 def test_exposure_and_light_of_the_photo_stay_behind(street):
     alike, truth, mine = seen(street, [photographed(painted(), d) for d in REAR])
     darker, _, _ = seen(street, [photographed(painted(), d, gain=0.6) for d in REAR])

@@ -11,6 +11,7 @@ from PIL import Image
 from render import render_frame
 from render.album import keep_photos, references_of, shots_in
 from render.compare import psnr
+from render.frame_types import Frame
 from render.rays import camera_rays
 from render.references import COVERED, GONE, READS, RIM, References, Shot
 from render.video import to_bytes
@@ -117,6 +118,11 @@ def test_the_sky_of_a_photo_is_that_behind_a_haze(street):
     assert faint.sum() > 100 and found.trust[faint].float().mean() > 0.5
 
 
+def stands_near(frame: Frame) -> torch.Tensor:
+    """bool `[H, W]`: where something stands, or so near to it that the sky there is not told."""
+    return torch.nn.functional.max_pool2d((frame.alpha > COVERED).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+
+
 def at_hand(street) -> Camera:
     return street.camera(CAMERA, int(street.frame_times(CAMERA)[3]))
 
@@ -152,7 +158,7 @@ def test_sky_is_believed_where_photos_agree_and_nothing_stands_near(street):
     later = aside(camera, 0.0, 1)
     (alike,) = References([Shot(camera, snow), Shot(later, snow)], street).along([frame])
     (apart,) = References([Shot(camera, snow), Shot(later, lambda w, h: snow(w, h)[::-1].copy())], street).along([frame])
-    stands = torch.nn.functional.max_pool2d((frame.alpha > COVERED).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+    stands = stands_near(frame)
     sky, inside = frame.instance < 0, torch.zeros_like(stands)
     rim = camera.width // 16
     inside[rim:-rim, rim:-rim] = True  # towards its border a photo's sky fades
@@ -262,6 +268,65 @@ def test_an_actor_that_was_removed_leaves_no_ghost(street, unclear):
     truth = [f.rgb for f in views(replace(street, actors=()), times)]
     for f, car, t in zip(found, there, truth, strict=True):
         assert car.sum() > 20 and psnr(better(f), t, car) > psnr(f.rgb, t, car) - 0.5
+
+
+def before_the_sky(street: Scene) -> Scene:
+    """The street without houses: its car, 5 m tall then, stands before the sky."""
+    g = street.background.gaussians
+    (actor,) = street.actors
+    tall = replace(actor.asset.gaussians, means=actor.asset.gaussians.means * torch.tensor([1.0, 1.0, 3.3]))
+    actor = replace(actor, asset=replace(actor.asset, gaussians=tall))
+    return replace(street, background=replace(street.background, gaussians=g.select(g.means[:, 2] < 0.1)), actors=(actor,))
+
+
+def test_an_actor_that_was_removed_leaves_no_rim_in_the_sky(street):
+    """Where a photo shows it, and beside it, nothing is known of the sky behind."""
+    recorded = before_the_sky(street)
+    camera = recorded.camera(CAMERA, int(street.frame_times(CAMERA)[6]))
+    stands = render_frame(recorded, camera, ("alpha", "instance"))
+    empty = replace(recorded, actors=())
+    frame = render_frame(empty, camera, READS)
+    (found,) = References([Shot(camera, snow)], recorded, empty).along([frame])
+    near = stands_near(stands)
+    behind = near & (frame.instance == -1) & (render_frame(empty, camera, ("alpha",)).alpha == 0)
+    rim = behind & (stands.instance == -1)
+    assert behind.sum() > 100 and rim.sum() > 20 and not found.trust[behind].any()
+    assert found.trust[(frame.instance == -1) & ~near].max() > 0.5
+
+
+def test_what_nobody_knew_in_the_frame_before_is_not_carried_over(street):
+    """Sky that a car stood before then is told now as if there had been no frame before."""
+    scene = before_the_sky(street)
+    times = [int(street.frame_times(CAMERA)[i]) for i in (5, 7)]
+    first, second = (render_frame(scene, replace(scene.camera(CAMERA, times[1]), time_us=t), READS) for t in times)
+    references = References([Shot(second.camera, snow)], scene)
+    (alone,) = references.along([second])
+    _, carried = references.along([first, second])
+    freed = stands_near(first) & (first.instance == -1) & ~stands_near(second)
+    assert freed.sum() > 10 and alone.trust[freed].max() > 0.5
+    assert torch.equal(carried.trust[freed], alone.trust[freed])
+
+
+def test_an_actor_keeps_its_detail_when_one_before_it_is_removed(street, unclear):
+    """Though its number changes."""
+    first = replace(unclear.actors[0], track="first", trajectory=unclear.actors[0].trajectory.shifted(forward=-12.0))
+    both = replace(unclear, actors=(first, *unclear.actors))
+    frames = views(unclear, street.frame_times(CAMERA)[7:8])
+    (found,), (wanted,) = (References(shots(street), s, unclear).along(frames) for s in (both, unclear))
+    mine = frames[0].instance == 1
+    assert wanted.trust[mine].mean() > 0.3 and (found.trust - wanted.trust)[mine].abs().mean() < 0.02
+
+
+def test_a_reference_is_a_picture_and_trust_a_share(street):
+    """Though a cubic overshoots where it carries what is known beside what is not, and a frame is brighter than the photo was."""
+    ego = np.random.default_rng(2).random((9, 16)) > 0.5
+    camera = at_hand(street)
+    black_and_white = Shot(camera, lambda w, h: np.where(snow(w, h) > 120, 255, 0).astype(np.uint8), ego)
+    brighter = torch.cat([torch.eye(3) * 1.5, torch.zeros(3, 1)], 1)
+    frames = [render_frame(street, replace(aside(camera, 0.05 * i), exposure=brighter), READS) for i in range(3)]
+    for found in References([black_and_white], street).along(frames):
+        for told in (found.trust, found.reference):
+            assert told.min() >= 0 and 0.5 < told.max() <= 1
 
 
 def test_what_stands_in_an_actors_place_is_not_given_its_detail(street):

@@ -281,6 +281,33 @@ def test_parallel_rays_show_a_shadow_where_it_lies(street):
     assert (float(x), float(y)) == pytest.approx((64 + 3 * 8, 64 + 2 * 8), abs=0.5)
 
 
+@pytest.mark.parametrize("heading", [90, 144])
+def test_a_turned_asset_casts_the_shade_of_its_turned_shape(street, heading):
+    """As one that was built turned: a board that is a few flat splats, near one corner of its footprint, under a low sun."""
+    half, low = math.radians(heading) / 2, torch.full((32, 64, 3), 0.1)
+    low[12, 20] = 2000.0  # 20 degrees high
+    bare = replace(open_street(street), sky=Sky(low), actors=())
+    n = 4
+    board = Gaussians(
+        torch.stack([torch.linspace(0.0, 1.5, n), torch.full((n,), 1.2), torch.full((n,), 0.9)], 1),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        torch.tensor([0.4, 0.01, 0.5]).log().repeat(n, 1),
+        torch.full((n,), 4.0),
+        torch.zeros(n, 1, 3),
+    )
+    asset = replace(CAR, gaussians=board, size=torch.tensor([4.0, 4.0, 1.5], dtype=torch.float64))
+    built = replace(asset, gaussians=moved(board, pose_from([math.cos(half), 0, 0, math.sin(half)], [0, 0, 0]), Path("board")))
+    down = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    down[:3, 3] = torch.tensor([12.0, 0.0, 12.0])
+    camera, light = Camera(Orthographic(8.0, 8.0, 64.0, 64.0), 128, 128, down, time_us=START_US), []
+    for one, angle in ((built, 0.0), (asset, 2 * half), (asset, 0.0)):
+        scene = insert(bare, one, Placement("board", 12, 0, yaw=angle)).scene
+        light.append(cast(on_ground(camera), shadow_casters(scene, camera))[..., 0])
+    as_built, turned, unturned = light
+    assert as_built.min() < 0.6
+    assert (turned - as_built).abs().mean() < 0.1 * (unturned - as_built).abs().mean()
+
+
 @pytest.mark.parametrize("shutter", ["rows", "columns"])
 def test_a_shadow_stays_below_its_asset_while_the_shutter_moves(street, shutter):
     ahead = insert(replace(open_street(street), sky=None), CAR, Placement("car", 9, -1, yaw=math.pi / 2, speed=15.0)).scene
