@@ -1,15 +1,21 @@
-"""Need: nothing where a photo stood, more the further from it, everything where something was put."""
+"""Need: nothing where a photo stood, more the further from it, everything where something was put; and of scenes by lot, as defined."""
 
+import math
+import random
 from dataclasses import replace
 
 import pytest
 import torch
 
-from render import rasterize, render_clip, render_frame
-from render.need import far_from_photos, support_fields
-from scenes import Camera, Equirectangular, Gaussians, Pinhole, Placed
-from scenes.poses import translation
+from render import RenderConfig, rasterize, render_clip, render_frame
+from render.need import ASIDE, COARSE, FACING, STRETCHED, far_from_photos, support_fields
+from scenes import Actor, Asset, Camera, Equirectangular, Gaussians, Pinhole, Placed, RigCamera, Scene, Trajectory
+from scenes.poses import inverse, pose_from, translation
+from tests import oracle
 from tests.bench.presets import random_splats
+from tests.render.test_lenses import HEIGHT, LENSES, WIDTH
+from tests.render.test_rasterize import largest
+from tests.render.test_shutter import PINHOLE
 
 NEVER = torch.eye(4, dtype=torch.float64)
 
@@ -93,3 +99,69 @@ def test_need_is_not_asked_of_splats_without_a_scene():
     camera = Camera(Pinhole(20.0, 20.0, 10.0, 10.0), 20, 20, translation(0, 0, -5))
     with pytest.raises(ValueError, match="render_frame"):
         rasterize(random_splats(3, 0), camera, ("need",))
+
+
+def scene_by_lot(dice: random.Random, sky) -> Scene:
+    """Splats of all shapes, and before them a thing that was recorded or inserted; a rig of two cameras that took two photos each."""
+    seed = dice.randrange(1000)
+    cloud, few = (random_splats(count, seed) for count in (100, 30))
+    shapes = [1.2 * torch.randn(len(g), 3, generator=torch.Generator().manual_seed(seed)) for g in (cloud, few)]
+    cloud, few = (replace(g, log_scales=g.log_scales + shape) for g, shape in zip((cloud, few), shapes, strict=True))
+    stands = pose_from([1, 0.1, dice.uniform(-1, 1), 0], [dice.uniform(-2, 2), dice.uniform(-1, 1), dice.uniform(2.5, 4)])
+    asset = Asset(replace(few, means=0.4 * few.means), (1.0, 1.0, 1.0), "car", meta={"inserted": dice.random() < 0.7})
+    times, lens = torch.tensor([0, 500_000]), Pinhole(48.0, 48.0, 28.0, 20.0)
+    mounts = {"front": pose_from([1, 0, 0, 0], [0.1, 0, 0]), "side": pose_from([1, 0, dice.uniform(-1, 1), 0], [0.1, 0, 0])}
+    rig = {name: RigCamera(lens, WIDTH, HEIGHT, mount, times_us=times) for name, mount in mounts.items()}
+    ego = Trajectory(times, torch.stack([translation(), translation(0.2, 0.0, dice.uniform(-0.5, 1.5))]))
+    background = Placed(cloud, pose_from([1, 0.1, 0.2, 0.05], [0.1, 0.2, 6.0]))
+    return Scene(background, (Actor(asset, Trajectory(torch.tensor([0]), stands[None]), "a"),), sky, ego, rig)
+
+
+def needed(scene: Scene, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Need `[H, W]` by its definition, of the oracle's picture, and where that is sure."""
+    placed = scene.placed(camera.time_us)
+    truth = oracle.as_oracle(placed)
+    for (fields, *_), p in zip(truth, placed, strict=True):
+        axes = p.gaussians.log_scales.double().exp().sort(1).values
+        pose = inverse(camera.world_from_cam) @ p.world_from_local
+        depth = camera.lens.depth(p.gaussians.means.double() @ pose[:3, :3].T + pose[:3, 3])
+        sigma = max(camera.lens.focal()) * axes[:, 1] / depth.clamp_min(0.1)
+        fields["features"] = torch.stack([smooth(sigma, COARSE), smooth(axes[:, 2] / axes[:, 1], STRETCHED)], 1)
+    with torch.no_grad():
+        _, alpha, depth, instance, unsure, unfit = oracle.render(
+            truth, camera, scene.model_for(camera), cutoff=1 / 255, alpha_max=0.999, features=True
+        )
+    eye, ahead = camera.world_from_cam[:3, 3], camera.world_from_cam[:3, 2]
+    sight = camera.lens.unproject(camera.pixel_centres()) @ camera.world_from_cam[:3, :3].T
+    points = eye + sight * depth.where(alpha > 0, 1.0)[..., None]
+    looks = sight if camera.lens.limit() > math.pi / 2 else ahead.expand_as(sight)
+    aside = torch.full_like(depth, math.pi)
+    for photo in (scene.camera(name, int(t)).world_from_cam for name in scene.rig for t in scene.frame_times(name)):
+        seen = angle(looks, photo[:3, 2]) < math.acos(FACING)
+        aside = torch.where(seen, torch.minimum(aside, angle(eye - points, photo[:3, 3] - points)), aside)
+    holes = 1 - alpha if scene.sky is None else 4 * alpha * (1 - alpha)
+    put_in = torch.isin(instance, torch.tensor(scene.anew()))
+    supported = (1 - alpha * smooth(aside, ASIDE)) * (1 - holes) * (1 - unfit.clamp(0, 1)).prod(-1) * ~put_in
+    return 1 - supported, ~unsure & ((alpha - 0.5).abs() > 1e-4)
+
+
+def smooth(value: torch.Tensor, span: tuple[float, float]) -> torch.Tensor:
+    u = ((value - span[0]) / (span[1] - span[0])).clamp(0, 1)
+    return 3 * u**2 - 2 * u**3
+
+
+def angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return torch.atan2(torch.linalg.cross(a, b.expand_as(a)).norm(dim=-1), (a * b).sum(-1))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_need_of_scenes_by_lot_is_what_it_is_defined_to_be(street, seed):
+    dice = random.Random(seed)
+    scene = scene_by_lot(dice, dice.choice([None, street.sky]))
+    lens = dice.choice([PINHOLE, LENSES["opencv"], LENSES["fisheye"], LENSES["equirectangular"]])
+    pose = pose_from([1, dice.uniform(-0.05, 0.05), dice.uniform(-0.3, 0.3), 0], [dice.uniform(-1.5, 1.5), 0.1, dice.uniform(-0.5, 0.5)])
+    camera = Camera(lens, WIDTH, HEIGHT, pose)
+    wanted, sure = needed(scene, camera)
+    found = render_frame(scene, camera, ("need",), shadows=False, config=RenderConfig(termination=0)).need
+    assert sure.float().mean() > 0.9 and wanted.max() - wanted.min() > 0.5
+    assert largest(found, wanted, sure) < 1e-5, lens.kind

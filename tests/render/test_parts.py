@@ -1,14 +1,18 @@
-"""Crops, masks and many cameras: each the same bits as the whole, at a part of the work."""
+"""Crops, masks and many cameras: each the same bits as the whole, at a part of the work; and many cameras as the oracle draws each."""
 
+import random
 from dataclasses import replace
 
 import pytest
 import torch
 
 from render import RenderConfig, rasterize
-from scenes import Camera, Pinhole
+from scenes import Camera, Gaussians, Pinhole, Placed, SplatModel
 from scenes.poses import pose_from, translation
-from tests.render.test_rasterize import two_instances
+from tests import oracle
+from tests.render.test_lenses import LENSES, around
+from tests.render.test_rasterize import EXACT, largest, two_instances
+from tests.render.test_shutter import PINHOLE, driven, traffic, turned
 
 CAMERA = Camera(Pinhole(120.0, 122.0, 65.0, 40.0), 139, 75, torch.eye(4, dtype=torch.float64))
 NAMES = ("rgb", "alpha", "depth", "median_depth", "normal", "features", "instance", "instance_alpha", "flow_next", "visible_next")
@@ -95,3 +99,40 @@ def test_a_rig_of_ragged_cameras_is_drawn_in_one_call_as_one_by_one():
     assert [tuple(f.rgb.shape) for f in together] == [(30 + i, 40 + 3 * i, 3) for i in range(7)]
     for camera, frame in zip(rig, together, strict=True):
         assert torch.equal(frame.rgb, rasterize(placed, camera).rgb)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_batch_of_what_was_placed_by_lot_is_drawn_as_the_oracle_draws_each_camera(seed):
+    """Among the placed the same splats twice, and none at all; of the cameras one moves."""
+    dice = random.Random(seed)
+    placed = dice.choice([two_instances, around, traffic])(seed)
+    again, end = dice.choice(placed), translation(0.2, 0.0, -0.1)
+    way = translation(dice.uniform(-2, 2), dice.uniform(-1, 1), dice.uniform(0, 2)) @ turned(dice.uniform(-90, 90))
+    pose = again.world_from_local @ way
+    placed += [Placed(again.gaussians, pose, dice.choice([None, end @ pose]), instance=7)]
+    placed.insert(dice.randrange(3), Placed(Gaussians.empty(), pose, instance=5))
+    features = [torch.eye(4)[i].expand(len(p.gaussians), -1) for i, p in enumerate(placed)]
+    rig = [driven(dice.choice([PINHOLE, *LENSES.values()]), "rows", dice.uniform(0, 30), dice.uniform(-60, 60)) for _ in range(2)]
+    rig[1] = replace(rig[1], world_from_cam_end=None)
+    model = SplatModel(antialias=dice.random() < 0.5)
+    names = ("rgb", "alpha", "depth", "instance", "instance_alpha", "features")
+    frames = rasterize(placed, rig, names, model=model, features=features, config=EXACT)
+    for camera, frame in zip(rig, frames, strict=True):
+        truth = oracle.as_oracle(placed)
+        for (fields, *_), field in zip(truth, features, strict=True):
+            fields["features"] = field.double()
+        with torch.no_grad():
+            rgb, alpha, depth, _, unsure, sums = oracle.render(
+                truth, camera, model, cutoff=1e-8, alpha_max=0.999, features=True,
+                world_from_cam_end=camera.world_from_cam_end, ends=[p.world_from_local_end for p in placed],
+            )  # fmt: skip
+        sure, solid = ~unsure, ~unsure & (alpha > 0.01)
+        assert sure.float().mean() > 0.9 and alpha.max() > 0.5
+        for name, reference in {"rgb": rgb, "alpha": alpha, "features": sums, "instance_alpha": sums}.items():
+            off = largest(getattr(frame, name), reference, sure)
+            assert off < 5e-6 * max(1.0, float(reference.max())), f"{name} of {camera.lens.kind} is off by {off:.1e}"
+        assert largest(frame.depth / depth, torch.ones_like(depth), solid) < 1e-5
+        most, who = sums.max(-1)
+        told = sure & (most > 0.5 * alpha + 1e-4) & ((alpha - 0.5).abs() > 1e-4)  # else another may be told
+        whose = torch.where(alpha < 0.5, -1, torch.tensor([p.instance for p in placed])[who])
+        assert told.float().mean() > 0.1 and torch.equal(frame.instance[told].long(), whose[told])
