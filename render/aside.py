@@ -1,5 +1,5 @@
-"""How far aside of the recorded path a camera can go before it is behind a wall or off the known ground, and a car before it runs into
-something."""
+"""How far aside of the recorded path a camera can go before it is behind a wall, off the known ground or farther than is measured, and a
+car before it runs into something."""
 
 from __future__ import annotations
 
@@ -47,6 +47,9 @@ UNSEEN = 0.05
 
 STEP = 0.5
 """Metres, of which the largest shift is told in whole ones: it is measured no better."""
+
+MEASURED = 3.0
+"""Metres aside up to which it is measured how well views hold (`recon/evaluation/offpath.py`)."""
 
 
 @torch.no_grad()
@@ -132,8 +135,9 @@ def path_warning(scene: Scene, recorded: Sequence[Camera], path: float | Traject
         return []
     looks = spread(recorded, LOOKS)
     if not isinstance(path, Trajectory):
-        return _beyond(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
-    where = _beyond(scene, looks, path, said) or _off(scene, looks, path, said) or _in_the_way(scene, looks, path, said)
+        return _beyond(scene, looks, path, said) or _in_the_way(scene, looks, path, said) + _far(scene, looks, path, said)
+    where = _beyond(scene, looks, path, said) or _off(scene, looks, path, said)
+    where = where or _in_the_way(scene, looks, path, said) + _far(scene, looks, path, said)
     return where + _turned(scene, looks, path, said)
 
 
@@ -154,7 +158,7 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
         fix = "stay nearer to the recorded path there"
         return [f"{said} goes beyond what was recorded: {after} {ends}, or the known ground ends, and what is behind is a guess; {fix}"]
     whole = STEP * math.floor(room / STEP)
-    fix = f"the largest shift that makes sense there is {math.copysign(whole, path):g}m" if whole else "no shift to that side makes sense"
+    fix = f"the largest shift short of that is {math.copysign(whole, path):g}m" if whole else "no shift to that side makes sense"
     return [
         f"{said} goes beyond what was recorded: {after} something stands, or the known ground ends, "
         f"{room + BEFORE:.1f} m to the {side} of the path, and what is behind is a guess; {fix}"
@@ -167,6 +171,18 @@ def _off(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) -> 
     if off is None:
         return []
     return [f"{said} leaves the known ground {_after(looks, off)}, and what is there is a guess; stay nearer to the recorded path"]
+
+
+def _far(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
+    """Told of an open street, too: cameras saw it from the recorded path only. Half a metre is let pass, for a lane change."""
+    asides = [abs(_aside(scene, path, look.time_us)[1]) for look in looks]
+    most = max(asides)
+    if round(most, 1) <= MEASURED + STEP:
+        return []
+    after = _after(looks, looks[asides.index(most)].time_us)
+    where = f"is {most:.1f} m beside the recorded path, {after}" if isinstance(path, Trajectory) else "leads far beside the recorded path"
+    told = f"how well views hold is measured up to {MEASURED:g}m, and farther off they smear"
+    return [f"{said} {where}: {told}; stay within {MEASURED:g}m of it"]
 
 
 def _turned(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) -> list[str]:

@@ -8,6 +8,8 @@ from street import START_US, box, car
 from render.aside import path_warning, room_aside, sight_warning
 from render.clip import clip_cameras
 from scenes import Actor, Asset, Gaussians, OpenCV, Trajectory
+from scenes.ego_path import changing_lane
+from scenes.lateral import parse_lateral
 from scenes.poses import translation, yaw
 
 CAMERA = "front_camera"
@@ -27,9 +29,13 @@ def test_a_camera_can_go_aside_up_to_the_houses(street):
     assert room(street, True, reach=3.0) == 3
 
 
-def test_where_nothing_stands_the_known_ground_ends(street):
+def without_houses(street):
     g = street.background.gaussians
-    bare = replace(street, background=replace(street.background, gaussians=g.select(g.means[:, 2] < 0.1)))
+    return replace(street, background=replace(street.background, gaussians=g.select(g.means[:, 2] < 0.1)))
+
+
+def test_where_nothing_stands_the_known_ground_ends(street):
+    bare = without_houses(street)
     assert room(bare, True) == pytest.approx(19, abs=0.5) and room(bare, False) == pytest.approx(20, abs=0.5)
 
 
@@ -39,13 +45,34 @@ def test_what_drives_beside_the_path_is_in_nobodys_way(street):
     assert room(replace(street, actors=(beside,)), True) == room(street, True)
 
 
-def test_a_shift_to_where_nothing_was_recorded_is_told_with_the_largest_that_makes_sense(street):
+def test_a_shift_to_where_nothing_was_recorded_is_told_with_the_largest_short_of_it(street):
     (said,) = told(street, 500.0)
     assert "500m goes beyond" in said and "m to the left of the path" in said
     largest = float(said.rpartition(" is ")[2].rstrip("m"))
-    assert 7 <= largest <= 8 and not told(street, largest) and not told(street, -largest) and not told(street, 0.0)
+    assert 7 <= largest <= 8 and not any("beyond" in said for shift in (largest, -largest, 0.0) for said in told(street, shift))
     (said,) = told(street, -500.0)
     assert "to the right" in said and said.endswith(f"is {-largest:g}m")
+
+
+def test_over_an_open_street_too_a_shift_farther_than_is_measured_is_told(street):
+    """But not one by a lane."""
+    bare = without_houses(street)
+    assert not told(bare, 3.5) and not told(bare, -3.5)
+    for shift in (5.0, -12.0):
+        (said,) = told(bare, shift)
+        assert said.startswith(f"--lateral-shift {shift:g}m leads far beside the recorded path") and said.endswith("stay within 3m of it")
+
+
+def test_a_lane_change_that_leads_farther_than_is_measured_says_when(street):
+    bare = without_houses(street)
+
+    def over_by(left):
+        path, _ = changing_lane(street.ego, parse_lateral(f"0m@0s,{left}m@300ms"), START_US, START_US + 700_000)
+        return path_warning(bare, clip_cameras(bare, CAMERA), path, "--lateral-shift")
+
+    assert not over_by(3.5)
+    (said,) = over_by(-8)
+    assert said.startswith("--lateral-shift is 8.0 m beside the recorded path, 0.3s after the clip's first frame: ")
 
 
 def test_beside_a_wall_no_shift_makes_sense(street):
