@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from street import START_US, car
+from street import START_US, box, car
 from street import street as made_street
 
 from recon.log import Track
@@ -158,6 +158,21 @@ def test_houses_keep_the_sun_off(street, turn):
         scene = insert(replace(scene, sky=Sky(high)), CAR, Placement("car", 12, 0)).scene
         caster = shadow_casters(scene, scene.camera("front_camera", START_US))[0]
         assert least <= at(caster.field(), 0.0, -2.2) <= most
+
+
+def test_a_roof_keeps_light_off_a_turned_asset_where_its_end_reaches(street):
+    """And not where that would be if it were turned the other way."""
+    bare, reaches = replace(open_street(street), sky=None, actors=()), 5 * math.sqrt(0.5)
+    long = replace(CAR, size=torch.tensor([10.0, 1.0, 1.5], dtype=torch.float64))
+    result = insert(bare, long, Placement("truck", 12, 0, yaw=math.pi / 4))
+    light, (x, y) = {}, result.actor.trajectory.world_from_body[0, :2, 3].tolist()
+    for side in (-1, 1):
+        roof = box((3.0, 3.0, 0.2), (0.5, 0.5, 0.5))
+        roof = replace(roof, means=roof.means + torch.tensor([x + reaches, y + side * reaches, 2.5]))
+        g = Gaussians.cat([bare.background.gaussians, roof])
+        scene = replace(result.scene, background=replace(bare.background, gaussians=g))
+        light[side] = float(Shade(scene).at(result.actor, START_US)[1].sum())
+    assert light[1] < 0.9 * light[-1]
 
 
 def test_only_what_the_light_would_reach_is_darkened(street):
