@@ -20,7 +20,7 @@ PLANES = 96
 CHUNK = 16
 """Planes that are looked at together: what they need stays in the cache."""
 
-LEANING = 9
+LEANING = 7
 """Side of the squares that are correlated on the road and on walls. What faces the picture is smaller than the squares of such surfaces may
 be, and on these, seen askance, smaller ones hold too little."""
 
