@@ -43,7 +43,7 @@ FEWEST, ALIKE, PEAK = 12, 0.3, 0.05
 TOLD, EVERY = 200, 4.0
 """Points under the path that are needed to say where the road is, and metres of it over which the middle of them is taken."""
 
-WAVES = 0.06
+WAVES = 0.03
 """Metres off its middle up to which the road is taken to be where points show it."""
 
 WIDE = 4.0
