@@ -40,6 +40,9 @@ STRAY, STRAY_IN_PICTURES = 0.02, 0.3
 """How many points are there all the same, in parts of those that lie on it: of lidar's, and of those on which pictures agree, which are a
 decimetre off a road."""
 
+ALONG, LEVELS = 2.0, 20.0
+"""Metres of the path by which its steepness is told; and how far it goes on beyond the path's ends."""
+
 STEEPEST = 0.2
 """Metres by which ground may rise or fall with every metre away from the path."""
 
@@ -57,23 +60,27 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     cell = max(CELL, float(np.sqrt((high - low).prod() / MOST)))
     shape = tuple(int(n) for n in np.ceil((high - low) / cell)[::-1] + 1)
     distance, level = _beside(path, low, shape, cell)
-    heights = np.full(shape, np.nan)
+    off = np.full(shape, np.nan)
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
     column, row = np.round((points[:, :2] - low) / cell).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
-    near = np.abs(points[:, 2] - level[row, column]) < 4 + STEEPEST * distance[row, column]
-    points, place = points[near], (row * shape[1] + column)[near]
+    above = points[:, 2] - _ground(level, low, cell).height(torch.from_numpy(points[:, :2])).numpy()
+    near = np.abs(above) < 4 + STEEPEST * distance[row, column]
+    points, above, place = points[near], above[near], (row * shape[1] + column)[near]
+    # what is sorted, filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
     if len(points):
-        order = np.lexsort((points[:, 2], place))
+        order = np.lexsort((above, place))
         cells, first, counts = np.unique(place[order], return_index=True, return_counts=True)
-        heights.flat[cells] = points[order, 2][first + (counts * 0.05).astype(np.int64)]
-    off = heights - level
+        off.flat[cells] = above[order][first + (counts * 0.05).astype(np.int64)]
     close = np.isfinite(off) & (distance < CLOSE)
     known = off[close] if close.any() else off[np.isfinite(off)]
-    level = level + (float(np.percentile(known, 30)) if len(known) else 0.0)
-    # what is filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
-    heights = level + _filled(_without_objects(heights - level, distance, cell), 0.0, cell)
-    ground = Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
+    usual = float(np.percentile(known, 30)) if len(known) else 0.0
+    heights = level + usual + _filled(_without_objects(off - usual, distance, cell), 0.0, cell)
+    ground = _ground(heights, low, cell)
     return replace(ground, heights=ground.heights + _noise_under(points, place, ground)) if len(points) else ground
+
+
+def _ground(heights: np.ndarray, low: np.ndarray, cell: float) -> Ground:
+    return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
 
 
 def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> torch.Tensor:
@@ -112,18 +119,30 @@ def _noise_under(points: np.ndarray, place: np.ndarray, ground: Ground) -> torch
 
 
 def _beside(path: np.ndarray, low: np.ndarray, shape: tuple[int, ...], cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Each cell's distance from the path in metres, and the path's height where it is nearest."""
+    """Each cell's distance from the path in metres, and the path's height where it is nearest; beyond its ends it goes on as steeply, and
+    levels out by and by."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
     moving = np.concatenate([[True], np.diff(way) > 1e-6])  # np.interp wants a way that rises
-    at = np.linspace(0.0, way[-1], max(2, int(2 * way[-1] / cell)))
+    at, step = np.linspace(0.0, way[-1], max(2, int(2 * way[-1] / cell)), retstep=True)
     fine = np.stack([np.interp(at, way[moving], path[moving, k]) for k in range(3)], 1)
     column, row = np.round((fine[:, :2] - low) / cell).astype(np.int64).T
-    count, total = np.zeros(shape), np.zeros(shape)
+    count, total = np.zeros(shape), np.zeros((*shape, 6))
     np.add.at(count, (row, column), 1)
-    np.add.at(total, (row, column), fine[:, 2])
+    np.add.at(total, (row, column), np.concatenate([fine, _ways(fine, float(step))], 1))
     distance, nearest = ndimage.distance_transform_edt(count == 0, return_indices=True)
-    level = total / np.maximum(count, 1)
-    return distance * cell, level[tuple(nearest)]
+    *here, z, ahead_x, ahead_y, steepness = np.moveaxis((total / np.maximum(count, 1)[..., None])[tuple(nearest)], 2, 0)
+    rows, columns = np.indices(shape)
+    ahead = (low[0] + cell * columns - here[0]) * ahead_x + (low[1] + cell * rows - here[1]) * ahead_y
+    return distance * cell, z + steepness * LEVELS * np.tanh(ahead / LEVELS)
+
+
+def _ways(fine: np.ndarray, step: float) -> np.ndarray:
+    """Directions in plan and steepness `[N, 3]` of a path along its points `[N, 3]`, so many metres apart, over `ALONG` metres; none of one
+    that stands."""
+    if step * len(fine) < ALONG:
+        return np.zeros_like(fine)
+    rises = ndimage.gaussian_filter1d(np.gradient(fine, axis=0), ALONG / step, axis=0, mode="nearest")
+    return rises / np.maximum(np.linalg.norm(rises[:, :2], axis=1), 1e-9)[:, None]
 
 
 def _without_objects(heights: np.ndarray, distance: np.ndarray, cell: float) -> np.ndarray:

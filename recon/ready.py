@@ -11,6 +11,7 @@ from recon.evaluation.offpath import held_out_sweeps
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
+from recon.objects.leaning import leaning
 from recon.registration.adjust import adjusted
 from recon.registration.align import aligned
 from recon.registration.corrected import as_corrected
@@ -72,13 +73,13 @@ def same_sweeps(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
 
 
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
-    """The log, with the movers that `sweeps` show where it has no boxes of its own."""
-    if log.tracks or not sweeps:
-        return log
-    with Progress("movers", total=len(sweeps)) as steps:
-        found = with_movers(log, sweeps, steps.step)
-    print(f"{log.path} has no boxes: its lidar shows {moving_things(len(found.tracks))}", file=sys.stderr)
-    return _moved_by(log, found.tracks)
+    """The log, with the movers that `sweeps` show where it has no boxes of its own; on a hill its boxes lean as the road does."""
+    if not log.tracks and sweeps:
+        with Progress("movers", total=len(sweeps)) as steps:
+            found = with_movers(log, sweeps, steps.step)
+        print(f"{log.path} has no boxes: its lidar shows {moving_things(len(found.tracks))}", file=sys.stderr)
+        log = _moved_by(log, found.tracks)
+    return leaning(log, sweeps)
 
 
 def moving_things(count: int) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
+from torch.nn import functional as F
 
 from scenes.poses import interpolate, yaw_of
 from scenes.scene import Scene
@@ -56,23 +58,41 @@ def _share(path: Trajectory, below: torch.Tensor, scene: Scene) -> torch.Tensor:
 
 def standing_pose(scene: Scene, xy: torch.Tensor, heading: float, size: torch.Tensor) -> torch.Tensor:
     """`world_from_asset` `[4, 4]` at a world point `[2]`, heading in radians, on the plane that fits the ground under its footprint."""
-    forward = torch.tensor([math.cos(heading), math.sin(heading)], dtype=torch.float64)
-    left = torch.stack([-forward[1], forward[0]])
+    headings = torch.tensor(heading, dtype=torch.float64)
+    height, rise, bank = plane_under(partial(ground_heights, scene), xy, headings, size)
+    return leaning_pose(torch.cat([xy, height[None]]), headings, rise, bank)
+
+
+def plane_under(
+    heights: Callable[[torch.Tensor], torch.Tensor], xy: torch.Tensor, headings: torch.Tensor, size: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The planes that fit `heights` of points `[..., P, 2]` under the footprint of a body of a size `[3]` at world points `[..., 2]`,
+    headings `[...]` in radians: heights there, and metres that they rise with every metre forward and left, `[...]` each."""
+    forward, left = _ways(headings)
     spread = torch.linspace(-0.4, 0.4, 5, dtype=torch.float64)
     u, v = torch.meshgrid(spread, spread, indexing="ij")
     along, across = (u * size[0]).reshape(-1), (v * size[1]).reshape(-1)
-    heights = ground_heights(scene, xy + along[:, None] * forward + across[:, None] * left)
+    under = heights(xy[..., None, :] + along[:, None] * forward[..., None, :] + across[:, None] * left[..., None, :])
     # the grid is symmetric about its centre, so the least-squares plane separates into a mean and two slopes
-    rise, bank = (along * heights).sum() / (along * along).sum(), (across * heights).sum() / (across * across).sum()
-    x_axis = torch.cat([forward, rise[None]])
-    x_axis = x_axis / x_axis.norm()
-    y_axis = torch.cat([left, bank[None]])
-    z_axis = torch.linalg.cross(x_axis, y_axis)
-    z_axis = z_axis / z_axis.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([x_axis, torch.linalg.cross(z_axis, x_axis), z_axis], 1)
-    pose[:2, 3], pose[2, 3] = xy, heights.mean()
+    return under.mean(-1), (along * under).sum(-1) / (along * along).sum(), (across * under).sum(-1) / (across * across).sum()
+
+
+def leaning_pose(places: torch.Tensor, headings: torch.Tensor, rise: torch.Tensor, bank: torch.Tensor) -> torch.Tensor:
+    """Poses `[..., 4, 4]` at places `[..., 3]`, headings in radians, on planes that rise so many metres with every metre forward and left,
+    `[...]` each."""
+    forward, left = _ways(headings)
+    x_axis = F.normalize(torch.cat([forward, rise[..., None]], -1), dim=-1)
+    z_axis = F.normalize(torch.linalg.cross(x_axis, torch.cat([left, bank[..., None]], -1)), dim=-1)
+    pose = torch.eye(4, dtype=torch.float64).repeat(*headings.shape, 1, 1)
+    pose[..., :3, :3] = torch.stack([x_axis, torch.linalg.cross(z_axis, x_axis), z_axis], -1)
+    pose[..., :3, 3] = places
     return pose
+
+
+def _ways(headings: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Forward and left in plan, `[..., 2]`."""
+    forward = torch.stack([headings.cos(), headings.sin()], -1)
+    return forward, torch.stack([-forward[..., 1], forward[..., 0]], -1)
 
 
 def ground_heights(scene: Scene, xy: torch.Tensor) -> torch.Tensor:

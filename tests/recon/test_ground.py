@@ -90,9 +90,9 @@ def test_every_cell_is_filled_even_far_from_any_point():
     assert torch.isfinite(ground.heights).all()
 
 
-def test_without_points_the_ground_goes_with_the_body():
+def test_without_points_the_ground_goes_with_the_body_and_on_beyond():
     ground = estimate_ground(np.zeros((0, 3)), path())
-    for x, z in ((0.0, 0.3), (10.0, 0.5), (19.0, 0.68), (60.0, 0.68)):
+    for x, z in ((0.0, 0.3), (10.0, 0.5), (19.0, 0.68), (24.0, 0.78), (-5.0, 0.2), (70.0, 1.08)):
         assert abs(float(ground.height(torch.tensor([x, 3.0]))) - z) < 0.02
 
 
@@ -115,6 +115,19 @@ def test_a_street_over_a_hill_is_found_all_along():
         for y in (-18, -5, 0, 5, 18):
             true = hill(x) + 0.06 * np.clip(abs(y), 6, 20)
             assert abs(float(ground.height(torch.tensor([float(x), float(y)]))) - true) < 0.2, (x, y)
+
+
+def test_a_steep_street_is_as_even_as_a_flat_one():
+    """It rises by a decimetre from cell to cell: taken at the cells' middles it would lie in steps."""
+    generator = np.random.default_rng(7)
+    poses = torch.stack([translation(float(x), 0.3 * float(x), 0.4 + 0.2 * float(x)) for x in np.linspace(0, 40, 60)])
+    xy = generator.uniform([-25, -20], [65, 40], (400_000, 2))
+    points = np.column_stack([xy, 0.2 * xy[:, 0] + generator.normal(0, 0.01, len(xy))])
+    ground = estimate_ground(points, Trajectory(torch.arange(60) * 100_000, poses))
+    at = torch.from_numpy(generator.uniform([-20, -15], [60, 35], (2000, 2)))
+    off = ground.height(at) - 0.2 * at[:, 0]
+    assert float(off.std()) < 0.006
+    assert float(off.abs().max()) < 0.03
 
 
 def test_a_car_that_stands_still_has_a_ground():
