@@ -10,9 +10,11 @@ import numpy as np
 import torch
 
 from recon.fit.model import Splats
-from recon.log import Log
+from recon.log import Log, Track
 from recon.movers.freespace import RangeImage, range_images
+from recon.objects.actors import SWEPT_MARGIN, inside
 from scenes.ground import Ground
+from scenes.poses import inverse
 from scenes.spread import spread
 
 LOOKS = 24
@@ -37,9 +39,13 @@ class Clear:
 
     @staticmethod
     def of(log: Log, span_us: tuple[int, int], ground: Ground) -> Clear:
-        """By some of a log's sweeps within a span of time."""
-        asked = spread(log.sweeps_within(span_us), LOOKS)
-        return Clear([image for _, image in range_images(log, ((s.time_us, s.read()) for s in asked))], ground)
+        """By some of a log's sweeps within a span of time. What they struck of what moves is not there."""
+        images = []
+        for sweep in spread(log.sweeps_within(span_us), LOOKS):
+            points = sweep.read()
+            moves = points.xyz[_in_boxes(points.xyz, [t for t in log.tracks if t.moving], sweep.time_us)]
+            images += [image.without(moves) for _, image in range_images(log, [(sweep.time_us, points)])]
+        return Clear(images, ground)
 
     def struck(self, points: np.ndarray) -> np.ndarray:
         """Whether more than `THERE` of the sweeps saw something where points `[N, 3]` are; bool `[N]`, of none where there is no lidar."""
@@ -70,3 +76,14 @@ class Clear:
         found = np.zeros(len(points), bool)
         found[asked[(through >= THROUGH) & (there <= THERE * through)]] = True
         return found
+
+
+def _in_boxes(xyz: np.ndarray, tracks: Sequence[Track], time_us: int) -> np.ndarray:
+    """Whether points `[N, 3]` are in the boxes of tracks at a time, or next to them: bool `[N]`."""
+    within = np.zeros(len(xyz), bool)
+    for track in tracks:
+        path = track.trajectory()
+        if path.covers(time_us):
+            back = inverse(path.at(time_us)).numpy()
+            within |= inside(xyz @ back[:3, :3].T + back[:3, 3], track.size, SWEPT_MARGIN)
+    return within

@@ -4,7 +4,7 @@ Revert")."""
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -24,6 +24,9 @@ BAND = 25.0
 FARTHER = 0.5, 0.02
 """Metres, and parts of the distance, that others must have seen farther than a point to have seen through it."""
 
+NEAREST = 0.05
+"""Metres by which a cell's range is that of a point in it."""
+
 AUDIBLE, ROW = 10.0, 0.1
 """Metres up to which whatever is there comes back, and the part of a row's cells that have a return where a lidar looks at all."""
 
@@ -34,7 +37,8 @@ TURN = 16
 @dataclass(frozen=True)
 class RangeImage:
     """What one lidar saw in a sweep: `range_m` `[H, W]`, how far it saw in each direction, elevation by azimuth in cells of `cell` degrees;
-    inf where nothing came back, as in its first row and its last. `clear_m` is the least of a cell and its eight neighbours, `told` how
+    inf where nothing came back, as in its first row and its last, -inf where what did is not
+    to count (`without`). `clear_m` is the least of a cell and its eight neighbours, `told` how
     many of them had a return. Rows begin `lowest` cells above straight down. `stood` `[W, 3]` is where it was when it looked at an azimuth,
     `middle` `[3]` where it was half-way."""
 
@@ -54,9 +58,17 @@ class RangeImage:
         """The same, where it has also seen through what is no farther than `AUDIBLE` if it looked there and nothing at all came back."""
         away, row, column = self._where(xyz)
         through, there = self._votes(away, row, column)
-        returned = np.isfinite(self.range_m)
+        returned = ~np.isposinf(self.range_m)
         looked = (returned.mean(1) > ROW)[row] & returned.any(0)[column]
         return through | (looked & (self.told[row, column] == 0) & (away < AUDIBLE)), there
+
+    def without(self, xyz: np.ndarray) -> RangeImage:
+        """The image as it would count what it saw at its points `[N, 3]` as seen, but as nothing that is there: they move."""
+        away, row, column = self._where(xyz)
+        nearest = np.abs(self.range_m[row, column] - away) < NEAREST
+        range_m = self.range_m.copy()
+        range_m[row[nearest], column[nearest]] = -np.inf
+        return replace(self, range_m=range_m)
 
     def _votes(self, away: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         margin = FARTHER[0] + FARTHER[1] * away

@@ -6,10 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_sweeps import drive, standing
+from made_sweeps import Box, drive, standing
 
 from recon.fit.clear import ABOVE, FAR, LOOKS, Clear
+from recon.log import Track
 from scenes.ground import Ground
+from scenes.poses import translation
 from tests.recon.test_swept import splats
 
 EVER = (-(10**9), 10**9)
@@ -45,6 +47,19 @@ def test_where_nothing_came_back_nothing_is_near():
     beside = (6.0, 3.0, 2.0)
     assert held(log, beside) == [True]
     assert held(replace(log, lidars={}), beside) == [False], "of a lidar that stands nobody knows where nothing is known"
+
+
+def test_what_drove_there_is_not_there():
+    """Of a car that pulled out a tenth of all sweeps and more struck its roof: a ghost of it, left standing there, must go."""
+    size = (4.4, 1.8, 1.5)
+    log = drive([*THINGS, Box(size, lambda t: (12 + 10 * t, 3.0, 0.0))], count=12)
+    times = np.arange(12) * 100_000
+    boxes = torch.stack([translation(12 + 10 * t / 1e6, 3.0, 0.0) for t in times])
+    car = Track("veh_1", "car", True, np.array(size), times, boxes, np.zeros(12, np.int64), ("a",))
+    roof, wall = (13.0, 3.0, 1.45), (29.4, 3.0, 2.0)
+    assert held(log, roof, wall) == [False, False], "nobody knows that it is a car's"
+    assert held(replace(log, tracks=(car,)), roof, wall) == [True, False]
+    assert held(replace(log, tracks=(replace(car, moving=False),)), roof, wall) == [False, False]
 
 
 def test_a_drive_without_lidar_knows_nothing():
