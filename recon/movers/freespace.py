@@ -58,7 +58,7 @@ class RangeImage:
         """The same, where it has also seen through what is no farther than `AUDIBLE` if it looked there and nothing at all came back."""
         away, row, column = self._where(xyz)
         through, there = self._votes(away, row, column)
-        returned = ~np.isposinf(self.range_m)
+        returned = np.isfinite(self.range_m) | np.isneginf(self.range_m)
         looked = (returned.mean(1) > ROW)[row] & returned.any(0)[column]
         return through | (looked & (self.told[row, column] == 0) & (away < AUDIBLE)), there
 
