@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.log import FETCH, Log, LogCamera, SparsePoints, image_size, is_upright
+from recon.log import FETCH, Log, LogCamera, SparsePoints
 from recon.readers.colmap_model import Model, ModelCamera, is_model, read_model
 from recon.readers.gauge import find_gauge
 from recon.readers.moments import moments_of
@@ -21,7 +21,7 @@ from recon.readers.order import names_apart
 from recon.readers.stated import stating
 from scenes.lenses import Fisheye, Lens, OpenCV, Pinhole
 from scenes.names import nearest
-from scenes.pictures import opened
+from scenes.pictures import is_turned, opened
 from scenes.poses import CAM_FROM_FLU
 from scenes.trajectory import Trajectory
 
@@ -50,6 +50,9 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     if where is None:
         raise FileNotFoundError(f"{path} holds no COLMAP model; it has cameras.bin, images.bin and points3D.bin, as in {path / 'sparse/0'}")
     model = read_model(where)
+    if len(model.images) == 1:
+        fix = "make a model of more pictures, from different places"
+        raise ValueError(f"{where} registers one picture, {model.images[0].name}, and one has no depth; {fix}")
     names = camera_names(model)
     lead = _lead(model)
     moments, clock = moments_of(where, model, lead)
@@ -78,14 +81,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         for file in files:
             if not file.is_file():
                 raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file, files)}")
-        _check_upright(path, files)
-        found = model.cameras[key]
-        for file in files:
-            size = image_size(file)
-            if size != (found.width, found.height):
-                fix = f"put the pictures that the model was made of into {pictures}, or make a model of these"
-                taken = f"{file} is {size[0]}x{size[1]}, but the model in {where} has a camera of {found.width}x{found.height}"
-                raise ValueError(f"{taken}; {fix}")
+        _check_pictures(path, where, files, found := model.cameras[key])
         firsts.append(files[0])
         times = torch.tensor([moments[k] for k in chosen])
         cameras[names[key]] = LogCamera(names[key], lens_of(found, where), found.width, found.height, files, times, placed[chosen])
@@ -180,11 +176,17 @@ def _tell_masked(files: list[Path], masks: Path) -> None:
         print(f"{name} masks a part of the pictures, which is not heeded: all that they show is fitted", file=sys.stderr)
 
 
-def _check_upright(path: Path, files: tuple[Path, ...]) -> None:
-    """ValueError where COLMAP, which does not ask their EXIF data, took pictures as they are stored, and these say that is not upright:
-    up and the ground would be sought to the side."""
-    turned = next((file for file in files if not is_upright(file)), None)
-    if turned is not None:
-        fix = "turn them and make the model anew, or, if they are upright as they are stored, take the orientation out of their EXIF data"
-        fix = "delete it to begin again" if path.suffix == ".sfm" else fix
-        raise ValueError(f"{path} was made of photos as they are stored, and {turned.name} is not stored upright; {fix}")
+def _check_pictures(path: Path, where: Path, files: tuple[Path, ...], found: ModelCamera) -> None:
+    """ValueError where a picture is of another size than its camera in the model in `where`, or COLMAP, which does not ask their EXIF data,
+    took it as it is stored, and this says that is not upright: up and the ground would be sought to the side."""
+    for file in files:
+        with opened(file, str(file), FETCH) as picture:
+            turned, (width, height) = is_turned(picture), picture.size
+        if turned:
+            fix = "turn them and make the model anew, or, if they are upright as they are stored, take the orientation out of their EXIF data"
+            fix = "delete it to begin again" if path.suffix == ".sfm" else fix
+            raise ValueError(f"{path} was made of photos as they are stored, and {file.name} is not stored upright; {fix}")
+        if (width, height) != (found.width, found.height):
+            fix = f"put the pictures that the model was made of into {file.parent}, or make a model of these"
+            taken = f"{file} is {width}x{height}, but the model in {where} has a camera of {found.width}x{found.height}"
+            raise ValueError(f"{taken}; {fix}")

@@ -161,6 +161,19 @@ def test_pictures_that_are_not_stored_upright_are_refused_with_the_fix(own):
         open_log(own)
 
 
+def test_pictures_of_a_model_are_opened_once_and_the_first_for_its_mask(own, monkeypatch):
+    really, asked = Image.open, []
+    monkeypatch.setattr(Image, "open", lambda file, *rest: asked.append(file.name) or really(file, *rest))
+    open_log(own)
+    assert sorted(asked) == sorted([f"{i:03d}.png" for i in range(12)] + ["000.png"])
+
+
+def test_a_model_of_one_picture_is_refused_for_that(street, tmp_path):
+    one = write_colmap(tmp_path / "one", street, {"": pictures_along(street, count=1)})
+    with pytest.raises(ValueError, match="sparse/0 registers one picture, 000.png, and one has no depth; make a model of more pictures"):
+        open_log(one)
+
+
 def test_masks_are_said_not_to_be_heeded(own, capsys):
     open_log(own)
     assert "masks" not in capsys.readouterr().err
