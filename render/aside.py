@@ -51,6 +51,8 @@ STEP = 0.5
 MEASURED = 3.0
 """Metres aside up to which it is measured how well views hold (`recon/evaluation/offpath.py`)."""
 
+SMEARED = f"how well views hold is measured up to {MEASURED:g}m, and farther off they smear"
+
 
 @torch.no_grad()
 def room_aside(scene: Scene, camera: Camera, world_from_body: torch.Tensor, left: bool, reach: float) -> float:
@@ -81,11 +83,11 @@ def _depth(scene: Scene, camera: Camera) -> torch.Tensor:
 
 @torch.no_grad()
 def sight_warning(scene: Scene, name: str, cameras: Sequence[Camera]) -> list[str]:
-    """What to tell of a clip by a camera of one's own (`Scene.own`): that something stands between it and the nearest camera of the rig,
-    how much of what it shows no camera of the rig ever had in its picture, hidden there or not, and how much of the picture its lens does
-    not reach; a sentence each, or nothing."""
+    """What to tell of a clip by a camera of one's own (`Scene.own`): that something stands between it and the nearest camera of the rig, or
+    else that it is far from where any of these drove, how much of what it shows no camera of the rig ever had in its picture, hidden there
+    or not, and how much of the picture its lens does not reach; a sentence each, or nothing."""
     looks = spread(cameras, SIGHTS)
-    said = _behind(scene, name, looks)
+    said = _behind(scene, name, looks) or _off_the_rig(scene, name, looks)
     if (unseen := max(_unseen(scene, look) for look in looks)) >= UNSEEN:
         told = f"{name} shows what no camera recorded on {unseen:.0%} of its pixels"
         said.append(f"{told}, which is a guess; turn it to where a camera looked, or narrow its view")
@@ -108,6 +110,19 @@ def _behind(scene: Scene, name: str, looks: Sequence[Camera]) -> list[str]:
             where = f"{name} is {reach:.1f} m from the nearest recorded camera, and something stands {free:.1f} m from that towards it"
             return [f"{where}, {_after(looks, look.time_us)}: what is behind is a guess; move it nearer"]
     return []
+
+
+def _off_the_rig(scene: Scene, name: str, looks: Sequence[Camera]) -> list[str]:
+    """Told of a mount that is far beside the ways of the rig's cameras, or above them; not of one that a shift alone leads there."""
+    ways = torch.stack([c.body_from_cam[1:3, 3] for c in scene.rig.values()])
+    if float((scene.own[name].body_from_cam[1:3, 3] - ways).norm(dim=1).min()) <= BEFORE:
+        return []
+    eyes = torch.stack([look.world_from_cam[:, 3] for look in looks])
+    local = torch.stack([inverse(nearest(scene.ego, eye[:2])) @ eye for eye in eyes])[:, 1:3]
+    off = float((local[:, None] - ways).norm(dim=2).min(1).values.max())
+    if round(off, 1) <= MEASURED + STEP:
+        return []
+    return [f"{name} is {off:.1f} m beside or above where any recorded camera drove: {SMEARED}; mount it within {MEASURED:g}m of there"]
 
 
 def _unseen(scene: Scene, camera: Camera) -> float:
@@ -181,8 +196,7 @@ def _far(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: 
         return []
     after = _after(looks, looks[asides.index(most)].time_us)
     where = f"is {most:.1f} m beside the recorded path, {after}" if isinstance(path, Trajectory) else "leads far beside the recorded path"
-    told = f"how well views hold is measured up to {MEASURED:g}m, and farther off they smear"
-    return [f"{said} {where}: {told}; stay within {MEASURED:g}m of it"]
+    return [f"{said} {where}: {SMEARED}; stay within {MEASURED:g}m of it"]
 
 
 def _turned(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) -> list[str]:

@@ -160,3 +160,23 @@ def test_a_camera_of_ones_own_that_sees_what_no_camera_did_is_told(street):
     assert said.startswith("own.json is 12.0 m from the nearest recorded camera, and something stands 8.") and "move it nearer" in said
     (said,) = [line for line in told_of(lens=OpenCV(57.6, 57.6, 48.0, 27.0, -1.0)) if "distortion" in line]
     assert said.startswith("own.json sees nothing on ") and "check the numbers and their order" in said
+
+
+def test_a_camera_of_ones_own_far_from_where_the_recorded_ones_drove_is_told(street):
+    """Beside or above them, by its mount and the path together; but not one that is ahead, or that only a shift leads there."""
+    bare = without_houses(street)
+
+    def told_of(mount, shift=0.0):
+        front = bare.rig[CAMERA]
+        scene = replace(bare, own={"own.json": replace(front, body_from_cam=mount @ front.body_from_cam)})
+        told = sight_warning(scene, "own.json", clip_cameras(scene, "own.json", shift))
+        return [line for line in told if "measured" in line]
+
+    for mount, off in ((translation(y=-6.0), "6.0"), (translation(z=5.0), "5.0"), (translation(y=3.0, z=4.0), "5.0")):
+        (said,) = told_of(mount)
+        assert said.startswith(f"own.json is {off} m beside or above where any recorded camera drove: ")
+        assert said.endswith("mount it within 3m of there")
+    assert not told_of(translation(y=3.5)) and not told_of(translation(x=8.0)) and not told_of(translation(x=1.0), 6.0)
+    (said,) = told_of(translation(y=2.0), 2.0)
+    assert said.startswith("own.json is 4.0 m")
+    assert not told_of(translation(y=2.0), -2.0)
