@@ -13,7 +13,7 @@ from recon.readers.kitti_raw import is_kitti_raw, lacks_oxts, read_kitti_raw
 from recon.readers.ncore import is_ncore, read_ncore
 from recon.readers.nuscenes import is_nuscenes, read_nuscenes
 from recon.readers.pandaset import is_pandaset, read_pandaset
-from recon.readers.photos import check_enough, is_photos, is_video, read_photos
+from recon.readers.photos import check_enough, in_subfolders, is_photos, is_video, read_photos
 from recon.readers.recorder import without_recorder
 from recon.readers.waymo import is_waymo, read_waymo
 from recon.sound import sound
@@ -55,7 +55,7 @@ def open_log(
     inside = sorted(p for level in ("*", "*/*") for p in path.glob(level) if p.is_dir() and metric_reader(p))
     if not inside:
         check_enough(path)
-    hint = f" Did you mean {inside[0]}?" if inside else ""
+    hint = f" Did you mean {inside[0]}?" if inside else in_subfolders(path)
     raise ValueError(f"{path} is not a known layout of a drive: {', '.join(f'{name} has {what}' for name, what in LAYOUTS.items())}.{hint}")
 
 

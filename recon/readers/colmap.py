@@ -183,7 +183,7 @@ def _check_pictures(path: Path, where: Path, files: tuple[Path, ...], found: Mod
         with opened(file, str(file), FETCH) as picture:
             turned, (width, height) = is_turned(picture), picture.size
         if turned:
-            fix = "turn them and make the model anew, or, if they are upright as they are stored, take the orientation out of their EXIF data"
+            fix = "turn them and make the model anew, or, if they are upright as stored, take the orientation out of their EXIF data"
             fix = "delete it to begin again" if path.suffix == ".sfm" else fix
             raise ValueError(f"{path} was made of photos as they are stored, and {file.name} is not stored upright; {fix}")
         if (width, height) != (found.width, found.height):

@@ -54,6 +54,19 @@ def check_enough(path: Path) -> None:
         raise ValueError(f"{path} {what}, and a reconstruction needs at least {FEWEST} of one place; give a folder of as many")
 
 
+def in_subfolders(path: Path) -> str:
+    """A hint to photos in folders below one that holds none, up to two down; "" where there are none."""
+    if _photos(path):
+        return ""
+    below = [p for level in ("*", "*/*") for p in sorted(path.glob(level)) if p.is_dir() and not p.name.startswith(".")]
+    counts = {p: len(photos) for p in below if (photos := _photos(p))}
+    if not counts:
+        return ""
+    most = max(counts, key=lambda p: counts[p])
+    told = f"{counts[most]} photos lie in {most}" + f", {sum(counts.values()) - counts[most]} in other folders" * (len(counts) > 1)
+    return f" {told}: give that folder, or put all photos of one place into one folder"
+
+
 def _photos(path: Path) -> list[Path]:
     """A folder's photos in the order they were taken in; what a Mac leaves on a foreign disk (._01.jpg) is none."""
     found = [p for p in path.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith(".")]
