@@ -123,15 +123,20 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
         print(f"finding where {path} was taken; it is kept in {workspace}", file=sys.stderr)
         if is_video(path):
             times = _frames(path, partial / "images")
-            placed = solve(partial / "images", list(times), partial, True, angle_of_view, str(path))
+            found = solve(partial / "images", list(times), partial, True, angle_of_view, str(path))
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
             names = _of_one_size(path)
             _check_whole(path, names)
             pictures = _upright(path, names, partial / "images")
-            placed = solve(pictures, names, partial, False, angle_of_view, str(path))
+            found = solve(pictures, names, partial, False, angle_of_view, str(path))
             times = dict.fromkeys(names, 0)
-        print(f"placed {placed} of {len(times)} pictures", file=sys.stderr)
+        print(f"placed {found.placed} of {len(times)} pictures", file=sys.stderr)
+        if not found.right:
+            told = f"only {found.agreed:.0%} of what two pictures share lies where these poses say, and of right ones more than half"
+            fix = f"take more pictures, larger ones, with more overlap, and delete {workspace} to begin again"
+            fix += ", with --angle-of-view where it is known" if angle_of_view is None else ""
+            print(f"{path}: where its pictures were taken may be found wrongly: {told}; {fix}", file=sys.stderr)
         partial.rename(workspace)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -6,10 +6,12 @@ import math
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from recon.log import image_size
+from recon.sfm.agreement import AGREED, agreement
 from recon.sfm.colmap import extract_features, mapping_options, pycolmap, verification_options
 from render.progress import Progress
 
@@ -30,74 +32,111 @@ fit the lens that was found."""
 MOST_DISTORTION = 0.5
 """Largest magnitude of COLMAP's k of a SIMPLE_RADIAL lens: those of dash cameras are about -0.3."""
 
-BEGUN_WITHIN = 1 / 240
-"""Part of a picture's longer side by which points may be off in the two that a model begins with, unless that places too few. COLMAP's 4
-pixels are so much of a small picture that a pair passes which was turned, as is found, where it moved, and the others are placed along: 12
-rendered pictures of 480x270, of a known lens, came out turned by 22 to 29 degrees in four of eight cases, now by 0.1 in all."""
+USUAL_ERROR, WITHIN = 4.0, 1 / 240
+"""Pixels by which COLMAP lets matches be off the motion between two pictures, and the part of a picture's longer side that is allowed where
+it is less: of a small picture, 4 pixels are so much that a motion passes as a turn, and all others are placed along with it."""
+
+FEWEST_SEEN = 15
+"""Points of a model that a small picture must show to be placed, of which there are few; COLMAP's 30 leave most pictures of 320x180 out."""
+
+BEGUN_WITH = (4.0, 1.0), (2.0, 0.5)
+"""Of the two pictures that a model begins with: degrees between the rays to their points at least, and how far off these may be, in parts
+of what matches may. The second is tried where pictures are small, since what begins with a false pair places all pictures nevertheless;
+COLMAP's 16 degrees are those of pictures taken around something."""
 
 FEWEST_PLACED = 3
 """Pictures that must be registered at least."""
 
 
-def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None, source: str) -> int:
-    """Find the poses of the named files in the folder `pictures` and their common lens; writes `workspace`/sparse/0. Returns how many
-    pictures were registered.
+@dataclass(frozen=True)
+class Found:
+    """A model of COLMAP's, None for none, how many pictures it places, and how far what they show agrees with that (`agreement`)."""
+
+    model: Any = None
+    placed: int = 0
+    agreed: float = 0.0
+
+    @property
+    def right(self) -> int:
+        """How many pictures are placed rightly, by all that can be told: all of a model's, or none."""
+        return self.placed if self.agreed >= AGREED else 0
+
+    def is_enough(self, asked: int) -> bool:
+        return MORE * self.right > asked
+
+    def better_than(self, other: Found) -> bool:
+        if self.right or other.right:
+            return self.right >= max(MORE * other.right, FEWEST_PLACED)
+        return self.placed * self.agreed > other.placed * other.agreed
+
+
+def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angle_of_view: float | None, source: str) -> Found:
+    """Find the poses of the named files in the folder `pictures` and their common lens; writes `workspace`/sparse/0.
 
     ordered: whether `names` follow each other in time, as the frames of a video. angle_of_view: horizontal, in radians; where None the
     focal length is estimated, up to `WIDEST`, and where that registers too few pictures, `USUAL` is assumed and reported on stderr.
     source: where the pictures come from, for messages.
 
     SIFT features are matched between all pairs, or between pictures near each other in `names` where these are `ordered` or many, and
-    incremental mapping registers the pictures; the largest of its models is kept. ValueError where it has too few pictures.
+    incremental mapping registers the pictures; the largest of its models is kept. Where too few of the pictures are in one that agrees with
+    what they show, others are tried. ValueError where it has too few pictures.
     """
     colmap = pycolmap()
     database, models = workspace / "database.db", workspace / "models"
+    width, height = image_size(pictures / names[0])
+    within = min(USUAL_ERROR, WITHIN * max(width, height))
     with Progress("structure from motion") as steps:
         steps.step(note="features")
         reader = colmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
         if angle_of_view is not None:
-            width, height = image_size(pictures / names[0])
             reader.camera_params = f"{width / 2 / math.tan(angle_of_view / 2)},{width / 2},{height / 2},0"
         extract_features(colmap, database, pictures, names, reader, colmap.FeatureExtractionOptions())
         steps.step(note="matches")
+        verification = verification_options(colmap)
+        verification.ransac.max_error = within
         if ordered or len(names) > EXHAUSTIVE:
-            _match_neighbours(colmap, database, names)
+            _match_neighbours(colmap, database, names, verification)
         else:
-            colmap.match_exhaustive(database, verification_options=verification_options(colmap), device=colmap.Device.cpu)
+            colmap.match_exhaustive(database, verification_options=verification, device=colmap.Device.cpu)
         steps.step(note="poses")
-        options = _solving_options(colmap, angle_of_view)
+        options = _solving_options(colmap, angle_of_view, within)
 
         def tell(placed: int) -> None:
             steps.step(0, note=f"poses: {placed} of {len(names)} pictures placed")
 
-        usual_error = options.mapper.init_max_error
-        options.mapper.init_max_error = min(usual_error, BEGUN_WITHIN * max(image_size(pictures / names[0])))
-        best, count = _largest(colmap, database, pictures, models, options, tell)
-        if options.mapper.init_max_error < usual_error and MORE * count <= len(names):
-            options.mapper.init_max_error = usual_error
-            best, count = max((best, count), _largest(colmap, database, pictures, models, options, tell), key=lambda found: found[1])
-        said = ""
-        if angle_of_view is None and MORE * count <= len(names):
+        def sought(best: Found) -> Found:
+            """The best of what was found before and of what the options lead to."""
+            for degrees, part in BEGUN_WITH if within < USUAL_ERROR else BEGUN_WITH[:1]:
+                if not best.is_enough(len(names)):
+                    options.mapper.init_min_tri_angle, options.mapper.init_max_error = degrees, part * within
+                    model, placed = _largest(colmap, database, pictures, models, options, tell)
+                    other = Found(model, placed, agreement(colmap, database, model, max(width, height)) if placed else 0.0)
+                    best = other if other.better_than(best) else best
+            return best
+
+        best, said = sought(Found()), ""
+        if not best.is_enough(len(names)):
             angle = f"{math.degrees(_fix_lens(colmap, database, options)):.0f}deg"
             steps.step(0, note=f"poses once more, with a lens of {angle}")
-            usual, of_usual = _largest(colmap, database, pictures, models, options, tell)
-            if usual is not None and of_usual >= max(MORE * count, FEWEST_PLACED):
-                which = f"a lens of {angle} places {of_usual} of {len(names)}, one that is found {count}"
-                fix = f"lengths along its way are right as far as {angle} are: give --angle-of-view where it is known"
-                said = f"{source}: its pictures do not tell how wide its camera sees: {which}; {fix}"
-                best, count = _with_distortion(colmap, usual), of_usual
+            held = sought(best)
+            if held is not best:
+                if angle_of_view is None:
+                    which = f"a lens of {angle} places {held.placed} of {len(names)}, one that is found {best.right}"
+                    fix = f"lengths along its way are right as far as {angle} are: give --angle-of-view where it is known"
+                    said = f"{source}: its pictures do not tell how wide its camera sees: {which}; {fix}"
+                best = replace(held, model=_with_distortion(colmap, held.model))
+    if best.placed < max(FEWEST_PLACED, len(names) // 4):
+        fix = "take them closer together, with more overlap and things that stand still, while the camera moves"
+        raise ValueError(f"only {best.placed} of {len(names)} pictures of {source} could be placed; {fix}")
     if said:
         print(said, file=sys.stderr)
-    if best is None or count < max(FEWEST_PLACED, len(names) // 4):
-        fix = "take them closer together, with more overlap and things that stand still, while the camera moves"
-        raise ValueError(f"only {count} of {len(names)} pictures of {source} could be placed; {fix}")
     (workspace / "sparse" / "0").mkdir(parents=True)
-    best.write(workspace / "sparse" / "0")
+    best.model.write(workspace / "sparse" / "0")
     database.unlink()
-    return count
+    return best
 
 
-def _match_neighbours(colmap, database: Path, names: list[str]) -> None:
+def _match_neighbours(colmap, database: Path, names: list[str], verification) -> None:
     """Match the features of pictures that are near each other in the order of `names`."""
 
     def rename(called: dict[str, str]) -> None:
@@ -108,15 +147,18 @@ def _match_neighbours(colmap, database: Path, names: list[str]) -> None:
 
     in_order = {name: f"{i:08d}" for i, name in enumerate(names)}  # COLMAP goes by the alphabet, where 10.jpg comes before 9.jpg
     rename(in_order)
-    colmap.match_sequential(database, verification_options=verification_options(colmap), device=colmap.Device.cpu)
+    colmap.match_sequential(database, verification_options=verification, device=colmap.Device.cpu)
     rename({number: name for name, number in in_order.items()})
 
 
-def _solving_options(colmap, angle_of_view: float | None):
-    """Options of incremental mapping, with the focal length held where the angle of view is known."""
+def _solving_options(colmap, angle_of_view: float | None, within: float):
+    """Options of incremental mapping, with the focal length held where the angle of view is known; `within`: pixels by which matches may be
+    off."""
     options = mapping_options(colmap)
+    if within < USUAL_ERROR:
+        options.mapper.abs_pose_min_num_inliers = FEWEST_SEEN
     # two pictures of a drive lie one behind the other, and the defaults do not begin a model with such a pair
-    options.mapper.init_max_forward_motion, options.mapper.init_min_tri_angle = 1.0, 4.0
+    options.mapper.init_max_forward_motion = 1.0
     if angle_of_view is None:
         options.min_focal_length_ratio = 0.5 / math.tan(WIDEST / 2)
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = angle_of_view is None

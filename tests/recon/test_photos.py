@@ -1,12 +1,13 @@
 import math
 import shutil
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from made_colmap import pictures_along, write_colmap
+from made_colmap import pictures_along, relative, write_colmap
 from painted import drive as painted_drive
 from PIL import Image
 
@@ -17,6 +18,7 @@ from recon.sfm import solve as sfm
 from recon.sfm.colmap import pycolmap
 from render.video import VideoWriter
 from scenes.pictures import ORIENTATION
+from scenes.poses import pose_from
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
 
@@ -39,7 +41,7 @@ def solved(walk, monkeypatch):
         for i, name in enumerate(names):
             text = text.replace(f"{i:03d}.png", name)
         images.write_text(text)
-        return len(names)
+        return sfm.Found(None, len(names), 1.0)
 
     monkeypatch.setattr(reader, "solve", solve)
     return calls
@@ -200,7 +202,7 @@ def test_many_photos_are_matched_in_the_order_of_their_numbers(tmp_path, monkeyp
     colmap.extract_features(database, tmp_path, names, camera_mode=colmap.CameraMode.SINGLE, device=colmap.Device.cpu)
     before = {i.image_id: i.name for i in _images(colmap, database)}
     monkeypatch.setattr(colmap, "match_sequential", lambda path, **_: seen.extend(_images(colmap, path)))
-    sfm._match_neighbours(colmap, database, names)
+    sfm._match_neighbours(colmap, database, names, None)
     assert [before[i.image_id] for i in sorted(seen, key=lambda i: i.name)] == names
     assert {i.image_id: i.name for i in _images(colmap, database)} == before
 
@@ -253,6 +255,30 @@ def test_too_few_photos_are_told_from_no_drive_at_all(walk, tmp_path):
             open_log(folder)
     with pytest.raises(ValueError, match="001.png is 1 photo, and a reconstruction needs at least 3"):
         open_log(folder / "001.png")
+
+
+def test_photos_that_lie_in_subfolders_are_found_for_the_fix(walk, tmp_path):
+    shutil.copytree(walk / "images", tmp_path / "trip/day 1/street")
+    with pytest.raises(ValueError, match=r"not a known layout .* 6 photos lie in .*trip/day 1/street: give that folder, or put all"):
+        open_log(tmp_path / "trip")
+    (tmp_path / "trip/day 2").mkdir()
+    for i in range(2):
+        shutil.copy(walk / f"images/{i:03d}.png", tmp_path / "trip/day 2")
+    with pytest.raises(ValueError, match=r" 6 photos lie in .*trip/day 1/street, 2 in other folders: give that folder"):
+        open_log(tmp_path / "trip")
+
+
+def test_poses_that_pictures_do_not_agree_with_are_told_with_the_fix(walk, solved, tmp_path, monkeypatch, capsys):
+    shutil.copytree(walk / "images", tmp_path / "walk")
+    open_log(tmp_path / "walk")
+    assert "wrong" not in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "walk.sfm")
+    really = reader.solve
+    monkeypatch.setattr(reader, "solve", lambda *given: replace(really(*given), agreed=0.3))
+    open_log(tmp_path / "walk")
+    said = capsys.readouterr().err
+    assert "walk: where its pictures were taken may be found wrongly: only 30% of what two pictures share" in said
+    assert f"more overlap, and delete {tmp_path / 'walk.sfm'} to begin again, with --angle-of-view where it is known" in said
 
 
 def test_what_cannot_be_placed_leaves_nothing_behind(walk, tmp_path, monkeypatch):
@@ -338,7 +364,7 @@ def test_pictures_that_do_not_tell_their_lens_are_placed_by_a_usual_one(straight
         return (None, 0) if options.ba_refine_focal_length else really(colmap, database, pictures, made, options, tell)
 
     monkeypatch.setattr(sfm, "_largest", largest)
-    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names) and tried == [True, True, False]
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4").right == len(names) and tried == [True, True, False]
     camera = next(iter(read_model(tmp_path / "sparse/0").cameras.values()))
     assert camera.params[0] == pytest.approx(160 / math.tan(math.radians(30))) and 0 < abs(camera.params[3]) < sfm.MOST_DISTORTION
     said = capsys.readouterr().err
@@ -350,15 +376,45 @@ def test_a_lens_is_not_bent_more_than_lenses_are(straight, tmp_path, monkeypatch
     really = sfm._largest
     monkeypatch.setattr(sfm, "_largest", lambda *given: (None, 0) if given[4].ba_refine_focal_length else really(*given))
     monkeypatch.setattr(sfm, "MOST_DISTORTION", 0.0)
-    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4").right == len(names)
     assert next(iter(read_model(tmp_path / "sparse/0").cameras.values())).params[3] == 0
 
 
 def test_pictures_that_tell_their_lens_are_placed_once(straight, tmp_path, monkeypatch, capsys):
     folder, names = straight
     monkeypatch.setattr(sfm, "_fix_lens", lambda *_: pytest.fail("placed once more"))
-    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4") == len(names)
+    assert sfm.solve(folder, names, tmp_path, True, None, "street.mp4").right == len(names)
     assert "--angle-of-view" not in capsys.readouterr().err
+
+
+def test_a_models_pictures_agree_with_it_unless_their_cameras_are_turned(straight, tmp_path, monkeypatch):
+    folder, names = straight
+    really, agreed = sfm.agreement, []
+
+    def of_both(colmap, database, model, longer):
+        turned = colmap.Reconstruction(model)
+        for i, image in enumerate(turned.images.values()):
+            aside = pose_from([1.0, 0.0, 0.02 * i, 0.0], [0.0, 0.0, 0.0])[:3].numpy()
+            image.frame.rig_from_world = colmap.Rigid3d(aside) * image.frame.rig_from_world
+        agreed.extend(really(colmap, database, one, longer) for one in (model, turned))
+        return agreed[0]
+
+    monkeypatch.setattr(sfm, "agreement", of_both)
+    sfm.solve(folder, names, tmp_path, True, None, "street.mp4")
+    assert agreed[0] > 0.7 and agreed[1] < 0.3
+
+
+def test_small_pictures_of_a_real_street_are_placed_as_they_were_taken(shared, tmp_path, capsys):
+    """Eight of 320x180, 18 metres straight ahead, of an unknown lens: where matches may be 4 pixels off, some are turned by 40 degrees."""
+    camera = open_log(shared / "pandaset/002").camera("front_camera")
+    (tmp_path / "street").mkdir()
+    for i in range(40, 80, 5):
+        with Image.open(camera.files[i]) as photo:
+            photo.resize((320, 180), Image.Resampling.LANCZOS).save(tmp_path / f"street/{i}.jpg", quality=92)
+    found = open_log(tmp_path / "street").camera("camera")
+    assert len(found) == 8 and "wrongly" not in capsys.readouterr().err
+    off = relative(found.world_from_cam)[:, :3, :3] @ relative(camera.world_from_cam[40::5])[:, :3, :3].mT
+    assert math.degrees(float(torch.acos(((off.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)).max())) < 2
 
 
 def test_the_folder_one_is_in_is_read_too(walk, solved, tmp_path, monkeypatch):

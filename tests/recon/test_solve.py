@@ -19,6 +19,7 @@ def test_a_known_angle_is_that_across_also_of_pictures_that_stand(tmp_path, monk
     monkeypatch.setattr(sfm, "extract_features", lambda *given: asked.append(given[4].camera_params))
     monkeypatch.setattr(sfm, "_match_neighbours", lambda *_: None)
     monkeypatch.setattr(sfm, "_largest", lambda *_: (None, 0))
+    monkeypatch.setattr(sfm, "_fix_lens", lambda *_: 1.0)
     with pytest.raises(ValueError, match="only 0 of 1 pictures"):
         sfm.solve(tmp_path, ["a.png"], tmp_path, True, math.radians(90), "a")
     (focal, *rest) = map(float, asked[0].split(","))
@@ -26,28 +27,61 @@ def test_a_known_angle_is_that_across_also_of_pictures_that_stand(tmp_path, monk
 
 
 def test_a_lens_that_is_found_is_no_wider_than_any():
-    options = sfm._solving_options(pycolmap(), None)
+    options = sfm._solving_options(pycolmap(), None, 4.0)
     assert options.min_focal_length_ratio == pytest.approx(0.3004, abs=1e-4) and options.ba_refine_focal_length  # 0.5 / tan(59 deg)
-    assert not sfm._solving_options(pycolmap(), 1.0).ba_refine_focal_length
+    assert not sfm._solving_options(pycolmap(), 1.0, 4.0).ba_refine_focal_length
+
+
+FREE, HELD, STEEP, FLAT = True, False, 4, 2
 
 
 @pytest.mark.parametrize(
-    ("size", "placed", "asked"), [((480, 270), 5, [2]), ((270, 480), 4, [2, 4]), ((960, 540), 5, [4]), ((1920, 1080), 5, [4])]
+    ("size", "models", "tried", "taken"),
+    [
+        ((480, 270), [(5, 0.9)], [(FREE, STEEP)], 0),
+        ((270, 480), [(2, 0.9), (5, 0.9)], [(FREE, STEEP), (FREE, FLAT)], 1),
+        ((480, 270), [(5, 0.3), (5, 0.3), (4, 0.9), (5, 0.9)], [(FREE, STEEP), (FREE, FLAT), (HELD, STEEP), (HELD, FLAT)], 3),
+        ((480, 270), [(3, 0.9), (5, 0.3), (5, 0.3), (5, 0.4)], [(FREE, STEEP), (FREE, FLAT), (HELD, STEEP), (HELD, FLAT)], 0),
+        ((480, 270), [(5, 0.1), (5, 0.3), (4, 0.3), (5, 0.2)], [(FREE, STEEP), (FREE, FLAT), (HELD, STEEP), (HELD, FLAT)], 1),
+        ((960, 540), [(4, 0.9), (5, 0.9)], [(FREE, STEEP), (HELD, STEEP)], 1),
+    ],
 )
-def test_the_pair_that_a_model_begins_with_is_off_by_little_of_a_small_picture(size, placed, asked, tmp_path, monkeypatch):
-    """Unless that places too few: then by as much as COLMAP allows, and what places more is taken."""
+def test_what_most_pictures_agree_with_is_taken_of_all_that_is_tried(size, models, tried, taken, tmp_path, monkeypatch):
+    """Until four fifths are placed so: that a model has the pictures does not make it right."""
     Image.new("RGB", size).save(tmp_path / "0.png")
     (tmp_path / "database.db").touch()
-    errors, models = [], iter([placed, 3])
+    made = [SimpleNamespace(agrees=agrees, placed=placed, write=lambda _: None) for placed, agrees in models]
+    asked = []
 
-    def largest(*given):
-        errors.append(given[4].mapper.init_max_error)
-        return SimpleNamespace(write=lambda _: None), next(models)
+    def largest(_, __, ___, ____, options, _____):
+        asked.append((options.ba_refine_focal_length, options.mapper.init_min_tri_angle))
+        return (model := made[len(asked) - 1]), model.placed
+
+    def fix_lens(_, __, options):
+        options.ba_refine_focal_length = False
+        return 1.0
 
     for name in ("extract_features", "_match_neighbours"):
         monkeypatch.setattr(sfm, name, lambda *_: None)
     monkeypatch.setattr(sfm, "_largest", largest)
-    assert sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, 1.0, "a") == placed and errors == asked
+    monkeypatch.setattr(sfm, "_fix_lens", fix_lens)
+    monkeypatch.setattr(sfm, "_with_distortion", lambda _, model: model)
+    monkeypatch.setattr(sfm, "agreement", lambda _, __, model, ___: model.agrees)
+    found = sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, None, "a")
+    assert found.model is made[taken] and asked == tried and (found.right > 0) == (models[taken][1] > 0.5)
+
+
+@pytest.mark.parametrize(("size", "within"), [((480, 270), 2), ((270, 480), 2), ((960, 540), 4), ((1920, 1080), 4)])
+def test_matches_of_small_pictures_are_off_by_as_little_of_them(size, within, tmp_path, monkeypatch):
+    Image.new("RGB", size).save(tmp_path / "0.png")
+    errors = []
+    monkeypatch.setattr(sfm, "extract_features", lambda *_: None)
+    monkeypatch.setattr(sfm, "_match_neighbours", lambda *given: errors.append(given[3].ransac.max_error))
+    monkeypatch.setattr(sfm, "_largest", lambda *given: errors.append(given[4].mapper.init_max_error) or (None, 0))
+    monkeypatch.setattr(sfm, "_fix_lens", lambda *_: 1.0)
+    with pytest.raises(ValueError, match="only 0 of 5"):
+        sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, 1.0, "a")
+    assert errors == ([2, 2, 1, 2, 1] if within == 2 else [4, 4, 4])
 
 
 @pytest.mark.parametrize(("size", "degrees"), [((800, 600), 60), ((600, 800), 46.83)])
@@ -55,7 +89,7 @@ def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path
     colmap, database = pycolmap(), tmp_path / "database.db"
     with colmap.Database.open(database) as opened:
         opened.write_camera(colmap.Camera(model="SIMPLE_RADIAL", width=size[0], height=size[1], params=[500, *size, 0.1]))
-    assert math.degrees(sfm._fix_lens(colmap, database, sfm._solving_options(colmap, None))) == pytest.approx(degrees, abs=0.01)
+    assert math.degrees(sfm._fix_lens(colmap, database, sfm._solving_options(colmap, None, 4.0))) == pytest.approx(degrees, abs=0.01)
     with colmap.Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
     assert camera.params.tolist() == pytest.approx([400 / math.tan(math.radians(30)), size[0] / 2, size[1] / 2, 0])
