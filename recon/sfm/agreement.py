@@ -9,7 +9,7 @@ import numpy as np
 WITHIN = 1 / 960
 """Part of a picture's longer side by which a match may be off what a model says of it."""
 
-AGREED = 0.45
+AGREED = 0.5
 """Agreement from which on a model is taken to be right."""
 
 

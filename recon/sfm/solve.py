@@ -191,6 +191,7 @@ def _fix_lens(colmap, database: Path, options) -> float:
         (camera,) = opened.read_all_cameras()
         focal = camera.params[0] if camera.has_prior_focal_length else max(camera.width, camera.height) / 2 / math.tan(USUAL / 2)
         camera.params = [focal, camera.width / 2, camera.height / 2, 0.0]
+        camera.has_prior_focal_length = True  # else COLMAP estimates it for a picture once more
         opened.update_camera(camera)
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False

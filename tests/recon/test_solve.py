@@ -92,6 +92,7 @@ def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path
     assert math.degrees(sfm._fix_lens(colmap, database, sfm._solving_options(colmap, None, 4.0))) == pytest.approx(degrees, abs=0.01)
     with colmap.Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
+    assert camera.has_prior_focal_length
     assert camera.params.tolist() == pytest.approx([400 / math.tan(math.radians(30)), size[0] / 2, size[1] / 2, 0])
 
 
