@@ -35,6 +35,10 @@ ABOVE = 0.3
 ALIGNED = math.radians(8)
 """How far off the street's direction, as it looks, what lies along it may be."""
 
+SURELY = math.radians(1)
+"""By how much nearer to level than to the street's direction it must look to be taken to be level: wires climb with a street, and cornices
+do not."""
+
 LONGER, PLAIN = 2.5, 1e-3
 """How many times as long as wide it looks, at least, and how long, in radians: a pixel of 960 in an angle of view of 50 degrees."""
 
@@ -142,22 +146,33 @@ def _nearest_eyes(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.nda
 
 def _turned(rays: np.ndarray, axes: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which ellipsoids, bool `[N]`, whose scaled `axes` are the columns of `[N, 3, 3]`, look from `rays` `[N, 3]` away as what lies along
-    `ways` `[N, 3]`; and of those rotations `[M, 3, 3]` and standard deviations `[M, 3]` that lie along these and look the same."""
+    `ways` `[N, 3]`, or level above them; and of those rotations `[M, 3, 3]` and standard deviations `[M, 3]` that lie so and look the
+    same."""
     away = np.linalg.norm(rays, axis=1)
     rays = rays / away[:, None]
+    level = ways * [1, 1, 0]
+    level /= np.linalg.norm(level, axis=1).clip(1e-9)[:, None]
+    aslant, _, _ = _looks(rays, axes, ways)
+    ways = np.where((_looks(rays, axes, level)[0] < aslant - SURELY)[:, None], level, ways)
+    off, long, wide = _looks(rays, axes, ways)
     across = np.cross(rays, ways)
     foreshortened = np.linalg.norm(across, axis=1)
     across = across / np.maximum(foreshortened, 1e-9)[:, None]
-    seen = np.stack([np.cross(across, rays), across], 1) @ axes  # along the street as it looks, and at right angles to that
-    (xx, xy), (_, yy) = np.moveaxis(seen @ seen.transpose(0, 2, 1), 0, 2)
-    middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    long, wide = np.sqrt(middle + half), np.sqrt(np.maximum(middle - half, 0))
-    off = np.abs(np.arctan2(2 * xy, xx - yy)) / 2
     lengths = long / np.maximum(foreshortened, 1e-9)
     which = (off < ALIGNED) & (long > LONGER * wide) & (long > PLAIN * away) & (lengths < REACHES * away)
     rotations = np.stack([ways, across, np.cross(ways, across)], 2)[which]
     thin = np.maximum(np.minimum(wide, np.linalg.norm(axes, axis=1).min(1)), lengths / ROOM)
     return rotations, np.stack([lengths, wide, thin], 1)[which], which
+
+
+def _looks(rays: np.ndarray, axes: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far off `ways` `[N, 3]` ellipsoids look turned from rays `[N, 3]`, in radians, and how long and how wide they look, `[N]`."""
+    across = np.cross(rays, ways)
+    across = across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
+    seen = np.stack([np.cross(across, rays), across], 1) @ axes  # along them as that looks, and at right angles to it
+    (xx, xy), (_, yy) = np.moveaxis(seen @ seen.transpose(0, 2, 1), 0, 2)
+    middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    return np.abs(np.arctan2(2 * xy, xx - yy)) / 2, np.sqrt(middle + half), np.sqrt(np.maximum(middle - half, 0))
 
 
 def _off_edges(places: np.ndarray, logs: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -103,6 +103,23 @@ def test_a_wire_along_the_street_is_one_line_from_beside_it(shakes):
     assert thin.max() < 0.03 and (long < 0.7 * LONGEST * middle).all(), "as wide as it looks, and free to grow"
 
 
+@pytest.mark.parametrize("rise", [0.0, 0.12])
+def test_along_a_steep_street_wires_climb_and_cornices_are_level(rise):
+    """Turned up to the street, a cornice would be a saw."""
+    path = straight(60.0, 61)
+    path.world_from_body[:, 2, 3] += rise * path.world_from_body[:, 0, 3]
+    eye = torch.tensor([25.0, 0, 1.5 + 25 * rise], dtype=torch.float64)
+    for climbs in (0.0, rise):
+        along = torch.nn.functional.normalize(torch.tensor([1.0, 0, climbs], dtype=torch.float64), dim=0)
+        places = torch.stack(
+            [torch.tensor([x, 6.0, 6.5 + 25 * rise + climbs * (x - 38)], dtype=torch.float64) for x in np.linspace(38, 48, 40)]
+        )
+        splats = square_to(eye, places, along)
+        assert lines(path).straighten(splats) == 40
+        tips = matrix_from_quat(splats.fields["quats"].double())[torch.arange(40), :, splats.fields["log_scales"].argmax(1)]
+        assert float(torch.rad2deg((tips @ along).abs().clamp_max(1).arccos()).max()) < 0.5
+
+
 def test_the_pictures_of_the_path_stay():
     path, (splats, eye) = straight(), wire(deep=0.0)
     nearest = next(c for c in cameras(path) if torch.allclose(c.world_from_cam[:3, 3], eye))
