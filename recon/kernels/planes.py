@@ -1,0 +1,233 @@
+"""How alike pictures look on planes before one of them. A lane vector is 16 planes at one pixel, so that sums over squares of pixels are
+sums of whole vectors."""
+
+import warp as wp
+
+from render.kernels.lanewise import cut, greater, lesser
+from render.kernels.types import OPTIONS, TILE, lanes, pixel_of, pixels_of
+
+wp.set_module_options(OPTIONS)
+
+PLANES = 96
+"""Planes of a direction."""
+
+CHUNKS = PLANES // TILE
+"""Lane vectors of a pixel."""
+
+NEAREST = wp.constant(0.1)
+"""Metres before another picture from which on it may show a place."""
+
+BEHIND = wp.constant(1.0e-3)
+"""What depths are divided by at least."""
+
+
+@wp.func
+def lesser_of(a: lanes, b: lanes):
+    return lanes(
+        lesser(a[0], b[0]), lesser(a[1], b[1]), lesser(a[2], b[2]), lesser(a[3], b[3]),
+        lesser(a[4], b[4]), lesser(a[5], b[5]), lesser(a[6], b[6]), lesser(a[7], b[7]),
+        lesser(a[8], b[8]), lesser(a[9], b[9]), lesser(a[10], b[10]), lesser(a[11], b[11]),
+        lesser(a[12], b[12]), lesser(a[13], b[13]), lesser(a[14], b[14]), lesser(a[15], b[15]),
+    )  # fmt: skip
+
+
+@wp.func
+def greater_of(a: lanes, b: lanes):
+    return -lesser_of(-a, -b)
+
+
+@wp.func
+def roots(v: lanes):
+    return lanes(
+        wp.sqrt(v[0]), wp.sqrt(v[1]), wp.sqrt(v[2]), wp.sqrt(v[3]), wp.sqrt(v[4]), wp.sqrt(v[5]), wp.sqrt(v[6]), wp.sqrt(v[7]),
+        wp.sqrt(v[8]), wp.sqrt(v[9]), wp.sqrt(v[10]), wp.sqrt(v[11]), wp.sqrt(v[12]), wp.sqrt(v[13]), wp.sqrt(v[14]), wp.sqrt(v[15]),
+    )  # fmt: skip
+
+
+@wp.func
+def numbers(chunk: int):
+    """Which planes the lanes of a chunk are."""
+    return lanes(float(TILE * chunk)) + lanes(0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
+
+
+@wp.func
+def matters(bounds: wp.array3d[float], y: int, x: int, chunk: int):
+    """Whether a pixel has planes of a chunk between its bounds."""
+    return bounds[0, y, x] < float(TILE * (chunk + 1)) and bounds[1, y, x] >= float(TILE * chunk)
+
+
+@wp.func
+def on_axis(motion: wp.array3d[float], o: int, axis: int, x: int, y: int, inverse_depths: lanes):
+    base = motion[o, axis, 0] * float(x) + motion[o, axis, 1] * float(y) + motion[o, axis, 2]
+    return lanes(base) + inverse_depths * motion[o, axis, 3]
+
+
+@wp.struct
+class Places:
+    """Where another picture has them: columns and rows, 0 the middle of its first pixel, and depths z in parts of those here."""
+
+    u: lanes
+    v: lanes
+    z: lanes
+
+
+@wp.func
+def places_of(motion: wp.array3d[float], o: int, x: int, y: int, inverse_depths: lanes):
+    """Where picture o has what pixel x, y shows at inverse depths. motion `[O, 3, 4]`: (u z, v z, z) of (x, y, 1, inverse depth)."""
+    there = Places()
+    there.z = on_axis(motion, o, 2, x, y, inverse_depths)
+    before = greater_of(there.z, lanes(BEHIND))
+    there.u = wp.cw_div(on_axis(motion, o, 0, x, y, inverse_depths), before)
+    there.v = wp.cw_div(on_axis(motion, o, 1, x, y, inverse_depths), before)
+    return there
+
+
+@wp.func
+def peek(others: wp.array3d[float], o: int, u: float, v: float):
+    """Picture o, with its border, between four pixels."""
+    c = int(u)
+    r = int(v)
+    right = u - float(c)
+    a = others[o, r, c]
+    b = others[o, r + 1, c]
+    above = a + right * (others[o, r, c + 1] - a)
+    below = b + right * (others[o, r + 1, c + 1] - b)
+    return above + (v - float(r)) * (below - above)
+
+
+@wp.kernel
+def look(
+    others: wp.array3d[float], motion: wp.array3d[float], step: wp.array2d[float], near: wp.array3d[float], chunk: int,
+    shown: wp.array3d[lanes],
+    first: int,
+):  # fmt: skip
+    """What others show on a chunk's planes before a picture: shown `[O, h, w]`; an item is a row.
+
+    others: `[O, h + 3, w + 3]`, within a border of 0, a pixel to the left and above, two to the right and below; step: inverse depth
+    `[h, w]` from plane to plane; near `[2, h, w]`: the first and the last plane that matter to any square with the pixel in it.
+    """
+    h = shown.shape[1]
+    w = shown.shape[2]
+    o = (first + wp.tid()) / h
+    y = (first + wp.tid()) % h
+    for x in range(w):
+        if matters(near, y, x, chunk):
+            there = places_of(motion, o, x, y, numbers(chunk) * step[y, x])
+            u = lesser_of(greater_of(there.u + lanes(1.0), lanes(0.0)), lanes(float(w + 1)))
+            v = lesser_of(greater_of(there.v + lanes(1.0), lanes(0.0)), lanes(float(h + 1)))
+            shown[o, y, x] = lanes(
+                peek(others, o, u[0], v[0]), peek(others, o, u[1], v[1]), peek(others, o, u[2], v[2]), peek(others, o, u[3], v[3]),
+                peek(others, o, u[4], v[4]), peek(others, o, u[5], v[5]), peek(others, o, u[6], v[6]), peek(others, o, u[7], v[7]),
+                peek(others, o, u[8], v[8]), peek(others, o, u[9], v[9]), peek(others, o, u[10], v[10]), peek(others, o, u[11], v[11]),
+                peek(others, o, u[12], v[12]), peek(others, o, u[13], v[13]), peek(others, o, u[14], v[14]), peek(others, o, u[15], v[15]),
+            )  # fmt: skip
+
+
+@wp.struct
+class Prices:
+    """What planes cost that are not compared, or compared and cannot be."""
+
+    unseen: float  # where no other picture shows them
+    outside: float  # more, beyond the bounds
+    pinned: float  # more, two planes or more from a known point
+
+
+@wp.kernel
+def compare(
+    own: wp.array3d[float], shown: wp.array3d[lanes], motion: wp.array3d[float], step: wp.array2d[float],
+    bounds: wp.array3d[float], near: wp.array3d[float], known: wp.array2d[float], chunk: int, half: int, noise: float, prices: Prices,
+    sums: wp.array3d[lanes], cost: wp.array3d[lanes],
+    first: int,
+):  # fmt: skip
+    """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, in squares of 2 half + 1 pixels,
+    the mean of the better half of the others (they may not see the place), and `prices`. An item is a row.
+
+    own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and the
+    last plane that matter, NaN where none does and none costs more; known `[h, w]`: inverse depths, NaN where not known; sums `[h, w, 4]`:
+    to work in.
+    """
+    y = first + wp.tid()
+    h = cost.shape[0]
+    w = cost.shape[1]
+    part = 1.0 / float((2 * half + 1) * (2 * half + 1))
+    number = numbers(chunk)
+    for x in range(w):
+        cost[y, x, chunk] = lanes(2.0)
+        sums[y, x, 3] = lanes(2.0)
+    for o in range(shown.shape[0]):
+        for x in range(w):
+            if matters(near, y, x, chunk):
+                s = lanes(0.0)
+                squares = lanes(0.0)
+                products = lanes(0.0)
+                for row in range(y - half, y + half + 1):
+                    r = wp.clamp(row, 0, h - 1)
+                    v = shown[o, r, x]
+                    s = s + v
+                    squares = squares + wp.cw_mul(v, v)
+                    products = products + v * own[0, r, x]
+                sums[y, x, 0] = s
+                sums[y, x, 1] = squares
+                sums[y, x, 2] = products
+        for x in range(w):
+            if matters(bounds, y, x, chunk):
+                s = lanes(0.0)
+                squares = lanes(0.0)
+                products = lanes(0.0)
+                for column in range(x - half, x + half + 1):
+                    c = wp.clamp(column, 0, w - 1)
+                    s = s + sums[y, c, 0]
+                    squares = squares + sums[y, c, 1]
+                    products = products + sums[y, c, 2]
+                mean = s * part
+                spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
+                alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
+                inverse_depths = number * step[y, x]
+                there = places_of(motion, o, x, y, inverse_depths)
+                more = lanes(1.0 - prices.unseen) - alike
+                more = cut(there.u, float(w) - 0.5, cut(-there.u, 0.5, more))
+                more = cut(there.v, float(h) - 0.5, cut(-there.v, 0.5, more))
+                now = lanes(prices.unseen) + cut(inverse_depths * NEAREST - there.z, 0.0, more)
+                best = cost[y, x, chunk]
+                sums[y, x, 3] = lesser_of(sums[y, x, 3], greater_of(now, best))
+                cost[y, x, chunk] = lesser_of(now, best)
+    for x in range(w):
+        now = lanes(prices.unseen)
+        if matters(bounds, y, x, chunk):
+            now = cost[y, x, chunk]
+            if shown.shape[0] > 2:
+                now = 0.5 * (now + sums[y, x, 3])
+        beyond = lanes(prices.outside)
+        now = now + cut(number, bounds[0, y, x], beyond) + cut(-number, -bounds[1, y, x], beyond)
+        if known[y, x] >= 0.0:
+            away = number - lanes(known[y, x] / greater(step[y, x], 1.0e-9))
+            now = now + prices.pinned * lesser_of(0.5 * greater_of(away, -away), lanes(1.0))
+        cost[y, x, chunk] = now
+
+
+@wp.kernel
+def choose(
+    cost: wp.array3d[float], total: wp.array3d[float], step: wp.array2d[float], bounds: wp.array3d[float], lowest: wp.array2d[float],
+    unseen: float, least: wp.array2d[float], inverse_depth: wp.array2d[float],
+    stretch: int, first: int,
+):  # fmt: skip
+    """Of planes that cost `total` `[h, w, PLANES]` the best: what it costs, infinite where none matters; and the inverse depth between it
+    and its neighbours, by a parabola, NaN where no other picture shows it, as `cost` says, or it is not beyond plane `lowest`."""
+    w = total.shape[1]
+    begin, end = pixels_of(first + wp.tid(), stretch, total.shape[0], w)
+    for pixel in range(begin, end):
+        y, x = pixel_of(pixel, w)
+        best = int(0)
+        for d in range(1, PLANES):
+            if total[y, x, d] < total[y, x, best]:
+                best = d
+        middle = wp.clamp(best, 1, PLANES - 2)
+        between = float(best)
+        if best == middle:
+            before = total[y, x, best - 1]
+            after = total[y, x, best + 1]
+            bend = greater(before + after - 2.0 * total[y, x, best], 1.0e-6)
+            between += wp.clamp(0.5 * (before - after) / bend, -0.5, 0.5)
+        least[y, x] = wp.where(bounds[1, y, x] >= 0.0, total[y, x, best], wp.inf)
+        seen = cost[y, x, best] != unseen and between > lowest[y, x]
+        inverse_depth[y, x] = wp.where(seen, between * step[y, x], wp.nan)

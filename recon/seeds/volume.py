@@ -1,0 +1,101 @@
+"""What planes before a plate cost its pixels, by kernels: compared with other plates, smoothed, and the best taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import warp as wp
+
+from recon.kernels.planes import CHUNKS, PLANES, Prices, choose, compare, look
+from recon.kernels.scanlines import Paths, add_paths
+from recon.seeds.stereo import FLAT, UNSEEN, Plate, moments_of
+from render.kernels.types import TILE, lanes
+from render.launch import run, run_pixels, stage, upload, view
+
+NUDGE, JUMP = 0.06, 0.5
+"""What it costs a pixel to be one plane off its neighbour, or any number; a correlation of 1 costs 0, of none 1."""
+
+EDGE = 12.0
+"""Levels between neighbours at which a jump costs half."""
+
+PINNED = 1.0
+"""What it costs the pixel of a known point to be elsewhere."""
+
+OUTSIDE = 2.0
+"""What it costs to be beyond the planes that matter."""
+
+
+class Volume:
+    """Costs of `PLANES` planes, in equal steps of inverse depth from 0 (the sky) on, for each pixel of a plate that `others`, of its size
+    and on its device, are compared with. Memory is taken once for all directions of planes."""
+
+    def __init__(self, plate: Plate, others: list[Plate]) -> None:
+        self.plate, device = plate, plate.grey.device
+        h, w = plate.grey.shape
+        self.others = F.pad(torch.stack([other.grey for other in others]), (1, 2, 1, 2))
+        pixels, back = _pixels_from_cam(plate), np.linalg.inv(plate.cam_from_world)
+        motion = np.zeros((len(others), 3, 4))
+        for of, other in zip(motion, others, strict=True):
+            there = other.cam_from_world @ back
+            of[:, :3] = _pixels_from_cam(other) @ there[:3, :3] @ np.linalg.inv(pixels)
+            of[:, 3] = _pixels_from_cam(other) @ there[:3, 3]
+        self.motion = upload(torch.from_numpy(motion).float(), device)
+        self.cost, self.total = torch.empty(2, h, w, PLANES, device=device)
+        self.shown = torch.empty(len(others), h, w, TILE, device=device)
+        self.sums = torch.empty(h, w, 4, TILE, device=device)
+        self.path = torch.empty(max(h, w), CHUNKS, TILE, device=device)
+
+    def best(
+        self, step: torch.Tensor, bounds: torch.Tensor, known: torch.Tensor, lowest: torch.Tensor, window: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the best plane costs each pixel, infinite where none matters, and the inverse depth there, NaN where not above plane `lowest`
+        or where no other plate shows it, `[h, w]` each.
+
+        step: inverse depth `[h, w]` from plane to plane; bounds `[2, h, w]`: the first and the last plane that matter, NaN where none does;
+        known `[h, w]`: inverse depths, NaN where not known; window: side of the squares that are compared.
+        """
+        with stage(self.plate.grey.device):
+            self._compare(step.contiguous(), bounds, known, window)
+            self._smooth()
+            return self._choose(step.contiguous(), bounds, lowest)
+
+    def _compare(self, step: torch.Tensor, bounds: torch.Tensor, known: torch.Tensor, window: int) -> None:
+        grey = self.plate.grey
+        h, w = grey.shape
+        own = torch.cat([grey[None], *moments_of(grey[None], window)])
+        # to a square matters what does to any pixel of it
+        wide = F.max_pool2d(torch.stack([-bounds[0], bounds[1]]).nan_to_num(-torch.inf)[None], window, 1, window // 2)[0]
+        near = torch.stack([-wide[0], wide[1]])
+        prices = Prices()
+        prices.unseen, prices.outside, prices.pinned = UNSEEN, OUTSIDE, PINNED
+        told = [view(self.motion, float), view(step, float)]
+        shown, spans = view(self.shown, lanes), [view(bounds, float), view(near, float)]
+        sums, cost = view(self.sums, lanes), view(self.cost.view(h, w, CHUNKS, TILE), lanes)
+        for chunk in range(CHUNKS):  # what a chunk needs stays in the cache
+            run(look, len(self.shown) * h, [view(self.others, float), *told, spans[1], chunk, shown], grey.device)
+            args = [view(own, float), shown, *told, *spans, view(known, float), chunk, window // 2, FLAT, prices, sums, cost]
+            run(compare, h, args, grey.device)
+
+    def _smooth(self) -> None:
+        """Sum costs along paths from the left, right, top and bottom."""
+        h, w = self.plate.grey.shape
+        arrays = [view(t.view(-1, CHUNKS, TILE), lanes) for t in (self.cost, self.path, self.total.zero_())]
+        cost, path, total = arrays
+        for lines, count, *where in ((h, w, 0, w, 1), (h, w, w - 1, w, -1), (w, h, 0, 1, w), (w, h, (h - 1) * w, 1, -w)):
+            paths = Paths()
+            paths.start, paths.beside, paths.step = where
+            paths.count, paths.nudge, paths.jump, paths.edge = count, NUDGE, JUMP, EDGE
+            run(add_paths, lines, [paths, cost, view(self.plate.grey.view(-1), float), path, total], self.path.device)
+
+    def _choose(self, step: torch.Tensor, bounds: torch.Tensor, lowest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        least, inverse_depth = torch.empty(2, *step.shape, device=step.device)
+        told = [view(t, float) for t in (self.cost, self.total, step, bounds, lowest)]
+        run_pixels(choose, step.numel(), [*told, UNSEEN, view(least, float), view(inverse_depth, float)], step.device)
+        return least, inverse_depth
+
+
+def _pixels_from_cam(plate: Plate) -> np.ndarray:
+    """`[3, 3]`, 0 the middle of the first pixel."""
+    (fx, fy), (cx, cy) = plate.focal, plate.centre
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
