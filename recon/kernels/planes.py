@@ -1,6 +1,8 @@
 """How alike pictures look on planes before one of them. A lane vector is 16 planes at one pixel, so that sums over squares of pixels are
 sums of whole vectors."""
 
+from functools import cache
+
 import warp as wp
 
 from render.kernels.lanewise import cut, greater, lesser
@@ -62,37 +64,22 @@ def on_axis(motion: wp.array3d[float], o: int, axis: int, x: int, y: int, invers
     return lanes(base) + inverse_depths * motion[o, axis, 3]
 
 
-@wp.struct
-class Places:
-    """Where another picture has them: columns and rows, 0 the middle of its first pixel, and depths z in parts of those here."""
-
-    u: lanes
-    v: lanes
-    z: lanes
-
-
-@wp.func
-def places_of(motion: wp.array3d[float], o: int, x: int, y: int, inverse_depths: lanes):
-    """Where picture o has what pixel x, y shows at inverse depths. motion `[O, 3, 4]`: (u z, v z, z) of (x, y, 1, inverse depth)."""
-    there = Places()
-    there.z = on_axis(motion, o, 2, x, y, inverse_depths)
-    before = greater_of(there.z, lanes(BEHIND))
-    there.u = wp.cw_div(on_axis(motion, o, 0, x, y, inverse_depths), before)
-    there.v = wp.cw_div(on_axis(motion, o, 1, x, y, inverse_depths), before)
-    return there
-
-
-@wp.func
-def peek(others: wp.array3d[float], o: int, u: float, v: float):
-    """Picture o, with its border, between four pixels."""
-    c = int(u)
-    r = int(v)
-    right = u - float(c)
-    a = others[o, r, c]
-    b = others[o, r + 1, c]
-    above = a + right * (others[o, r, c + 1] - a)
-    below = b + right * (others[o, r + 1, c + 1] - b)
-    return above + (v - float(r)) * (below - above)
+# in C++ since Warp, which asks each index whether it counts from the end, gathers at half the speed
+@wp.func_native("""
+    wp::vec_t<16, float> seen;
+    const float* grey = (const float*)others.data;
+    for (int l = 0; l < 16; ++l) {
+        const int column = (int)u[l], row = (int)v[l], i = first + row * pitch + column;
+        const float right = u[l] - (float)column, down = v[l] - (float)row;
+        const float above = grey[i] + right * (grey[i + 1] - grey[i]);
+        const float below = grey[i + pitch] + right * (grey[i + pitch + 1] - grey[i + pitch]);
+        seen[l] = above + down * (below - above);
+    }
+    return seen;
+""")
+def between_pixels(others: wp.array3d[float], first: int, pitch: int, u: lanes, v: lanes) -> lanes:
+    """What the picture whose first pixel is `first`, with rows of `pitch`, has at columns u and rows v, neither of which are negative."""
+    ...
 
 
 @wp.kernel
@@ -110,17 +97,16 @@ def look(
     w = shown.shape[2]
     o = (first + wp.tid()) / h
     y = (first + wp.tid()) % h
+    number = numbers(chunk)
     for x in range(w):
         if matters(near, y, x, chunk):
-            there = places_of(motion, o, x, y, numbers(chunk) * step[y, x])
-            u = lesser_of(greater_of(there.u + lanes(1.0), lanes(0.0)), lanes(float(w + 1)))
-            v = lesser_of(greater_of(there.v + lanes(1.0), lanes(0.0)), lanes(float(h + 1)))
-            shown[o, y, x] = lanes(
-                peek(others, o, u[0], v[0]), peek(others, o, u[1], v[1]), peek(others, o, u[2], v[2]), peek(others, o, u[3], v[3]),
-                peek(others, o, u[4], v[4]), peek(others, o, u[5], v[5]), peek(others, o, u[6], v[6]), peek(others, o, u[7], v[7]),
-                peek(others, o, u[8], v[8]), peek(others, o, u[9], v[9]), peek(others, o, u[10], v[10]), peek(others, o, u[11], v[11]),
-                peek(others, o, u[12], v[12]), peek(others, o, u[13], v[13]), peek(others, o, u[14], v[14]), peek(others, o, u[15], v[15]),
-            )  # fmt: skip
+            inverse_depths = number * step[y, x]
+            parts = wp.cw_div(lanes(1.0), greater_of(on_axis(motion, o, 2, x, y, inverse_depths), lanes(BEHIND)))
+            u = lanes(1.0) + wp.cw_mul(on_axis(motion, o, 0, x, y, inverse_depths), parts)
+            v = lanes(1.0) + wp.cw_mul(on_axis(motion, o, 1, x, y, inverse_depths), parts)
+            u = lesser_of(greater_of(u, lanes(0.0)), lanes(float(w + 1)))
+            v = lesser_of(greater_of(v, lanes(0.0)), lanes(float(h + 1)))
+            shown[o, y, x] = between_pixels(others, o * others.shape[1] * others.shape[2], others.shape[2], u, v)
 
 
 @wp.struct
@@ -132,77 +118,83 @@ class Prices:
     pinned: float  # more, two planes or more from a known point
 
 
-@wp.kernel
-def compare(
-    own: wp.array3d[float], shown: wp.array3d[lanes], motion: wp.array3d[float], step: wp.array2d[float],
-    bounds: wp.array3d[float], near: wp.array3d[float], known: wp.array2d[float], chunk: int, half: int, noise: float, prices: Prices,
-    sums: wp.array3d[lanes], cost: wp.array3d[lanes],
-    first: int,
-):  # fmt: skip
-    """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, in squares of 2 half + 1 pixels,
-    the mean of the better half of the others (they may not see the place), and `prices`. An item is a row.
+@cache
+def compare_kernel(half: int) -> wp.Kernel:
+    """For squares of 2 half + 1 pixels: their sides are unrolled, since a sum that goes round a loop is no vector."""
 
-    own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and the
-    last plane that matter, NaN where none does and none costs more; known `[h, w]`: inverse depths, NaN where not known; sums `[h, w, 4]`:
-    to work in.
-    """
-    y = first + wp.tid()
-    h = cost.shape[0]
-    w = cost.shape[1]
-    part = 1.0 / float((2 * half + 1) * (2 * half + 1))
-    number = numbers(chunk)
-    for x in range(w):
-        cost[y, x, chunk] = lanes(2.0)
-        sums[y, x, 3] = lanes(2.0)
-    for o in range(shown.shape[0]):
+    @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
+    def compare(
+        own: wp.array3d[float], shown: wp.array3d[lanes], motion: wp.array3d[float], step: wp.array2d[float],
+        bounds: wp.array3d[float], near: wp.array3d[float], known: wp.array2d[float], chunk: int, noise: float, prices: Prices,
+        sums: wp.array3d[lanes], cost: wp.array3d[lanes],
+        first: int,
+    ):  # fmt: skip
+        """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, the mean of the better half of the others (they may not see the place), and `prices`. An item is a row.
+
+        own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and the
+        last plane that matter, NaN where none does and none costs more; known `[h, w]`: inverse depths, NaN where not known; sums `[h, w, 4]`:
+        to work in.
+        """
+        y = first + wp.tid()
+        h = cost.shape[0]
+        w = cost.shape[1]
+        part = wp.static(1 / (2 * half + 1) ** 2)
+        number = numbers(chunk)
         for x in range(w):
-            if matters(near, y, x, chunk):
-                s = lanes(0.0)
-                squares = lanes(0.0)
-                products = lanes(0.0)
-                for row in range(y - half, y + half + 1):
-                    r = wp.clamp(row, 0, h - 1)
-                    v = shown[o, r, x]
-                    s = s + v
-                    squares = squares + wp.cw_mul(v, v)
-                    products = products + v * own[0, r, x]
-                sums[y, x, 0] = s
-                sums[y, x, 1] = squares
-                sums[y, x, 2] = products
+            cost[y, x, chunk] = lanes(2.0)
+            sums[y, x, 3] = lanes(2.0)
+        for o in range(shown.shape[0]):
+            for x in range(w):
+                if matters(near, y, x, chunk):
+                    s = lanes(0.0)
+                    squares = lanes(0.0)
+                    products = lanes(0.0)
+                    for k in range(wp.static(-half), wp.static(half + 1)):
+                        r = wp.clamp(y + k, 0, h - 1)
+                        v = shown[o, r, x]
+                        s = s + v
+                        squares = squares + wp.cw_mul(v, v)
+                        products = products + v * own[0, r, x]
+                    sums[y, x, 0] = s
+                    sums[y, x, 1] = squares
+                    sums[y, x, 2] = products
+            for x in range(w):
+                if matters(bounds, y, x, chunk):
+                    s = lanes(0.0)
+                    squares = lanes(0.0)
+                    products = lanes(0.0)
+                    for k in range(wp.static(-half), wp.static(half + 1)):
+                        c = wp.clamp(x + k, 0, w - 1)
+                        s = s + sums[y, c, 0]
+                        squares = squares + sums[y, c, 1]
+                        products = products + sums[y, c, 2]
+                    mean = s * part
+                    spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
+                    alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
+                    inverse_depths = number * step[y, x]
+                    z = on_axis(motion, o, 2, x, y, inverse_depths)
+                    u = on_axis(motion, o, 0, x, y, inverse_depths) + 0.5 * z
+                    v = on_axis(motion, o, 1, x, y, inverse_depths) + 0.5 * z
+                    within = lesser_of(lesser_of(u, z * float(w) - u), lesser_of(v, z * float(h) - v))
+                    within = lesser_of(within, z - inverse_depths * NEAREST)
+                    now = lanes(prices.unseen) + cut(-within, 0.0, lanes(1.0 - prices.unseen) - alike)
+                    best = cost[y, x, chunk]
+                    sums[y, x, 3] = lesser_of(sums[y, x, 3], greater_of(now, best))
+                    cost[y, x, chunk] = lesser_of(now, best)
         for x in range(w):
+            now = lanes(prices.unseen)
             if matters(bounds, y, x, chunk):
-                s = lanes(0.0)
-                squares = lanes(0.0)
-                products = lanes(0.0)
-                for column in range(x - half, x + half + 1):
-                    c = wp.clamp(column, 0, w - 1)
-                    s = s + sums[y, c, 0]
-                    squares = squares + sums[y, c, 1]
-                    products = products + sums[y, c, 2]
-                mean = s * part
-                spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
-                alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
-                inverse_depths = number * step[y, x]
-                there = places_of(motion, o, x, y, inverse_depths)
-                more = lanes(1.0 - prices.unseen) - alike
-                more = cut(there.u, float(w) - 0.5, cut(-there.u, 0.5, more))
-                more = cut(there.v, float(h) - 0.5, cut(-there.v, 0.5, more))
-                now = lanes(prices.unseen) + cut(inverse_depths * NEAREST - there.z, 0.0, more)
-                best = cost[y, x, chunk]
-                sums[y, x, 3] = lesser_of(sums[y, x, 3], greater_of(now, best))
-                cost[y, x, chunk] = lesser_of(now, best)
-    for x in range(w):
-        now = lanes(prices.unseen)
-        if matters(bounds, y, x, chunk):
-            now = cost[y, x, chunk]
-            if shown.shape[0] > 2:
-                now = 0.5 * (now + sums[y, x, 3])
-        beyond = lanes(prices.outside)
-        now = now + cut(number, bounds[0, y, x], beyond) + cut(-number, -bounds[1, y, x], beyond)
-        if known[y, x] >= 0.0:
-            away = number - lanes(known[y, x] / greater(step[y, x], 1.0e-9))
-            now = now + prices.pinned * lesser_of(0.5 * greater_of(away, -away), lanes(1.0))
-        cost[y, x, chunk] = now
+                now = cost[y, x, chunk]
+                if shown.shape[0] > 2:
+                    now = 0.5 * (now + sums[y, x, 3])
+            beyond = lanes(prices.outside)
+            now = now + cut(number, bounds[0, y, x], beyond) + cut(-number, -bounds[1, y, x], beyond)
+            if known[y, x] >= 0.0:
+                away = number - lanes(known[y, x] / greater(step[y, x], 1.0e-9))
+                now = now + prices.pinned * lesser_of(0.5 * greater_of(away, -away), lanes(1.0))
+            cost[y, x, chunk] = now
+
+    return compare
 
 
 @wp.kernel

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from recon.kernels.planes import CHUNKS, PLANES, Prices, choose, compare, look
+from recon.kernels.planes import CHUNKS, PLANES, Prices, choose, compare_kernel, look
 from recon.kernels.scanlines import Paths, add_paths
 from recon.seeds.stereo import FLAT, UNSEEN, Plate, moments_of
 from render.kernels.types import TILE, lanes
@@ -74,8 +74,8 @@ class Volume:
         sums, cost = view(self.sums, lanes), view(self.cost.view(h, w, CHUNKS, TILE), lanes)
         for chunk in range(CHUNKS):  # what a chunk needs stays in the cache
             run(look, len(self.shown) * h, [view(self.others, float), *told, spans[1], chunk, shown], grey.device)
-            args = [view(own, float), shown, *told, *spans, view(known, float), chunk, window // 2, FLAT, prices, sums, cost]
-            run(compare, h, args, grey.device)
+            args = [view(own, float), shown, *told, *spans, view(known, float), chunk, FLAT, prices, sums, cost]
+            run(compare_kernel(window // 2), h, args, grey.device)
 
     def _smooth(self) -> None:
         """Sum costs along paths from the left, right, top and bottom."""
