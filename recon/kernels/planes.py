@@ -39,6 +39,13 @@ def greater_of(a: lanes, b: lanes):
 
 
 @wp.func
+def smallest(v: lanes):
+    a = lesser(lesser(lesser(v[0], v[8]), lesser(v[4], v[12])), lesser(lesser(v[2], v[10]), lesser(v[6], v[14])))
+    b = lesser(lesser(lesser(v[1], v[9]), lesser(v[5], v[13])), lesser(lesser(v[3], v[11]), lesser(v[7], v[15])))
+    return lesser(a, b)
+
+
+@wp.func
 def roots(v: lanes):
     return lanes(
         wp.sqrt(v[0]), wp.sqrt(v[1]), wp.sqrt(v[2]), wp.sqrt(v[3]), wp.sqrt(v[4]), wp.sqrt(v[5]), wp.sqrt(v[6]), wp.sqrt(v[7]),
@@ -199,27 +206,31 @@ def compare_kernel(half: int) -> wp.Kernel:
 
 @wp.kernel
 def choose(
-    cost: wp.array3d[float], total: wp.array3d[float], step: wp.array2d[float], bounds: wp.array3d[float], lowest: wp.array2d[float],
+    cost: wp.array3d[float], total: wp.array3d[lanes], step: wp.array2d[float], bounds: wp.array3d[float], lowest: wp.array2d[float],
     unseen: float, least: wp.array2d[float], inverse_depth: wp.array2d[float],
     stretch: int, first: int,
 ):  # fmt: skip
-    """Of planes that cost `total` `[h, w, PLANES]` the best: what it costs, infinite where none matters; and the inverse depth between it
+    """Of planes that cost `total` `[h, w, CHUNKS]` the best: what it costs, infinite where none matters; and the inverse depth between it
     and its neighbours, by a parabola, NaN where no other picture shows it, as `cost` says, or it is not beyond plane `lowest`."""
-    w = total.shape[1]
-    begin, end = pixels_of(first + wp.tid(), stretch, total.shape[0], w)
+    begin, end = pixels_of(first + wp.tid(), stretch, total.shape[0], total.shape[1])
     for pixel in range(begin, end):
-        y, x = pixel_of(pixel, w)
-        best = int(0)
-        for d in range(1, PLANES):
-            if total[y, x, d] < total[y, x, best]:
-                best = d
-        middle = wp.clamp(best, 1, PLANES - 2)
+        y, x = pixel_of(pixel, total.shape[1])
+        here = smallest(total[y, x, 0])
+        k = int(0)
+        for other in range(1, CHUNKS):
+            there = smallest(total[y, x, other])
+            if there < here:
+                here = there
+                k = other
+        lane = int(0)
+        while total[y, x, k][lane] > here:
+            lane += 1
+        best = TILE * k + lane
         between = float(best)
-        if best == middle:
-            before = total[y, x, best - 1]
-            after = total[y, x, best + 1]
-            bend = greater(before + after - 2.0 * total[y, x, best], 1.0e-6)
-            between += wp.clamp(0.5 * (before - after) / bend, -0.5, 0.5)
-        least[y, x] = wp.where(bounds[1, y, x] >= 0.0, total[y, x, best], wp.inf)
+        if best > 0 and best < PLANES - 1:
+            before = total[y, x, (best - 1) / TILE][(best - 1) % TILE]
+            after = total[y, x, (best + 1) / TILE][(best + 1) % TILE]
+            between += wp.clamp(0.5 * (before - after) / greater(before + after - 2.0 * here, 1.0e-6), -0.5, 0.5)
+        least[y, x] = wp.where(bounds[1, y, x] >= 0.0, here, wp.inf)
         seen = cost[y, x, best] != unseen and between > lowest[y, x]
         inverse_depth[y, x] = wp.where(seen, between * step[y, x], wp.nan)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from recon.kernels.planes import CHUNKS, PLANES, Prices, choose, compare_kernel, look
-from recon.kernels.scanlines import Paths, add_paths
+from recon.kernels.scanlines import Lines, add_paths
 from recon.seeds.stereo import FLAT, UNSEEN, Plate, moments_of
 from render.kernels.types import TILE, lanes
 from render.launch import run, run_pixels, stage, upload, view
@@ -41,7 +41,7 @@ class Volume:
             of[:, :3] = _pixels_from_cam(other) @ there[:3, :3] @ np.linalg.inv(pixels)
             of[:, 3] = _pixels_from_cam(other) @ there[:3, 3]
         self.motion = upload(torch.from_numpy(motion).float(), device)
-        self.cost, self.total = torch.empty(2, h, w, PLANES, device=device)
+        self.cost, self.total = torch.zeros(2, h, w, PLANES, device=device)
         self.shown = torch.empty(len(others), h, w, TILE, device=device)
         self.sums = torch.empty(h, w, 4, TILE, device=device)
         self.path = torch.empty(max(h, w), CHUNKS, TILE, device=device)
@@ -56,9 +56,9 @@ class Volume:
         known `[h, w]`: inverse depths, NaN where not known; window: side of the squares that are compared.
         """
         with stage(self.plate.grey.device):
-            self._compare(step.contiguous(), bounds, known, window)
+            self._compare(step, bounds, known, window)
             self._smooth()
-            return self._choose(step.contiguous(), bounds, lowest)
+            return self._choose(step, bounds, lowest)
 
     def _compare(self, step: torch.Tensor, bounds: torch.Tensor, known: torch.Tensor, window: int) -> None:
         grey = self.plate.grey
@@ -80,18 +80,20 @@ class Volume:
     def _smooth(self) -> None:
         """Sum costs along paths from the left, right, top and bottom."""
         h, w = self.plate.grey.shape
-        arrays = [view(t.view(-1, CHUNKS, TILE), lanes) for t in (self.cost, self.path, self.total.zero_())]
-        cost, path, total = arrays
-        for lines, count, *where in ((h, w, 0, w, 1), (h, w, w - 1, w, -1), (w, h, 0, 1, w), (w, h, (h - 1) * w, 1, -w)):
-            paths = Paths()
-            paths.start, paths.beside, paths.step = where
-            paths.count, paths.nudge, paths.jump, paths.edge = count, NUDGE, JUMP, EDGE
-            run(add_paths, lines, [paths, cost, view(self.plate.grey.view(-1), float), path, total], self.path.device)
+        cost, path, total = (view(t.view(-1, CHUNKS, TILE), lanes) for t in (self.cost, self.path, self.total))
+        for begun, (many, *where) in enumerate(((h, w, 1, w), (w, 1, w, h))):
+            lines = Lines()
+            lines.beside, lines.step, lines.count = where
+            lines.nudge, lines.jump, lines.edge = NUDGE, JUMP, EDGE
+            run(add_paths, many, [lines, cost, view(self.plate.grey.view(-1), float), begun, path, total], self.path.device)
 
-    def _choose(self, step: torch.Tensor, bounds: torch.Tensor, lowest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _choose(
+        self, step: torch.Tensor, bounds: torch.Tensor, lowest: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         least, inverse_depth = torch.empty(2, *step.shape, device=step.device)
-        told = [view(t, float) for t in (self.cost, self.total, step, bounds, lowest)]
-        run_pixels(choose, step.numel(), [*told, UNSEEN, view(least, float), view(inverse_depth, float)], step.device)
+        costs = [view(self.cost, float), view(self.total.view(*step.shape, CHUNKS, TILE), lanes)]
+        told = [view(t, float) for t in (step, bounds, lowest)]
+        run_pixels(choose, step.numel(), [*costs, *told, UNSEEN, view(least, float), view(inverse_depth, float)], step.device)
         return least, inverse_depth
 
 
