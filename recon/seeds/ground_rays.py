@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+import warp as wp
 
+from recon.kernels.ground import Grid, march
+from render.launch import run, stage, view
 from scenes.ground import Ground
 
-STEPS = np.geomspace(0.5, 2000.0, 64)
+STEPS = torch.from_numpy(np.geomspace(0.5, 2000.0, 64))
 """Multiples of a ray at which it is asked whether it is under the ground; a crest that it enters and leaves between two is missed."""
 
 LEVEL = 1e-3
@@ -23,27 +26,11 @@ def ground_hits(eye: np.ndarray, rays: np.ndarray, ground: Ground, below: float 
     Infinite where they rise or are level, where they do not come there (a hill may fall as fast), and all of them where the eye itself is
     under it: such a ground is wrong.
     """
-    flat = rays.reshape(-1, 3)
-
-    def above(which: np.ndarray, times: np.ndarray) -> np.ndarray:
-        at = eye + times[:, None] * flat[which]
-        return at[:, 2] + below - ground.height(torch.from_numpy(at[:, :2])).numpy()
-
-    hits = np.full(len(flat), np.inf)
-    going = np.flatnonzero(flat[:, 2] < -LEVEL)
-    near, far, over, under = (np.zeros(len(flat)) for _ in range(4))
-    over[going] = above(going, near[going])
-    going = met = going[over[going] > 0]
-    for step in STEPS:
-        far[going] = step
-        under[going] = now = above(going, far[going])
-        near[going[now > 0]], over[going[now > 0]] = step, now[now > 0]
-        going = going[now > 0]
-    met = np.setdiff1d(met, going, assume_unique=True)
-    for _ in range(ROUNDS + 1):
-        hits[met] = near[met] + over[met] / (over[met] - under[met]) * (far[met] - near[met])
-        now = above(met, hits[met])
-        short, beyond = met[now > 0], met[now <= 0]
-        near[short], over[short] = hits[short], now[now > 0]
-        far[beyond], under[beyond] = hits[beyond], now[now <= 0]
-    return hits.reshape(rays.shape[:-1])
+    flat = torch.from_numpy(rays.reshape(-1, 3)).double().contiguous()
+    hits = torch.empty(len(flat), dtype=torch.float64)
+    grid = Grid()
+    (grid.x, grid.y), grid.cell = ground.origin, ground.cell
+    with stage(hits.device):
+        told = [wp.vec3d(eye[0], eye[1], eye[2] + below), view(flat, wp.vec3d), view(STEPS, wp.float64), ROUNDS + 1, LEVEL]
+        run(march, len(flat), [view(ground.heights, float), grid, *told, view(hits, wp.float64)], hits.device)
+    return hits.numpy().reshape(rays.shape[:-1])
