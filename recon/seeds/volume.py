@@ -41,7 +41,7 @@ class Volume:
             of[:, :3] = _pixels_from_cam(other) @ there[:3, :3] @ np.linalg.inv(pixels)
             of[:, 3] = _pixels_from_cam(other) @ there[:3, 3]
         self.motion = upload(torch.from_numpy(motion).float(), device)
-        self.cost, self.total = torch.zeros(2, h, w, PLANES, device=device)
+        self.cost, self.total = torch.empty(h, w, PLANES, device=device), torch.zeros(h, w, PLANES, device=device)
         self.shown = torch.empty(len(others), h, w, TILE, device=device)
         self.sums = torch.empty(h, w, 4, TILE, device=device)
         self.path = torch.empty(max(h, w), CHUNKS, TILE, device=device)
@@ -65,7 +65,9 @@ class Volume:
         h, w = grey.shape
         own = torch.cat([grey[None], *moments_of(grey[None], window)])
         # to a square matters what does to any pixel of it
-        wide = F.max_pool2d(torch.stack([-bounds[0], bounds[1]]).nan_to_num(-torch.inf)[None], window, 1, window // 2)[0]
+        wide = torch.stack([-bounds[0], bounds[1]]).nan_to_num(-torch.inf)
+        for side in ((1, window), (window, 1)):
+            wide = F.max_pool2d(wide, side, 1, (side[0] // 2, side[1] // 2))
         near = torch.stack([-wide[0], wide[1]])
         prices = Prices()
         prices.unseen, prices.outside, prices.pinned = UNSEEN, OUTSIDE, PINNED
