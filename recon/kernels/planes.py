@@ -93,19 +93,21 @@ def between_pixels(others: wp.array3d[float], first: int, pitch: int, u: lanes, 
 def look(
     others: wp.array3d[float], motion: wp.array3d[float], step: wp.array2d[float], near: wp.array3d[float], chunk: int,
     shown: wp.array3d[lanes],
-    first: int,
+    stretch: int, first: int,
 ):  # fmt: skip
-    """What others show on a chunk's planes before a picture: shown `[O, h, w]`; an item is a row.
+    """What others show on a chunk's planes before a picture: shown `[O, h, w]`.
 
     others: `[O, h + 3, w + 3]`, within a border of 0, a pixel to the left and above, two to the right and below; step: inverse depth
     `[h, w]` from plane to plane; near `[2, h, w]`: the first and the last plane that matter to any square with the pixel in it.
     """
     h = shown.shape[1]
     w = shown.shape[2]
-    o = (first + wp.tid()) / h
-    y = (first + wp.tid()) % h
     number = numbers(chunk)
-    for x in range(w):
+    begin, end = pixels_of(first + wp.tid(), stretch, shown.shape[0] * h, w)
+    for pixel in range(begin, end):
+        row, x = pixel_of(pixel, w)
+        o = row / h
+        y = row - o * h
         if matters(near, y, x, chunk):
             inverse_depths = number * step[y, x]
             parts = wp.cw_div(lanes(1.0), greater_of(on_axis(motion, o, 2, x, y, inverse_depths), lanes(BEHIND)))
@@ -134,24 +136,29 @@ def compare_kernel(half: int) -> wp.Kernel:
         own: wp.array3d[float], shown: wp.array3d[lanes], motion: wp.array3d[float], step: wp.array2d[float],
         bounds: wp.array3d[float], near: wp.array3d[float], known: wp.array2d[float], chunk: int, noise: float, prices: Prices,
         sums: wp.array3d[lanes], cost: wp.array3d[lanes],
-        first: int,
+        stretch: int, first: int,
     ):  # fmt: skip
-        """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, the mean of the better half of the others (they may not see the place), and `prices`. An item is a row.
+        """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, the mean of the better half
+        of the others (they may not see the place), and `prices`. An item is `stretch` pixels of a row.
 
-        own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and the
-        last plane that matter, NaN where none does and none costs more; known `[h, w]`: inverse depths, NaN where not known; sums `[h, w, 4]`:
-        to work in.
+        own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and
+        the last plane that matter, NaN where none does and none costs more; near: as of `look`; known `[h, w]`: inverse depths, NaN where
+        not known; sums `[items, stretch + 2 half, 4]`: to work in.
         """
-        y = first + wp.tid()
+        i = first + wp.tid()
         h = cost.shape[0]
         w = cost.shape[1]
+        y = i / ((w + stretch - 1) / stretch)
+        left = i % ((w + stretch - 1) / stretch) * stretch
+        right = wp.min(left + stretch, w)
         part = wp.static(1 / (2 * half + 1) ** 2)
         number = numbers(chunk)
-        for x in range(w):
+        for x in range(left, right):
             cost[y, x, chunk] = lanes(2.0)
-            sums[y, x, 3] = lanes(2.0)
+            sums[i, x - left, 3] = lanes(2.0)
         for o in range(shown.shape[0]):
-            for x in range(w):
+            for column in range(left - half, right + half):
+                x = wp.clamp(column, 0, w - 1)
                 if matters(near, y, x, chunk):
                     s = lanes(0.0)
                     squares = lanes(0.0)
@@ -162,19 +169,18 @@ def compare_kernel(half: int) -> wp.Kernel:
                         s = s + v
                         squares = squares + wp.cw_mul(v, v)
                         products = products + v * own[0, r, x]
-                    sums[y, x, 0] = s
-                    sums[y, x, 1] = squares
-                    sums[y, x, 2] = products
-            for x in range(w):
+                    sums[i, column - left + half, 0] = s
+                    sums[i, column - left + half, 1] = squares
+                    sums[i, column - left + half, 2] = products
+            for x in range(left, right):
                 if matters(bounds, y, x, chunk):
                     s = lanes(0.0)
                     squares = lanes(0.0)
                     products = lanes(0.0)
-                    for k in range(wp.static(-half), wp.static(half + 1)):
-                        c = wp.clamp(x + k, 0, w - 1)
-                        s = s + sums[y, c, 0]
-                        squares = squares + sums[y, c, 1]
-                        products = products + sums[y, c, 2]
+                    for k in range(wp.static(2 * half + 1)):
+                        s = s + sums[i, x - left + k, 0]
+                        squares = squares + sums[i, x - left + k, 1]
+                        products = products + sums[i, x - left + k, 2]
                     mean = s * part
                     spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
                     alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
@@ -186,14 +192,14 @@ def compare_kernel(half: int) -> wp.Kernel:
                     within = lesser_of(within, z - inverse_depths * NEAREST)
                     now = lanes(prices.unseen) + cut(-within, 0.0, lanes(1.0 - prices.unseen) - alike)
                     best = cost[y, x, chunk]
-                    sums[y, x, 3] = lesser_of(sums[y, x, 3], greater_of(now, best))
+                    sums[i, x - left, 3] = lesser_of(sums[i, x - left, 3], greater_of(now, best))
                     cost[y, x, chunk] = lesser_of(now, best)
-        for x in range(w):
+        for x in range(left, right):
             now = lanes(prices.unseen)
             if matters(bounds, y, x, chunk):
                 now = cost[y, x, chunk]
                 if shown.shape[0] > 2:
-                    now = 0.5 * (now + sums[y, x, 3])
+                    now = 0.5 * (now + sums[i, x - left, 3])
             beyond = lanes(prices.outside)
             now = now + cut(number, bounds[0, y, x], beyond) + cut(-number, -bounds[1, y, x], beyond)
             if known[y, x] >= 0.0:

@@ -25,6 +25,9 @@ PINNED = 1.0
 OUTSIDE = 2.0
 """What it costs to be beyond the planes that matter."""
 
+STRETCH = {"cpu": 1024, "cuda": 8}
+"""Pixels in a row whose squares an item sums up, at most: on the CPU a whole row, since the squares of two stretches share pixels."""
+
 
 class Volume:
     """Costs of `PLANES` planes, in equal steps of inverse depth from 0 (the sky) on, for each pixel of a plate that `others`, of its size
@@ -43,7 +46,6 @@ class Volume:
         self.motion = upload(torch.from_numpy(motion).float(), device)
         self.cost, self.total = torch.empty(h, w, PLANES, device=device), torch.zeros(h, w, PLANES, device=device)
         self.shown = torch.empty(len(others), h, w, TILE, device=device)
-        self.sums = torch.empty(h, w, 4, TILE, device=device)
         self.path = torch.empty(max(h, w), CHUNKS, TILE, device=device)
 
     def best(
@@ -73,11 +75,14 @@ class Volume:
         prices.unseen, prices.outside, prices.pinned = UNSEEN, OUTSIDE, PINNED
         told = [view(self.motion, float), view(step, float)]
         shown, spans = view(self.shown, lanes), [view(bounds, float), view(near, float)]
-        sums, cost = view(self.sums, lanes), view(self.cost.view(h, w, CHUNKS, TILE), lanes)
+        cost = view(self.cost.view(h, w, CHUNKS, TILE), lanes)
+        stretch = min(w, STRETCH[grey.device.type])
+        items = h * -(-w // stretch)
+        sums = view(torch.empty(items, stretch + 2 * (window // 2), 4, TILE, device=grey.device), lanes)
         for chunk in range(CHUNKS):  # what a chunk needs stays in the cache
-            run(look, len(self.shown) * h, [view(self.others, float), *told, spans[1], chunk, shown], grey.device)
-            args = [view(own, float), shown, *told, *spans, view(known, float), chunk, FLAT, prices, sums, cost]
-            run(compare_kernel(window // 2), h, args, grey.device)
+            run_pixels(look, self.shown[..., 0].numel(), [view(self.others, float), *told, spans[1], chunk, shown], grey.device)
+            args = [view(own, float), shown, *told, *spans, view(known, float), chunk, FLAT, prices, sums, cost, stretch]
+            run(compare_kernel(window // 2), items, args, grey.device)
 
     def _smooth(self) -> None:
         """Sum costs along paths from the left, right, top and bottom."""

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from recon.seeds import planes
 from recon.seeds.stereo import Plate
+from recon.seeds.volume import Volume
 
 HEIGHT, WIDTH, FOCAL = 96, 128, 100.0
 EYE, BESIDE = 1.6, 4.0
@@ -72,16 +73,25 @@ def test_pictures_from_one_above_the_other_have_no_walls_along_their_way():
     assert len(planes._directions(own, [above], torch.ones(HEIGHT, WIDTH))) == 2
 
 
+@pytest.mark.parametrize(("times", "found"), [(1.3, True), (2.0, False)])
+def test_planes_of_the_road_are_not_tried_far_above_it(times, found):
+    own, others = plate(0.0), [plate(-1.5), plate(1.5)]
+    depth, on_wall = truth(own)
+    limit = torch.from_numpy(1 / (times * depth)).float()
+    _, road, _ = planes._directions(own, others, limit)
+    cost, inverse_depth = planes._along(road, Volume(own, others), 0.5, planes._known(own, NOWHERE), limit)
+    asked = ~on_wall & (depth < 6)
+    right = (np.abs(1 / inverse_depth.numpy() / depth - 1) < 0.03) & (cost.numpy() < 1)
+    assert right[asked].mean() > 0.8 if found else not right[asked].any()
+
+
 def test_of_several_points_in_a_pixel_the_last_counts_on_any_number_of_threads():
     seen = Plate(torch.zeros(6, 8), (8.0, 8.0), (4.0, 3.0), np.eye(4), torch.zeros(6, 8, 2), np.ones((6, 8), bool))
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 40, 20_000)
     points = np.stack([rng.uniform(-0.5, 0.5, 20_000), rng.uniform(-0.375, 0.375, 20_000), np.ones(20_000)], 1) * depth[:, None]
     row, column, z, inside = seen.shown(points)
-    last = np.zeros((6, 8))
+    last = np.full((6, 8), np.nan)
     for r, c, d in zip(row[inside], column[inside], z[inside], strict=True):
         last[r, c] = d
-    cost = torch.zeros(6, 8, planes.PLANES)
-    planes._pin(cost, seen, points, torch.full((6, 8), 0.02))
-    away = np.abs(np.arange(planes.PLANES) - 1 / last[..., None] / 0.02)
-    np.testing.assert_allclose(cost.numpy(), planes.PINNED * np.minimum(away / 2, 1), atol=1e-4)
+    np.testing.assert_allclose(planes._known(seen, points).numpy(), 1 / last, rtol=1e-6)

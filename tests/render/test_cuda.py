@@ -10,7 +10,10 @@ import warp as wp
 from recon.kernels import behind as behind_kernels
 from recon.kernels import descent as descent_kernels
 from recon.kernels import develop as develop_kernels
+from recon.kernels import ground as ground_kernels
+from recon.kernels import planes as planes_kernels
 from recon.kernels import press as press_kernels
+from recon.kernels import scanlines as scanlines_kernels
 from recon.kernels import shutter as shutter_kernels
 from recon.kernels import sight as sight_kernels
 from recon.kernels.similarity import similar_kernel
@@ -63,6 +66,10 @@ KERNELS = {
     "sight": lambda: sight_kernels.mark,
     "similarity": lambda: similar_kernel(wp.float32),
     "shutter": lambda: shutter_kernels.carry,
+    "march": lambda: ground_kernels.march,
+    "look": lambda: planes_kernels.look,
+    "compare": lambda: planes_kernels.compare_kernel(3),
+    "scanlines": lambda: scanlines_kernels.add_paths,
     "behind": lambda: behind_kernels.find_corners,
     "frames": lambda: canonical_kernels.make_frames,
     "settled": lambda: settled_kernels.settle,
