@@ -42,8 +42,8 @@ def above(heights: wp.array2d[float], grid: Grid, eye: wp.vec3d, ray: wp.vec3d, 
 
 @wp.kernel
 def march(
-    heights: wp.array2d[float], grid: Grid, eye: wp.vec3d, rays: wp.array[wp.vec3d], steps: wp.array[wp.float64], rounds: int, level: wp.float64,
-    hits: wp.array[wp.float64],
+    heights: wp.array2d[float], grid: Grid, eye: wp.vec3d, rays: wp.array[wp.vec3d], steps: wp.array[wp.float64], rounds: int,
+    level: wp.float64, hits: wp.array[wp.float64],
     first: int,
 ):  # fmt: skip
     """hits: multiples of rays, of those that fall by more than `level`, at which they come to the field: between the first two of `steps`,

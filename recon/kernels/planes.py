@@ -60,6 +60,14 @@ def numbers(chunk: int):
 
 
 @wp.func
+def part_of_row(item: int, stretch: int, width: int):
+    """Of the at most `stretch` pixels of a row that an item does: the row, the first column, and the one behind the last."""
+    parts = (width + stretch - 1) / stretch
+    left = item % parts * stretch
+    return item / parts, left, wp.min(left + stretch, width)
+
+
+@wp.func
 def matters(bounds: wp.array3d[float], y: int, x: int, chunk: int):
     """Whether a pixel has planes of a chunk between its bounds."""
     return bounds[0, y, x] < float(TILE * (chunk + 1)) and bounds[1, y, x] >= float(TILE * chunk)
@@ -95,19 +103,18 @@ def look(
     shown: wp.array3d[lanes],
     stretch: int, first: int,
 ):  # fmt: skip
-    """What others show on a chunk's planes before a picture: shown `[O, h, w]`.
+    """What others show on a chunk's planes before a picture: shown `[O, h, w]`; an item is a part of a row.
 
     others: `[O, h + 3, w + 3]`, within a border of 0, a pixel to the left and above, two to the right and below; step: inverse depth
     `[h, w]` from plane to plane; near `[2, h, w]`: the first and the last plane that matter to any square with the pixel in it.
     """
     h = shown.shape[1]
     w = shown.shape[2]
+    row, left, right = part_of_row(first + wp.tid(), stretch, w)
+    o = row / h
+    y = row % h
     number = numbers(chunk)
-    begin, end = pixels_of(first + wp.tid(), stretch, shown.shape[0] * h, w)
-    for pixel in range(begin, end):
-        row, x = pixel_of(pixel, w)
-        o = row / h
-        y = row - o * h
+    for x in range(left, right):
         if matters(near, y, x, chunk):
             inverse_depths = number * step[y, x]
             parts = wp.cw_div(lanes(1.0), greater_of(on_axis(motion, o, 2, x, y, inverse_depths), lanes(BEHIND)))
@@ -139,7 +146,7 @@ def compare_kernel(half: int) -> wp.Kernel:
         stretch: int, first: int,
     ):  # fmt: skip
         """What a chunk's planes cost, cost `[h, w, CHUNKS]`: 1 - correlation with `shown`, as `look` leaves it, the mean of the better half
-        of the others (they may not see the place), and `prices`. An item is `stretch` pixels of a row.
+        of the others (they may not see the place), and `prices`. An item is a part of a row.
 
         own `[3, h, w]`: grey levels, and their means and standard deviations in the squares, with noise; bounds `[2, h, w]`: the first and
         the last plane that matter, NaN where none does and none costs more; near: as of `look`; known `[h, w]`: inverse depths, NaN where
@@ -148,9 +155,7 @@ def compare_kernel(half: int) -> wp.Kernel:
         i = first + wp.tid()
         h = cost.shape[0]
         w = cost.shape[1]
-        y = i / ((w + stretch - 1) / stretch)
-        left = i % ((w + stretch - 1) / stretch) * stretch
-        right = wp.min(left + stretch, w)
+        y, left, right = part_of_row(i, stretch, w)
         part = wp.static(1 / (2 * half + 1) ** 2)
         number = numbers(chunk)
         for x in range(left, right):

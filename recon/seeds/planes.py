@@ -59,7 +59,7 @@ def swept(plate: Plate, others: list[Plate], nearest: float, points: np.ndarray,
 def _directions(plate: Plate, others: list[Plate], limit: torch.Tensor) -> list[Direction]:
     """Those of what faces the plate, of the road, where its inverse depth `limit` is known, and of walls along the way to the others."""
     rays, turn, up = plate.rays(), plate.cam_from_world[:3, :3], np.array([0.0, 0.0, 1.0])
-    found = [Direction(torch.ones_like(plate.grey))]
+    found = [Direction(torch.ones(plate.grey.shape))]
     if limit.any():
         found.append(Direction((rays @ torch.from_numpy(turn @ -up).float()).clamp_min(0), LEANING, ABOVE))
     way = max((other.eye() - plate.eye() for other in others), key=lambda way: float(np.linalg.norm(way)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 import torch.nn.functional as F
-import warp as wp
 
 from recon.kernels.planes import CHUNKS, PLANES, Prices, choose, compare_kernel, look
 from recon.kernels.scanlines import Lines, add_paths
@@ -51,16 +50,19 @@ class Volume:
     def best(
         self, step: torch.Tensor, bounds: torch.Tensor, known: torch.Tensor, lowest: torch.Tensor, window: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the best plane costs each pixel, infinite where none matters, and the inverse depth there, NaN where not above plane `lowest`
-        or where no other plate shows it, `[h, w]` each.
+        """What the best plane costs each pixel, infinite where none matters, and the inverse depth there, NaN where it is not beyond plane
+        `lowest` or no other plate shows it, `[h, w]` each.
 
-        step: inverse depth `[h, w]` from plane to plane; bounds `[2, h, w]`: the first and the last plane that matter, NaN where none does;
-        known `[h, w]`: inverse depths, NaN where not known; window: side of the squares that are compared.
+        All maps are on the host. step: inverse depth `[h, w]` from plane to plane; bounds `[2, h, w]`: the first and the last plane that
+        matter, NaN where none does; known `[h, w]`: inverse depths, NaN where not known; window: side of the squares that are compared.
         """
-        with stage(self.plate.grey.device):
+        device = self.plate.grey.device
+        with stage(device):
+            step, bounds, known, lowest = (upload(t, device) for t in (step, bounds, known, lowest))
             self._compare(step, bounds, known, window)
             self._smooth()
-            return self._choose(step, bounds, lowest)
+            least, inverse_depth = self._choose(step, bounds, lowest).cpu()
+        return least, inverse_depth
 
     def _compare(self, step: torch.Tensor, bounds: torch.Tensor, known: torch.Tensor, window: int) -> None:
         grey = self.plate.grey
@@ -80,7 +82,7 @@ class Volume:
         items = h * -(-w // stretch)
         sums = view(torch.empty(items, stretch + 2 * (window // 2), 4, TILE, device=grey.device), lanes)
         for chunk in range(CHUNKS):  # what a chunk needs stays in the cache
-            run_pixels(look, self.shown[..., 0].numel(), [view(self.others, float), *told, spans[1], chunk, shown], grey.device)
+            run(look, len(self.shown) * items, [view(self.others, float), *told, spans[1], chunk, shown, stretch], grey.device)
             args = [view(own, float), shown, *told, *spans, view(known, float), chunk, FLAT, prices, sums, cost, stretch]
             run(compare_kernel(window // 2), items, args, grey.device)
 
@@ -94,14 +96,14 @@ class Volume:
             lines.nudge, lines.jump, lines.edge = NUDGE, JUMP, EDGE
             run(add_paths, many, [lines, cost, view(self.plate.grey.view(-1), float), begun, path, total], self.path.device)
 
-    def _choose(
-        self, step: torch.Tensor, bounds: torch.Tensor, lowest: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        least, inverse_depth = torch.empty(2, *step.shape, device=step.device)
+    def _choose(self, step: torch.Tensor, bounds: torch.Tensor, lowest: torch.Tensor) -> torch.Tensor:
+        """What `best` gives, `[2, h, w]`."""
+        found = torch.empty(2, *step.shape, device=step.device)
+        least, inverse_depth = found
         costs = [view(self.cost, float), view(self.total.view(*step.shape, CHUNKS, TILE), lanes)]
         told = [view(t, float) for t in (step, bounds, lowest)]
         run_pixels(choose, step.numel(), [*costs, *told, UNSEEN, view(least, float), view(inverse_depth, float)], step.device)
-        return least, inverse_depth
+        return found
 
 
 def _pixels_from_cam(plate: Plate) -> np.ndarray:

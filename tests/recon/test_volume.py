@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from recon.kernels.planes import PLANES
 from recon.seeds import volume
-from recon.seeds.stereo import FLAT, GREY, UNSEEN, Plate
+from recon.seeds.stereo import FLAT, UNSEEN, Plate
 from recon.seeds.volume import Volume
 
 HEIGHT, WIDTH, FOCAL, CENTRE = 18, 37, 30.0, (17.5, 9.5)
