@@ -1,5 +1,7 @@
 """The kernels behind planes, against NumPy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,10 +9,12 @@ from scipy import ndimage
 
 from recon.kernels.planes import PLANES
 from recon.seeds import volume
+from recon.seeds.planes import swept
 from recon.seeds.stereo import FLAT, UNSEEN, Plate
 from recon.seeds.volume import Volume
 
 HEIGHT, WIDTH, FOCAL, CENTRE = 18, 37, 30.0, (17.5, 9.5)
+ON_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
 DICE = np.random.default_rng(5)
 
 
@@ -95,3 +99,13 @@ def test_depths_are_the_same_bits_each_time():
     ways = [Volume(own, others).best(step, bounds, known, lowest, 5) for _ in range(2)]
     for first, second in zip(*ways, strict=True):
         assert torch.equal(first.nan_to_num(-1), second.nan_to_num(-1))
+
+
+@ON_A_GPU
+def test_a_gpu_finds_the_depths_that_the_cpu_finds():
+    pictures = [plate(), plate(0.6), plate(-0.5)]
+    there = [replace(p, grey=p.grey.cuda()) for p in pictures]
+    deepest, points = np.full((HEIGHT, WIDTH), np.inf), np.zeros((0, 3))
+    found, on_gpu = (swept(p[0], p[1:], 2.0, points, deepest) for p in (pictures, there))
+    assert (np.isfinite(found) == np.isfinite(on_gpu)).mean() > 0.98
+    assert np.nanquantile(np.abs(on_gpu / found - 1), 0.98) < 1e-3  # two planes may cost the same but for rounding
