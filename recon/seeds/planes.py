@@ -24,7 +24,7 @@ ASKANCE = 0.3
 """Part of the largest cosine between a direction's planes and rays from which on these are compared: others hardly meet the planes."""
 
 ABOVE = 1.4
-"""Times as far below the eye as the road at most, planes that lie as the road does may be."""
+"""How many times nearer below the eye than the road is, planes that lie as it does may be at most."""
 
 ON_LIMIT = 0.25
 """How many planes above the ground nothing is believed."""
