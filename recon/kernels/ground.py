@@ -42,18 +42,18 @@ def above(heights: wp.array2d[float], grid: Grid, eye: wp.vec3d, ray: wp.vec3d, 
 
 @wp.kernel
 def march(
-    heights: wp.array2d[float], grid: Grid, eye: wp.vec3d, rays: wp.array[wp.vec3d], steps: wp.array[wp.float64], rounds: int,
-    level: wp.float64, hits: wp.array[wp.float64],
+    heights: wp.array2d[float], grid: Grid, slope: wp.vec2d, eye: wp.vec3d, rays: wp.array[wp.vec3d], steps: wp.array[wp.float64],
+    rounds: int, level: wp.float64, hits: wp.array[wp.float64],
     first: int,
 ):  # fmt: skip
-    """hits: multiples of rays, of those that fall by more than `level`, at which they come to the field: between the first two of `steps`,
+    """hits: multiples of rays, of those that fall by more than `level`, or do against ground of a `slope` along x and y, at which they come to the field: between the first two of `steps`,
     from the eye on, that are above and under it, by `rounds` of false position. Infinite where there are none."""
     i = first + wp.tid()
     ray = rays[i]
     hits[i] = wp.float64(wp.inf)
     near = wp.float64(0.0)
     over = above(heights, grid, eye, ray, near)
-    if ray[2] < -level and over > NONE:
+    if ray[2] < wp.max(NONE, slope[0] * ray[0] + slope[1] * ray[1]) - level and over > NONE:
         n = int(0)
         far = steps[0]
         under = above(heights, grid, eye, ray, far)

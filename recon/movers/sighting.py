@@ -57,6 +57,12 @@ HIDDEN, HIDING = 0.07, 1.3
 """By how much something that stands nearer, by this part of inverse depth at least, may look more alike than the ground before a thing:
 what hides that hides its foot, and a tree behind a parked car seems to come."""
 
+LEVEL = 0.3
+"""Cosine between down a picture and down, at least."""
+
+CLIMB = 3
+"""Places of a path to either side of one, by which it is told how steep it is there."""
+
 APART = 0.6
 """Of a rear's width: two things in a picture are that far apart at least."""
 
@@ -66,7 +72,8 @@ class Sighting:
     """Something that moves, in a picture at `time_us`: where the middle of its end that looks at us stands `[2]`, the street's direction
     there `[2]`, how far ahead of the camera what is seen of it is, and its speeds along the street and to its left in m/s, `speed` and
     `aside`; by how much it looks more alike than what stands still, `worth`, and the ground before it than if it went on there, `grounded`.
-    cut: whether the picture's border is so near that there may be more of it beyond."""
+    cut: whether the picture's border is so near that there may be more of it beyond; rise: metres that the street climbs with every one of
+    it."""
 
     time_us: int
     place: np.ndarray
@@ -77,6 +84,7 @@ class Sighting:
     worth: float
     grounded: float
     cut: bool
+    rise: float = 0.0
 
     @property
     def axes(self) -> np.ndarray:
@@ -101,7 +109,7 @@ def sightings(
     plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], ground: Ground, path: np.ndarray, pace: float
 ) -> list[Sighting]:
     """What moves in a plate taken at a time, best first. sides: plates of its size before it, and after it, with their times; path:
-    places `[N, 2]` of the body, in order, each some way from the last; pace: its speed then."""
+    places `[N, 3]` of the body, in order, each some way from the last; pace: its speed then."""
     if not sides:
         return []
     eye, speeds = plate.eye(), np.arange(-ONCOMING, pace + PASSING, 1.0)
@@ -118,8 +126,8 @@ def sightings(
         before = slice(bottom + WINDOW // 2, None)
         if bottom < WINDOW or len(of_ground[rows][before]) < 2:
             continue
-        along = _along(path, eye[:2] + z * plate.axis()[:2])
-        ways = [[(other, np.outer(speeds * (t - time_us) / 1e6, [*along, 0.0])) for other, t in side] for side in sides]
+        along, rise = _along(path, eye[:2] + z * plate.axis()[:2])
+        ways = [[(other, np.outer(speeds * (t - time_us) / 1e6, [*along, rise])) for other, t in side] for side in sides]
         moving = unlike(plate, ways, rows, float(z)).numpy()
         allowed = (inverse_depths[:, None, None] <= NEARER / z) & (inverse_depths[:, None, None] >= UNDER / torch.from_numpy(deepest[rows]))
         stands = np.minimum(torch.where(allowed, standing[:, rows], torch.inf).amin(0).numpy(), of_ground[rows])
@@ -134,7 +142,7 @@ def sightings(
         for x in np.flatnonzero(fits):
             cut = not across < x < len(stands[0]) - across
             told = float(z), float(speeds[best[x]]), 0.0, float(worth[x]), float(grounded[x])
-            one = Sighting(time_us, eye[:2], along, *told, cut)  # its outline tells where it is
+            one = Sighting(time_us, eye[:2], along, *told, cut, rise)  # its outline tells where it is
             score = float(worth[x] + min(grounded[x], worth[x]))
             found.append(_Found(score, one, int(x), across, slice(rows.start, rows.start + bottom), worths[best[x]]))
     kept: list[_Found] = []
@@ -150,8 +158,8 @@ def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: 
     seen = [_shown(plate, x, one) for x in (found.x, *outline(found.worths, shown))]
     part = replace(plate, grey=plate.grey[:, shown], centre=(plate.centre[0] - shown.start, plate.centre[1]))
     speeds = np.stack(np.meshgrid(one.speed + DRIFTS[0], DRIFTS[1]), -1).reshape(-1, 2)
-    flat = np.column_stack([speeds @ one.axes, np.zeros(len(speeds))])
-    ways = [[(other, flat * (t - one.time_us) / 1e6) for other, t in side] for side in sides]
+    each = np.column_stack([speeds @ one.axes, one.rise * speeds[:, 0]])
+    ways = [[(other, each * (t - one.time_us) / 1e6) for other, t in side] for side in sides]
     speed, aside = speeds[int(unlike(part, ways, found.rows, one.away).mean((1, 2)).argmin())]
     return replace(one, place=plate.eye()[:2] + facing_us(*seen) @ one.axes, speed=float(speed), aside=float(aside))
 
@@ -193,10 +201,12 @@ def _shown(plate: Plate, column: int, one: Sighting) -> np.ndarray:
 def _base(plate: Plate, ground: Ground, z: float) -> float:
     """The row at which what is z ahead stands, in the median over the columns."""
     x = (np.arange(0, plate.grey.shape[1], 8) + 0.5 - plate.centre[0]) / plate.focal[0]
-    at = plate.eye() + z * np.stack([x, np.zeros_like(x), np.ones_like(x)], 1) @ plate.cam_from_world[:3, :3]
-    at[:, 2] = ground.height(torch.from_numpy(at[:, :2].copy())).numpy()
-    local = (at - plate.eye()) @ plate.cam_from_world[:3, :3].T
-    return float(np.median(local[:, 1] / local[:, 2] * plate.focal[1] + plate.centre[1]))
+    turn, y = plate.cam_from_world[:3, :3], np.zeros_like(x)
+    for _ in range(3):  # down the picture, which on a hill is not down
+        at = plate.eye() + z * np.stack([x, y, np.ones_like(x)], 1) @ turn
+        above = at[:, 2] - ground.height(torch.from_numpy(at[:, :2].copy())).numpy()
+        y += above / (z * max(-turn[1, 2], LEVEL))
+    return float(np.median(y * plate.focal[1] + plate.centre[1]))
 
 
 def hiding(standing: torch.Tensor, nearer: torch.Tensor, across: int) -> np.ndarray:
@@ -206,11 +216,16 @@ def hiding(standing: torch.Tensor, nearer: torch.Tensor, across: int) -> np.ndar
     return _beside(costs, across).min(0, initial=np.inf)
 
 
-def _along(path: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """The unit direction `[2]` of a path where it is nearest to a place."""
-    nearest = int(np.linalg.norm(path - place, axis=1).argmin())
-    way = path[min(nearest + 1, len(path) - 1)] - path[max(nearest - 1, 0)]
-    return way / np.linalg.norm(way)
+def _along(path: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
+    """The unit direction `[2]` in plan of a path `[N, 3]` where it is nearest to a place `[2]`, and metres that it climbs with every one:
+    what drives there climbs, too, by half a metre from picture to picture on a steep street."""
+    nearest = int(np.linalg.norm(path[:, :2] - place, axis=1).argmin())
+
+    def way(reach: int) -> np.ndarray:
+        return path[min(nearest + reach, len(path) - 1)] - path[max(nearest - reach, 0)]
+
+    ahead, steep = way(1)[:2], way(CLIMB)
+    return ahead / np.linalg.norm(ahead), float(steep[2] / np.linalg.norm(steep[:2]))
 
 
 def _beside(costs: np.ndarray, across: int) -> np.ndarray:

@@ -91,10 +91,10 @@ def spaced(views: Sequence[View]) -> list[View]:
 
 
 def way_of(places: np.ndarray) -> np.ndarray:
-    """Those of places `[T, 3]` in the plane `[N, 2]` that are a `STRIDE` from the last one each."""
-    way = [places[0, :2]]
-    for place in places[1:, :2]:
-        if np.linalg.norm(place - way[-1]) > STRIDE:
+    """Those of places `[T, 3]` that are a `STRIDE` in plan from the last one each, `[N, 3]`."""
+    way = [places[0]]
+    for place in places[1:]:
+        if np.linalg.norm(place[:2] - way[-1][:2]) > STRIDE:
             way.append(place)
     return np.array(way)
 

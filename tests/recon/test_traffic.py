@@ -1,5 +1,6 @@
 """Painted cars that go along a painted street, which pictures alone show."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -60,6 +61,24 @@ def test_what_goes_along_the_street_is_found_where_it_is(start, speed, left):
     assert np.median(np.abs(off[:, 0])) < 2.5 and np.median(np.abs(off[:, 1])) < 0.7
     assert abs(went[0] - speed) < 2.0
     assert float(track.world_from_box[0, 0, 0]) * speed > 0
+
+
+@pytest.mark.parametrize(("start", "speed", "left"), [(9.0, 7.5, -0.5), (24.0, -6.0, 1.6)], ids=["ahead", "oncoming"])
+def test_what_goes_up_or_down_a_steep_street_is_found(start, speed, left):
+    """From picture to picture it climbs by a part of its own height."""
+    climb = math.radians(8)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = math.cos(climb)
+    turn[2, 0], turn[0, 2] = math.sin(climb), -math.sin(climb)
+    log = drive(STEPS, ("front",), rears=(lambda seconds: (start + speed * seconds, left + seconds * speed / 12),))
+    cameras = {name: replace(camera, world_from_cam=turn @ camera.world_from_cam) for name, camera in log.cameras.items()}
+    log = replace(log, ego=replace(log.ego, world_from_body=turn @ log.ego.world_from_body), cameras=cameras)
+    heights = math.tan(climb) * (FLAT.origin[0] + FLAT.cell * torch.arange(300)).expand(300, 300).contiguous()
+    (track,) = traffic(log, load_frames(log, ["front"], (0, 10**18), SIZE, 8), replace(FLAT, heights=heights))
+    places = np.array([start + speed * t / 1e6 + CAR[0] / 2 for t in track.times_us]) * math.cos(climb)
+    middles = track.world_from_box[:, :3, 3].numpy()
+    assert len(track.times_us) > 8 and np.median(np.abs(middles[:, 0] - places)) < 2.5
+    assert np.abs(middles[:, 2] - math.tan(climb) * middles[:, 0]).max() < 0.1
 
 
 def test_what_drifts_towards_us_comes_as_fast_as_it_is():
