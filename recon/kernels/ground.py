@@ -46,8 +46,9 @@ def march(
     rounds: int, level: wp.float64, hits: wp.array[wp.float64],
     first: int,
 ):  # fmt: skip
-    """hits: multiples of rays, of those that fall by more than `level`, or do against ground of a `slope` along x and y, at which they come to the field: between the first two of `steps`,
-    from the eye on, that are above and under it, by `rounds` of false position. Infinite where there are none."""
+    """hits: multiples of rays, of those that fall by more than `level`, or do against ground of a `slope` along x and y, at which they come
+    to the field: between the first two of `steps`, from the eye on, that are above and under it, by `rounds` of false position. Infinite
+    where there are none."""
     i = first + wp.tid()
     ray = rays[i]
     hits[i] = wp.float64(wp.inf)
