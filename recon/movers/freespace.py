@@ -37,10 +37,9 @@ TURN = 16
 @dataclass(frozen=True)
 class RangeImage:
     """What one lidar saw in a sweep: `range_m` `[H, W]`, how far it saw in each direction, elevation by azimuth in cells of `cell` degrees;
-    inf where nothing came back, as in its first row and its last, -inf where what did is not
-    to count (`without`). `clear_m` is the least of a cell and its eight neighbours, `told` how
-    many of them had a return. Rows begin `lowest` cells above straight down. `stood` `[W, 3]` is where it was when it looked at an azimuth,
-    `middle` `[3]` where it was half-way."""
+    inf where nothing came back, as in its first row and its last, -inf where what did is not to count (`without`). `clear_m` is the least
+    of a cell and its eight neighbours, `told` how many of them had a return. Rows begin `lowest` cells above straight down. `stood`
+    `[W, 3]` is where it was when it looked at an azimuth, `middle` `[3]` where it was half-way."""
 
     range_m: np.ndarray
     clear_m: np.ndarray
