@@ -40,10 +40,10 @@ class Clear:
     @staticmethod
     def of(log: Log, span_us: tuple[int, int], ground: Ground) -> Clear:
         """By some of a log's sweeps within a span of time. What they struck of what moves is not there."""
-        images = []
+        images, movers = [], [track for track in log.tracks if track.moving]
         for sweep in spread(log.sweeps_within(span_us), LOOKS):
             points = sweep.read()
-            moves = points.xyz[_in_boxes(points.xyz, [t for t in log.tracks if t.moving], sweep.time_us)]
+            moves = points.xyz[_in_boxes(points.xyz, movers, sweep.time_us)]
             images += [image.without(moves) for _, image in range_images(log, [(sweep.time_us, points)])]
         return Clear(images, ground)
 

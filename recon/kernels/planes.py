@@ -5,7 +5,7 @@ from functools import cache
 
 import warp as wp
 
-from render.kernels.lanewise import cut, greater, lesser
+from render.kernels.lanewise import cut, greater, greater_of, lesser_of, roots, smallest
 from render.kernels.types import OPTIONS, TILE, lanes, pixel_of, pixels_of
 
 wp.set_module_options(OPTIONS)
@@ -21,36 +21,6 @@ NEAREST = wp.constant(0.1)
 
 BEHIND = wp.constant(1.0e-3)
 """What depths are divided by at least."""
-
-
-@wp.func
-def lesser_of(a: lanes, b: lanes):
-    return lanes(
-        lesser(a[0], b[0]), lesser(a[1], b[1]), lesser(a[2], b[2]), lesser(a[3], b[3]),
-        lesser(a[4], b[4]), lesser(a[5], b[5]), lesser(a[6], b[6]), lesser(a[7], b[7]),
-        lesser(a[8], b[8]), lesser(a[9], b[9]), lesser(a[10], b[10]), lesser(a[11], b[11]),
-        lesser(a[12], b[12]), lesser(a[13], b[13]), lesser(a[14], b[14]), lesser(a[15], b[15]),
-    )  # fmt: skip
-
-
-@wp.func
-def greater_of(a: lanes, b: lanes):
-    return -lesser_of(-a, -b)
-
-
-@wp.func
-def smallest(v: lanes):
-    a = lesser(lesser(lesser(v[0], v[8]), lesser(v[4], v[12])), lesser(lesser(v[2], v[10]), lesser(v[6], v[14])))
-    b = lesser(lesser(lesser(v[1], v[9]), lesser(v[5], v[13])), lesser(lesser(v[3], v[11]), lesser(v[7], v[15])))
-    return lesser(a, b)
-
-
-@wp.func
-def roots(v: lanes):
-    return lanes(
-        wp.sqrt(v[0]), wp.sqrt(v[1]), wp.sqrt(v[2]), wp.sqrt(v[3]), wp.sqrt(v[4]), wp.sqrt(v[5]), wp.sqrt(v[6]), wp.sqrt(v[7]),
-        wp.sqrt(v[8]), wp.sqrt(v[9]), wp.sqrt(v[10]), wp.sqrt(v[11]), wp.sqrt(v[12]), wp.sqrt(v[13]), wp.sqrt(v[14]), wp.sqrt(v[15]),
-    )  # fmt: skip
 
 
 @wp.func

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from recon.kernels.planes import CHUNKS, lesser_of, smallest
+from recon.kernels.planes import CHUNKS
+from render.kernels.lanewise import lesser_of, smallest
 from render.kernels.types import OPTIONS, lanes
 
 wp.set_module_options(OPTIONS)

@@ -103,6 +103,40 @@ def largest(v: lanes):
 
 
 @wp.func
+def lesser_of(a: lanes, b: lanes):
+    """The lesser of both."""
+    return lanes(
+        lesser(a[0], b[0]), lesser(a[1], b[1]), lesser(a[2], b[2]), lesser(a[3], b[3]),
+        lesser(a[4], b[4]), lesser(a[5], b[5]), lesser(a[6], b[6]), lesser(a[7], b[7]),
+        lesser(a[8], b[8]), lesser(a[9], b[9]), lesser(a[10], b[10]), lesser(a[11], b[11]),
+        lesser(a[12], b[12]), lesser(a[13], b[13]), lesser(a[14], b[14]), lesser(a[15], b[15]),
+    )  # fmt: skip
+
+
+@wp.func
+def greater_of(a: lanes, b: lanes):
+    """The greater of both."""
+    return -lesser_of(-a, -b)
+
+
+@wp.func
+def smallest(v: lanes):
+    """The smallest lane."""
+    a = lesser(lesser(lesser(v[0], v[8]), lesser(v[4], v[12])), lesser(lesser(v[2], v[10]), lesser(v[6], v[14])))
+    b = lesser(lesser(lesser(v[1], v[9]), lesser(v[5], v[13])), lesser(lesser(v[3], v[11]), lesser(v[7], v[15])))
+    return lesser(a, b)
+
+
+@wp.func
+def roots(v: lanes):
+    """The square root of each lane."""
+    return lanes(
+        wp.sqrt(v[0]), wp.sqrt(v[1]), wp.sqrt(v[2]), wp.sqrt(v[3]), wp.sqrt(v[4]), wp.sqrt(v[5]), wp.sqrt(v[6]), wp.sqrt(v[7]),
+        wp.sqrt(v[8]), wp.sqrt(v[9]), wp.sqrt(v[10]), wp.sqrt(v[11]), wp.sqrt(v[12]), wp.sqrt(v[13]), wp.sqrt(v[14]), wp.sqrt(v[15]),
+    )  # fmt: skip
+
+
+@wp.func
 def total(v: lanes):
     """The sum of all lanes."""
     a = ((v[0] + v[8]) + (v[4] + v[12])) + ((v[2] + v[10]) + (v[6] + v[14]))
