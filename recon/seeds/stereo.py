@@ -102,32 +102,26 @@ def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], ro
             there = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
             moved = torch.from_numpy(ways @ other.cam_from_world[:3, :3].T).float() + there[:3, 3]
             x, y, z = (there[:3, :3] @ local.flatten(1)).reshape(local.shape)[:, None] + moved.T[:, :, None, None]
-            cost, inside = compared(own, moments, other, x, y, z)
+            cost, inside = _compared(own, moments, other, x, y, z)
             seen = inside & (z > 0.5)
             total, count = total + torch.where(seen, cost, 0.0), count + seen
         of_sides.append(torch.where(count > 0, total / count.clamp_min(1), UNSEEN))
     return torch.stack(of_sides).amin(0)
 
 
-def compared(
-    own: torch.Tensor,
-    moments: tuple[torch.Tensor, torch.Tensor],
-    other: Plate,
-    x: torch.Tensor,
-    y: torch.Tensor,
-    z: torch.Tensor,
-    window: int = WINDOW,
+def _compared(
+    own: torch.Tensor, moments: tuple[torch.Tensor, torch.Tensor], other: Plate, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """1 - correlation, in squares of a side, of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]`
-    before it, and whether these are in its view."""
+    """1 - correlation, in squares, of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]` before
+    it, and whether these are in its view."""
     h, w = other.grey.shape
     behind = 1 / z.clamp_min(1e-3)
     u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
     v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
     grid = torch.stack([u, v], -1).clamp_(-3, 3)
     shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
-    (mean, spread), (their_mean, their_spread) = moments, moments_of(shown, window)
-    return 1 - (box_means(shown * own, window) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
+    (mean, spread), (their_mean, their_spread) = moments, moments_of(shown)
+    return 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
 
 
 def box_means(maps: torch.Tensor, window: int = WINDOW) -> torch.Tensor:
