@@ -11,7 +11,7 @@ import torch
 
 from recon.fit.model import Splats
 from recon.log import Track
-from recon.objects.actors import APART_US
+from recon.objects.curves import APART_US
 from scenes.ground import Ground
 
 CELL = 0.2

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from recon.log import Log, Sweep, Track
+from recon.objects.curves import APART_US, curved
 from scenes.poses import inverse
 from scenes.trajectory import all_at, all_near
 
@@ -29,16 +30,13 @@ ALIKE_US = 250_000
 """Before and after a box, within which others of its track are scanned at nearly the same phase of a sweep: the lidar turns, and in a
 second a car may come from ahead to beside it."""
 
-APART_US = 750_000
-"""Between a track's boxes at most, for it to be known between them: nuScenes annotates every half second."""
-
 
 @dataclass(frozen=True)
 class Split:
     """Points sorted by what they belong to.
 
     static: xyz `[N, 3]` and the sweep's index `[N]`; actors: per track name local points `[N, 3]` in the box frame and the sweep's
-    index `[N]`; tracks: the moving tracks, their times corrected to when the lidar passed over the box.
+    index `[N]`; tracks: the moving tracks, their times corrected to when the lidar passed over the box, and `curved` between them.
     """
 
     static: np.ndarray
@@ -103,6 +101,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
         points.append((read.xyz, read.times_us))
     usual = float(np.median(offsets)) if offsets else 0.0
     retimed = [_retimed(t, scanned[t.name], usual) for t in tracks]
+    retimed = [(curved(track), smooth) for track, smooth in retimed]
     corrected = tuple(track for track, _ in retimed)
 
     # of a long drive there is no room for a point twice: what is sorted takes the place of what was read

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from recon.log import Track
-from recon.objects.actors import APART_US
+from recon.objects.curves import APART_US
 from scenes.poses import inverse, pose_from
 from scenes.trajectory import Trajectory
 
