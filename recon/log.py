@@ -139,7 +139,8 @@ class Log:
 
     `front` names the cameras that a reconstruction takes where nobody names any; the first one where it is empty. `points` stand
     in for lidar where the poses come from pictures. `lidars` is where they stand in the body, `[3]` by the points' sensor number; of a
-    sensor that it lacks that is not known. `meta["metric"]` is False where the world's unit is not the metre.
+    sensor that it lacks that is not known. `meta["metric"]` is False where the world's unit is not the metre, `meta["heights"]` where the
+    path has none.
     """
 
     name: str

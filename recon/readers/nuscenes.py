@@ -1,10 +1,10 @@
 """Reads a scene of nuScenes from its json tables (Caesar et al. 2020; the tables as in the devkit's docs/schema_nuscenes.md).
 
 `nuscenes/scene-0061`: the data set's folder, with samples/, perhaps sweeps/, and a v1.0-*/ of tables, then the scene's name. The body is
-the ego frame (rear axle, x forward, y left, z up), the world the map less its place at the start. Boxes are annotated at 2 Hz, centres
-and sizes as width, length, height. Sweeps are published free of the car's own motion, without a time for each point: the lidar turns
-clockwise, 20 times a second, until the sweep's stamp, and cameras are triggered as it comes across the middle of what they see
-(forum.nuscenes.org, topic 245), so their stamps tell when it looked where.
+the ego frame (rear axle, x forward, y left, z up), the world the map less its place at the start; its height is always 0. Boxes are
+annotated at 2 Hz, centres and sizes as width, length, height. Sweeps are published free of the car's own motion, without a time for each
+point: the lidar turns clockwise, 20 times a second, until the sweep's stamp, and cameras are triggered as it comes across the middle of
+what they see (forum.nuscenes.org, topic 245), so their stamps tell when it looked where.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ def read_nuscenes(path: Path) -> Log:
     meta: dict = {
         "name": f"nuscenes-{scene['name']}", "source": f"nuScenes {scene['name']}", "licence": "CC BY-NC-SA 4.0",
         "attribution": "nuScenes by Motional", "body": "ego frame, x forward, y left, z up", "world_origin": origin.tolist(),
+        "heights": False,
     }  # fmt: skip
     tracks = _tracks(tables, samples, by_channel.get("LIDAR_TOP", []), home, ego)
     front = tuple(n for n in FRONT if n in cameras)

@@ -56,8 +56,10 @@ WHOLE = (0.05, 0.05, 0.05, 2.0, 2.0, 2.0)
 PROBE = 4
 """Every how many sweeps one is tried, to see whether anything has to be corrected."""
 
-WORTH = 0.03
-"""Metres by which corrections of sweeps that are registered to each other must differ for corrections to be made."""
+WORTH, UNKNOWN = 0.03, 0.001
+"""Metres by which corrections of sweeps that are registered to each other must differ for corrections to be made; the second where the log
+records no heights: a car goes up and down on its springs by centimetres, and pictures of the road then do not tell how cameras are mounted.
+"""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lamb
         return [kept[turn[0].index] for turn in some]
 
     turns = _turns(sweeps)
-    if len(turns) < 2 * PROBE or _unlike(_corrections(surfaces(turns[::PROBE]), PROBE), PROBE) < WORTH:
+    worth = WORTH if log.meta.get("heights", True) else UNKNOWN
+    if len(turns) < 2 * PROBE or _unlike(_corrections(surfaces(turns[::PROBE]), PROBE), PROBE) < worth:
         return log
     found = _corrections(surfaces(turns))
     print(f"{log.path}: its sweeps lie up to {_unlike(found):.2f} m apart by its recorded poses, which are corrected", file=sys.stderr)

@@ -93,6 +93,14 @@ def test_a_drive_whose_sweeps_meet_is_left_alone(capsys):
     assert aligned(bare, bare.sweeps) is bare
 
 
+def test_heights_that_are_not_recorded_are_found_however_small_they_are(capsys):
+    log, _ = drifting(height=0.02)
+    assert aligned(log, log.sweeps) is log
+    better = aligned(replace(log, meta={"heights": False}), log.sweeps)
+    assert apart(log.tracks[0].world_from_box) > 0.01 and "which are corrected" in capsys.readouterr().err
+    assert apart(better.tracks[0].world_from_box) < 0.004
+
+
 def test_sweeps_that_are_left_out_go_along(drift=0.4):
     """Those against which a scene is measured take no part, and are moved as their neighbours are."""
     log, back = drifting(height=drift)

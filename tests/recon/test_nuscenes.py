@@ -31,6 +31,7 @@ def test_a_scene_reads_as_it_was_recorded(data_set, recorded):
     log = open_log(data_set / "scene-0061")
     check(log, recorded, NAMES)
     assert log.front == ("CAM_FRONT", "CAM_FRONT_RIGHT") and len(log.tracks) == 2 and log.name == "nuscenes-scene-0061"
+    assert log.meta["heights"] is False
 
 
 @pytest.mark.parametrize(("late", "known"), [({"CAM_FRONT": -35_278, "CAM_FRONT_RIGHT": -35_278}, True), ({}, False)])
