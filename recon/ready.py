@@ -11,6 +11,7 @@ from recon.evaluation.offpath import held_out_sweeps
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
+from recon.movers.steadying import steadied
 from recon.objects.leaning import leaning
 from recon.registration.adjust import adjusted
 from recon.registration.align import aligned
@@ -79,7 +80,7 @@ def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
             found = with_movers(log, sweeps, steps.step)
         print(f"{log.path} has no boxes: its lidar shows {moving_things(len(found.tracks))}", file=sys.stderr)
         log = _moved_by(log, found.tracks)
-    return leaning(log, sweeps)
+    return leaning(steadied(log, sweeps), sweeps)
 
 
 def moving_things(count: int) -> str:

@@ -76,11 +76,7 @@ def smoothed(
     `OFF` every way where None. speeds: how fast they went, too, `[T, 2]` in m/s, and how far off each of both is, `[2]`."""
     knots = np.union1d(times, at)
     seen = np.searchsorted(knots, times)
-    bend = np.zeros((max(len(knots) - 2, 0), len(knots)))
-    for i, (before, after) in enumerate(zip(np.diff(knots)[:-1], np.diff(knots)[1:], strict=True)):
-        half = (before + after) / 2
-        # the force that bends the way, over the time that it has: white noise of the size PUSH a second
-        bend[i, i : i + 3] = np.array([1 / before, -1 / before - 1 / after, 1 / after]) / half * np.sqrt(half) / PUSH
+    bend = bends(knots) / PUSH
     told = np.broadcast_to(np.eye(2) / OFF**2, (len(times), 2, 2)) if told is None else told
     calm = (bend.T @ bend + 1e-9 * np.eye(len(knots)))[:, :, None, None] * np.eye(2)
     drawn = np.zeros((len(knots), 2))
@@ -100,6 +96,16 @@ def smoothed(
         off = found[seen] - places
         weight = np.minimum(1, 3 / np.sqrt(np.maximum(np.einsum("ti,tij,tj->t", off, told, off), 1e-9)))
     return found[np.searchsorted(knots, at)]
+
+
+def bends(seconds: np.ndarray) -> np.ndarray:
+    """What makes of places at rising seconds `[K]` the forces that bend the way between them, each over the square root of the time that it
+    has, `[K - 2, K]`: white noise."""
+    bend = np.zeros((max(len(seconds) - 2, 0), len(seconds)))
+    for i, (before, after) in enumerate(zip(np.diff(seconds)[:-1], np.diff(seconds)[1:], strict=True)):
+        half = (before + after) / 2
+        bend[i, i : i + 3] = np.array([1 / before, -1 / before - 1 / after, 1 / after]) / half * np.sqrt(half)
+    return bend
 
 
 def headings(middles: np.ndarray, chord: float) -> np.ndarray:

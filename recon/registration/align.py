@@ -25,21 +25,17 @@ from scenes.poses import small_poses
 APART = (1, 3, 9, 27)
 """Numbers of sweeps between those that are registered to each other."""
 
-CELL, FARTHEST = 0.25, 60.0
-"""Metres: a sweep keeps one point in each such cell, and none from farther away."""
-
-KEPT = 8000
-"""Points of these, spread evenly, at which a plane is fitted."""
-
-NEIGHBOURS, FLAT = 12, 0.1
-"""Points that span a plane, and its largest thickness, as a part of its smaller extent; the smaller extent must be at least as large a part
-of the larger, or the points lie on one of the lidar's rings and could span anything."""
+FARTHEST = 60.0
+"""Metres: a sweep keeps no points from farther away."""
 
 TOGETHER_US = 25_000
 """Sweeps that begin within this time are one: a car's lidars turn together."""
 
 SAMPLES = 1500
 """Points of a sweep that are registered to another one."""
+
+FEWEST = 50
+"""Of these, those that must meet a surface of it."""
 
 REACH = (1.0, 0.7, 0.5, 0.3, 0.3)
 """Metres up to which a plane is searched for, round by round."""
@@ -63,6 +59,25 @@ records no heights: a car goes up and down on its springs by centimetres, and pi
 
 
 @dataclass(frozen=True)
+class Grain:
+    """How finely surfaces are told: one point is kept in each `cell` of so many metres, and at `kept` of these, spread evenly, a plane is
+    fitted to so many `neighbours`. It is at most as thick as a part `flat` of its smaller extent, and goes through that point, or `amid`
+    them all: points of one sweep are as thick as its lidar's noise, those of many as these are apart."""
+
+    cell: float
+    kept: int
+    neighbours: int
+    flat: float
+    amid: bool = False
+
+
+STREET = Grain(cell=0.25, kept=8000, neighbours=12, flat=0.1)
+
+NARROW = 0.1
+"""Part of a plane's larger extent that the smaller one must be, or its points lie on one of the lidar's rings and could span anything."""
+
+
+@dataclass(frozen=True)
 class Surfaces:
     """Points `[N, 3]` of a sweep where a surface is flat, its normals there, and where the body stood, in the world as recorded."""
 
@@ -72,20 +87,26 @@ class Surfaces:
     tree: cKDTree
 
     @staticmethod
-    def of(xyz: np.ndarray, centre: np.ndarray) -> Surfaces:
+    def of(xyz: np.ndarray, centre: np.ndarray, grain: Grain = STREET) -> Surfaces:
         near = xyz[np.linalg.norm(xyz - centre, axis=1) < FARTHEST]
-        cells = np.floor((near - centre) / CELL).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
-        thin = near[np.unique(cells, return_index=True)[1]]
-        if len(thin) < NEIGHBOURS:
+        thin = near[thinned(near - centre, grain.cell)]
+        if len(thin) < grain.neighbours:
             return Surfaces(thin[:0], thin[:0], centre, cKDTree(np.zeros((1, 3))))
-        some = thin[:: max(1, len(thin) // KEPT)]
-        around = thin[cKDTree(thin).query(some, NEIGHBOURS)[1]]
-        around -= around.mean(1, keepdims=True)
+        some = thin[:: max(1, len(thin) // grain.kept)]
+        around = thin[cKDTree(thin).query(some, grain.neighbours)[1]]
+        middles = around.mean(1)
+        around -= middles[:, None]
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
         extent = np.sqrt(values.clip(0))
-        flat = (extent[:, 0] < FLAT * extent[:, 1]) & (extent[:, 1] > FLAT * extent[:, 2])
-        kept = some[flat]
+        flat = (extent[:, 0] < grain.flat * extent[:, 1]) & (extent[:, 1] > NARROW * extent[:, 2])
+        kept = (middles if grain.amid else some)[flat]
         return Surfaces(kept, vectors[flat, :, 0], centre, cKDTree(kept if len(kept) else np.zeros((1, 3))))
+
+
+def thinned(points: np.ndarray, cell: float) -> np.ndarray:
+    """Indices of one of the points `[N, 3]` in each cell of so many metres."""
+    cells = np.floor(points / cell).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
+    return np.unique(cells, return_index=True)[1]
 
 
 def aligned(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = lambda: None) -> Log:
@@ -151,27 +172,30 @@ def _corrections(clouds: list[Surfaces], step: int = 1) -> np.ndarray:
     centres = np.stack([c.centre for c in clouds])
     for reach in REACH:
         poses = about(centres, deltas).numpy()
-        blocks = [_pair(clouds[i], clouds[j], poses[i], poses[j], reach) for i, j in pairs]
+        blocks = [met(clouds[i].points, centres[i], clouds[j], poses[i], poses[j], reach, FEWEST) for i, j in pairs]
         deltas = _solved(deltas, pairs, blocks, step)
     turn, away = deltas[:, :3].mean(0), centres - centres.mean(0)  # sweeps do not tell how they lie as a whole: as they did in the mean
     deltas[:, 3:] -= np.cross(turn, away)
     return deltas - deltas.mean(0)
 
 
-def _pair(one: Surfaces, other: Surfaces, pose: np.ndarray, other_pose: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations `[12, 12]`, `[12]` of laying points of one cloud on the surfaces of another, for further small motions of both."""
-    points = one.points[:: max(1, len(one.points) // SAMPLES)]
+def met(
+    points: np.ndarray, centre: np.ndarray, other: Surfaces, pose: np.ndarray, other_pose: np.ndarray, reach: float, fewest: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations `[12, 12]`, `[12]` of laying some of the points `[N, 3]` of one cloud, which stood at `centre`, on the surfaces of
+    another within `reach` metres, for further small motions of both; zeros where fewer than so many points meet them."""
+    points = points[:: max(1, len(points) // SAMPLES)]
     here = points @ pose[:3, :3].T + pose[:3, 3]
     there = (here - other_pose[:3, 3]) @ other_pose[:3, :3]
     away, nearest = other.tree.query(there, distance_upper_bound=reach)
-    met = np.isfinite(away) & (nearest < len(other.points))
-    if met.sum() < 50:
+    meets = np.isfinite(away) & (nearest < len(other.points))
+    if meets.sum() < fewest:
         return np.zeros((12, 12)), np.zeros(12)
-    here, nearest = here[met], nearest[met]
+    here, nearest = here[meets], nearest[meets]
     surface = other.points[nearest] @ other_pose[:3, :3].T + other_pose[:3, 3]
     normal = other.normals[nearest] @ other_pose[:3, :3].T
     off = ((here - surface) * normal).sum(1)
-    jacobian = np.concatenate([np.cross(here - one.centre, normal), normal, -np.cross(surface - other.centre, normal), -normal], 1)
+    jacobian = np.concatenate([np.cross(here - centre, normal), normal, -np.cross(surface - other.centre, normal), -normal], 1)
     spread = max(0.02, 1.5 * float(np.median(np.abs(off))))
     weight = 1 / (1 + (off / spread) ** 2) / (ALIKE * spread**2)
     return (jacobian * weight[:, None]).T @ jacobian, -(jacobian * weight[:, None]).T @ off

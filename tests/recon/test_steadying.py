@@ -1,0 +1,158 @@
+"""Boxes of moving things laid where lidar's points in them meet (recon/movers/steadying.py)."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from recon.log import LidarPoints, Log, Sweep, Track
+from recon.movers.steadying import steadied
+from recon.objects.actors import box_skin
+from recon.objects.tracks import upright
+from scenes.poses import inverse, yaw_of
+from scenes.trajectory import Trajectory
+
+SIZE = np.array([4.5, 1.8, 1.5])
+SKIN = box_skin(SIZE, 0.08)
+SEEN = SKIN[(SKIN[:, 0] < -2.1) | (SKIN[:, 1] < -0.8)]
+"""What a follower to its right sees of a car: its rear and its right."""
+
+ROAD = np.stack(np.meshgrid(np.arange(15, 50, 0.3), np.arange(0, 20, 0.3), [0.0]), -1).reshape(-1, 3)
+
+STEP_US, COUNT = 100_000, 30
+STAMPS = STEP_US * np.arange(COUNT)
+
+
+def way(times_us: np.ndarray, brakes: float = 0.0) -> torch.Tensor:
+    """Where a car is that drives on a slight bend at 8 m/s, `[T, 4, 4]`, and brakes after a second by so many m/s^2."""
+    t = np.asarray(times_us) / 1e6
+    gone = 8 * t - brakes / 2 * np.clip(t - 1, 0, None) ** 2
+    turned = 0.3 + gone / 100
+    places = 100 * np.stack([np.sin(turned) - np.sin(0.3), np.cos(0.3) - np.cos(turned), 0 * t], 1)
+    return upright(places + [20, 3, 0.1], turned)
+
+
+def drive(track: Track, late_us=lambda k: {0: 0.0}, brakes: float = 0.0, points: int = 120) -> Log:
+    """Sweeps of the car above and of the road, in which lidars, by their numbers, pass so late after the stamp `k`: at one
+    moment, or at several for ever other points."""
+    random = np.random.default_rng(3)
+
+    def sweep(k: int) -> Sweep:
+        xyz, times, sensors = [ROAD], [np.full(len(ROAD), STAMPS[k])], [np.zeros(len(ROAD), np.int64)]
+        for sensor, late in late_us(k).items():
+            local = SEEN[random.permutation(len(SEEN))[:points]] + random.normal(0, 0.02, (points, 3))
+            taken = STAMPS[k] + np.resize(np.array(late), points)
+            pose = way(taken, brakes).numpy()
+            xyz.append((pose[:, :3, :3] @ local[:, :, None])[..., 0] + pose[:, :3, 3])
+            times.append(taken)
+            sensors.append(np.full(points, sensor))
+        read = LidarPoints(*map(np.concatenate, (xyz, times, sensors)))
+        return Sweep(k, int(STAMPS[k]), lambda: read)
+
+    ego = Trajectory(torch.from_numpy(STAMPS), torch.eye(4, dtype=torch.float64).expand(COUNT, 4, 4))
+    return Log("street", Path("street"), {}, tuple(map(sweep, range(COUNT))), (track,), ego, {})
+
+
+def boxed(times_us: np.ndarray, poses: torch.Tensor, sensor=0, label: str = "car") -> Track:
+    return Track("veh_1", label, True, SIZE, times_us, poses, np.broadcast_to(sensor, times_us.shape), ("a",))
+
+
+def shaken(poses: torch.Tensor, metres: float = 0.15, radians: float = 0.035) -> torch.Tensor:
+    """Boxes as someone draws them, each anew."""
+    random = np.random.default_rng(5)
+    off = upright(random.normal(0, metres, (len(poses), 3)) * [1, 1, 0.5], random.normal(0, radians, len(poses)))
+    return poses @ off
+
+
+def unrest(track: Track, truth: torch.Tensor) -> tuple[float, float]:
+    """By how many metres and degrees, root mean square, poses are off from others `[T, 4, 4]`, but for what is so in all: points may
+    lie anywhere in a box as long as they do not move."""
+    off = inverse(truth) @ track.world_from_box
+    places, turns = off[:, :3, 3], yaw_of(off)
+    return float((places - places.mean(0)).norm(dim=1).square().mean().sqrt()), float(torch.rad2deg((turns - turns.mean()).std()))
+
+
+def test_boxes_drawn_anew_each_time_lie_where_their_points_meet():
+    drawn = boxed(STAMPS, shaken(way(STAMPS)))
+    (found,) = steadied(log := drive(drawn), log.sweeps).tracks
+    assert unrest(drawn, way(STAMPS))[0] > 0.15 and unrest(drawn, way(STAMPS))[1] > 1.5
+    metres, degrees = unrest(found, way(STAMPS))
+    assert metres < 0.03 and degrees < 0.3
+    assert (found.name, found.label, found.sources) == ("veh_1", "car", ("a",)) and found.times_us.tolist() == STAMPS.tolist()
+    mean = (inverse(way(STAMPS)) @ found.world_from_box)[:, :3, 3].mean(0)
+    assert mean.norm() < 0.1, "all boxes together say where they lie about what they hold"
+
+
+def test_without_points_boxes_go_on_as_something_heavy_does():
+    drawn = boxed(STAMPS, shaken(way(STAMPS)))
+    log = drive(drawn, late_us=lambda k: {})
+    (found,) = steadied(log, log.sweeps).tracks
+    assert unrest(found, way(STAMPS))[0] < 0.6 * unrest(drawn, way(STAMPS))[0]
+
+
+def test_between_boxes_of_every_half_second_it_brakes_where_it_was_seen_to():
+    few = STAMPS[::5].copy()
+    log = drive(boxed(few, way(few, brakes=6.0)), brakes=6.0)
+    (found,) = steadied(log, log.sweeps).tracks
+    there = STAMPS[: 5 * len(few) - 2]  # and half a step beyond its last box
+    assert found.times_us.tolist() == there.tolist()
+    between = boxed(there, log.tracks[0].trajectory().near_each(torch.from_numpy(there)))
+    assert unrest(between, way(there, brakes=6.0))[0] > 0.07
+    assert unrest(found, way(there, brakes=6.0))[0] < 0.03
+
+
+@pytest.mark.parametrize("matched", [True, False], ids=["boxes of sweeps", "boxes of moments of their own"])
+def test_points_are_as_late_as_the_lidar_passes(matched):
+    """Boxes of a sweep are drawn around its points, wherever the car is at its stamp; others are where it is then."""
+    times = STAMPS if matched else STAMPS[2:-2] + 30_000
+    drawn = way(times - 150_000 * matched)
+    log = drive(boxed(times[::5].copy(), shaken(drawn[::5], 0.05, 0.01)), late_us=lambda k: {0: -150_000})
+    (found,) = steadied(log, log.sweeps).tracks
+    assert len(found.times_us) > 20
+    assert unrest(found, way(found.times_us - 150_000 * matched))[0] < 0.03
+
+
+def test_a_second_lidar_that_passes_later_makes_no_car_jump():
+    """Its boxes are drawn where the car is by then, 0.4 m on: they are not off."""
+    sensor = np.arange(COUNT) % 2
+    drawn = boxed(STAMPS, way(STAMPS + 50_000 * sensor), sensor)
+    log = drive(drawn, late_us=lambda k: {0: 0, 1: 50_000})
+    assert steadied(log, log.sweeps).tracks[0] is drawn
+
+
+def test_what_a_turn_of_the_lidar_begins_and_ends_with_is_seen_twice():
+    """Points of its rear were taken 0.1 s before some of its front, in every third sweep."""
+    drawn = boxed(STAMPS, shaken(way(STAMPS)))
+    log = drive(drawn, late_us=lambda k: {0: [0, 0, 100_000] if k % 3 == 0 else 0})
+    (found,) = steadied(log, log.sweeps).tracks
+    assert unrest(found, way(STAMPS))[0] < 0.03
+
+
+def test_a_box_that_is_alone_in_being_off_pulls_no_other():
+    poses = way(STAMPS).clone()
+    poses[12, :2, 3] += torch.tensor([0.3, 0.25])
+    log = drive(boxed(STAMPS, poses))
+    (found,) = steadied(log, log.sweeps).tracks
+    assert unrest(found, way(STAMPS))[0] < 0.02
+
+
+def test_what_is_between_the_boxes_of_another_lean_as_these():
+    leant = way(STAMPS) @ upright(np.zeros((1, 3)), np.zeros(1))
+    tilt = torch.eye(4, dtype=torch.float64)
+    tilt[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, 0, 0.1], [0, 0, 0], [-0.1, 0, 0]], dtype=torch.float64))
+    log = drive(boxed(STAMPS, shaken(leant) @ tilt))
+    (found,) = steadied(log, log.sweeps).tracks
+    up = found.world_from_box[:, 2, 2]
+    assert not found.world_from_box.equal(log.tracks[0].world_from_box)
+    torch.testing.assert_close(up, torch.full_like(up, np.cos(0.1)))
+
+
+@pytest.mark.parametrize("what", ["exact", "a pedestrian", "standing", "no sweeps"])
+def test_what_needs_nothing_is_as_it_was(what):
+    poses = way(STAMPS) if what == "exact" else shaken(way(STAMPS))
+    track = boxed(STAMPS, poses, label="pedestrian" if what == "a pedestrian" else "car")
+    if what == "standing":
+        track = Track(**{**track.__dict__, "moving": False})
+    log = drive(track)
+    assert steadied(log, () if what == "no sweeps" else log.sweeps).tracks[0] is track
