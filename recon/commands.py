@@ -77,7 +77,7 @@ class Recon:
         if self.size is not None:
             check_size(self.size)  # before photos are placed, which takes long
         with sole(self.output):
-            log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view)
+            log = open_log(self.data, self.camera_height, self.metres_per_unit, self.angle_of_view, (self.start, self.duration))
             with stopped_saying(partial(resumed, checkpoint_path(self.output))):
                 reconstruct(
                     log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,

@@ -45,18 +45,20 @@ def choose(
 
 
 def _span(log: Log, names: list[str], start_us: int, duration_us: int | None) -> tuple[int, int]:
-    """First and last microsecond of the part of the drive that begins `start_us` after the first camera's first frame."""
+    """First and last microsecond of the part of the drive that begins `start_us` after the first camera's first frame, or a video's, which
+    may not have been placed."""
     times = log.camera(names[0]).times_us
     for name in names:
         log.camera(name)
-    length = int(times[-1] - times[0])
+    begun = int(log.meta.get("begun_us", times[0]))
+    length = int(times[-1]) - begun
     if not 0 <= start_us <= length:
         raise ValueError(f"start {start_us / 1e6:g}s is outside the drive, which lasts {length / 1e6:g}s")
     if duration_us is not None and duration_us <= 0:
         raise ValueError(f"duration {duration_us / 1e6:g}s must be positive; the drive lasts {length / 1e6:g}s")
     # the cameras of a rig fire up to a tenth of a second apart: half a step around keeps whole frames together
     slack = int(times.diff().double().median()) // 2 if len(times) > 1 else 0
-    first = int(times[0]) + start_us
+    first = begun + start_us
     last = int(times[-1]) if duration_us is None else min(int(times[-1]), first + duration_us - 2 * slack)
     return first - slack, max(last, first) + slack
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
@@ -100,17 +100,27 @@ class Video:
 
     def timed(self) -> Iterator[tuple[int, torch.Tensor]]:
         """The frames, each after its time in microseconds since the first: they need not be evenly apart."""
+        for _, time_us, rgb in self.picked(lambda _: True):
+            yield time_us, rgb
+
+    def picked(self, wanted: Callable[[int], bool], end_us: int | None = None) -> Iterator[tuple[int, int, torch.Tensor]]:
+        """Number, time and picture of those frames whose times are `wanted`, before `end_us`; others take a third of the work."""
         began = None
         for i, frame in enumerate(self._decoded()):
             at = i / self.fps if frame.pts is None else float(frame.pts * frame.time_base)
             began = at if began is None else began
+            time_us = round((at - began) * 1e6)
+            if end_us is not None and time_us >= end_us:
+                return
+            if not wanted(time_us):
+                continue
             quarters, mirrored = _turns(frame)
             stored = to_rgb(frame)
             pixels = np.rot90(stored[:, ::-1] if mirrored else stored, quarters)
             if pixels.shape[:2] != (self.height, self.width):
                 sizes = f"{self.width}x{self.height} to {pixels.shape[1]}x{pixels.shape[0]}"
                 raise ValueError(f"{self.path} changes its size after frame {i}, from {sizes}; cut it there, or scale it to one size")
-            yield round((at - began) * 1e6), from_bytes(pixels)
+            yield i, time_us, from_bytes(pixels)
 
     def _decoded(self):
         """PyAV's frames, as they are stored."""

@@ -31,7 +31,8 @@ def open_recording(path: str | Path, scene: Scene) -> Log:
     """The recording that a scene was made from, in the scene's world; one of pictures alone gets the scene's scale. ValueError where its
     place differs from the scene's; where only the name differs, stderr says so."""
     told = scene.meta.get("world_from_model")
-    log = open_log(path) if told is None else open_log(path, metres_per_unit=float(told["scale"]))
+    start_us, duration_us = scene.meta.get("part_us", (0, None))
+    log = open_log(path) if told is None else open_log(path, metres_per_unit=float(told["scale"]), part_us=(start_us, duration_us))
     fix = "give each scene's own recording with --data"
     for key, part, much in (("world_origin", 0.0, 1.0), ("world_from_model", 1e-3, 1e-3)):
         ours, theirs = (_numbers(meta.get(key)) for meta in (scene.meta, log.meta))

@@ -20,13 +20,18 @@ from recon.sound import sound
 
 
 def open_log(
-    path: str | Path, camera_height: float | None = None, metres_per_unit: float | None = None, angle_of_view: float | None = None
+    path: str | Path,
+    camera_height: float | None = None,
+    metres_per_unit: float | None = None,
+    angle_of_view: float | None = None,
+    part_us: tuple[int, int | None] = (0, None),
 ) -> Log:
     """The drive in a folder, by the layout of its files, or a video; reads no image and no sweep yet, but of photos
     and videos whose poses must be found first.
 
     camera_height, metres_per_unit: what makes a world that pictures alone made metric: metres of the cameras above the ground, or
-    metres a unit of the model. angle_of_view: radians from the left to the right side of photos or a video, found where None. Raises
+    metres a unit of the model. angle_of_view: radians from the left to the right side of photos or a video, found where None. part_us:
+    start and duration of the part of a video that is read; others are read whole. Raises
     FileNotFoundError where there is no such folder and ValueError where its layout is not known, a file is corrupt, or metres or an angle
     are given to a log that has its own.
     """
@@ -41,7 +46,7 @@ def open_log(
         _knows_its_lenses(path, angle_of_view)
         return without_recorder(sound(read(path)))
     if is_video(path):
-        return sound(read_photos(path, camera_height, metres_per_unit, angle_of_view))
+        return sound(read_photos(path, camera_height, metres_per_unit, angle_of_view, part_us))
     if not path.is_dir():
         check_enough(path)
         raise FileNotFoundError(f"{path} is neither a folder nor a video; give the folder of one drive, as pandaset/002")

@@ -12,13 +12,14 @@ import json
 import math
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-import torch
 from PIL import ImageOps
 
 from recon.log import FETCH, Log, is_upright
 from recon.readers.colmap import find_model, read_colmap
+from recon.readers.footage import RATE, Taken, take_frames
 from recon.readers.order import recorded
 from recon.sfm.solve import solve
 from scenes.pictures import PICTURES, opened, rgb_of, swaps_sides
@@ -29,9 +30,6 @@ UNREAD = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".nef", ".
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
 FEWEST = 3
 """Pictures that a world can be made of."""
-
-RATE, MOST = 10.0, 150
-"""Frames a second that are taken from a video, and how many of it at most: more say little more, and matching takes long."""
 
 QUALITY = 95
 """Of a JPEG that is written upright."""
@@ -85,20 +83,26 @@ def is_video(path: Path) -> bool:
 
 
 def read_photos(
-    path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, angle_of_view: float | None = None
+    path: Path,
+    camera_height: float | None = None,
+    metres_per_unit: float | None = None,
+    angle_of_view: float | None = None,
+    part_us: tuple[int, int | None] = (0, None),
 ) -> Log:
     """The log of a folder of photos or of a video; `camera_height` and `metres_per_unit` as in `read_colmap`.
 
-    angle_of_view: radians from the pictures' left to their right side, found with the poses where None. ValueError where too few of the
+    angle_of_view: radians from the pictures' left to their right side, found with the poses where None. part_us: start and duration, to the
+    end where None, of the part of a video that is read, which has a workspace of its own. ValueError where too few of the
     pictures can be placed, or were placed with another angle before, PermissionError where the workspace cannot be written and
     FileExistsError where something else has its name.
     """
     if angle_of_view is not None and not NARROWEST <= angle_of_view <= WIDEST:
         low, high = (f"{math.degrees(a):.0f}deg" for a in (NARROWEST, WIDEST))
         raise ValueError(f"--angle-of-view must lie from {low} to {high}, got {math.degrees(angle_of_view):g}deg")
-    workspace = path.with_name(path.name + ".sfm")
+    part_us = part_us if is_video(path) else (0, None)
+    workspace = path.with_name(path.name + _called(*part_us) + ".sfm")
     if find_model(workspace) is None:
-        _make(path, workspace, angle_of_view)
+        _make(path, workspace, angle_of_view, part_us)
     inside = workspace / "images"
     log = read_colmap(workspace, camera_height, metres_per_unit, inside if inside.is_dir() else path)
     camera = log.camera(log.front[0])
@@ -106,10 +110,18 @@ def read_photos(
     if angle_of_view is not None and abs(found - angle_of_view) > SAME * angle_of_view:
         fix = f"delete it to begin again with {math.degrees(angle_of_view):g}deg"
         raise ValueError(f"{workspace} was made with an angle of view of {math.degrees(found):.1f}deg; {fix}")
-    return log
+    if not is_video(path):
+        return log
+    return replace(log, name=path.name, meta=log.meta | {"name": path.name, "begun_us": 0, "part_us": list(part_us)})
 
 
-def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
+def _called(start_us: int, duration_us: int | None) -> str:
+    """What names a part of a video, as .2s+3.5s; "" for the whole."""
+    until = f"+{duration_us / 1e6:g}s" if duration_us else ""
+    return f".{start_us / 1e6:g}s{until}" if start_us or duration_us else ""
+
+
+def _make(path: Path, workspace: Path, angle_of_view: float | None, part_us: tuple[int, int | None]) -> None:
     """Find the poses and write the workspace: whole, or not at all."""
     if workspace.exists() and not (workspace.is_dir() and not any(workspace.iterdir())):
         raise FileExistsError(f"{workspace} is to hold the poses of {path.name}, and holds something else; move or rename it")
@@ -122,7 +134,7 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
     try:
         print(f"finding where {path} was taken; it is kept in {workspace}", file=sys.stderr)
         if is_video(path):
-            times = _frames(path, partial / "images")
+            times = _enough(path, take_frames(path, partial / "images", *part_us))
             found = solve(partial / "images", list(times), partial, True, angle_of_view, str(path))
             (partial / "sparse" / "0" / "times.json").write_text(json.dumps(times))
         else:
@@ -132,6 +144,8 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None) -> None:
             found = solve(pictures, names, partial, False, angle_of_view, str(path))
             times = dict.fromkeys(names, 0)
         print(f"placed {found.placed} of {len(times)} pictures", file=sys.stderr)
+        if len(found.elsewhere) >= FEWEST:
+            print(f"{path}: {_elsewhere(found.elsewhere, times if is_video(path) else None)}", file=sys.stderr)
         if not found.right:
             told = f"only {found.agreed:.0%} of what two pictures share lies where these poses say, and of right ones more than half"
             fix = f"take more pictures, larger ones, with more overlap, and delete {workspace} to begin again"
@@ -192,32 +206,20 @@ def _size(file: Path) -> tuple[int, int]:
         return picture.size[::-1] if swaps_sides(picture) else picture.size
 
 
-def _frames(path: Path, folder: Path) -> dict[str, int]:
-    """Write frames of a video to `folder`, evenly over its time; their times in microseconds by name."""
-    from render.video import read_video, write_image
-
-    folder.mkdir()
-    video = read_video(path)
-    seconds = video.seconds or max(t for t, _ in video.timed()) / 1e6
-    # the next one that is due, or comes at most half a frame too early
-    apart = max(1, round((max(1 / RATE, seconds / MOST) - 0.5 / video.fps) * 1e6))
-    times: dict[str, int] = {}
-    last, count = -apart, 0
-    for i, (time_us, frame) in enumerate(video.timed()):
-        count += 1
-        if time_us - last >= apart:
-            write_image(folder / f"{i:06d}.jpg", _square(frame, float(video.pixel_aspect)))
-            times[f"{i:06d}.jpg"] = last = time_us
-    if len(times) < FEWEST:
-        taken = "" if len(times) == count else f", of which {len(times)} are taken, {RATE:g} a second"
-        frames = f"{count} frame{'s' * (count > 1)}"
-        raise ValueError(f"{path} has {frames}{taken}; a reconstruction needs at least {FEWEST}: give a longer video")
-    return times
+def _enough(path: Path, taken: Taken) -> dict[str, int]:
+    """The frames' times. ValueError where they are too few."""
+    if len(taken.times) < FEWEST:
+        some = "" if len(taken.times) == taken.count else f", of which {len(taken.times)} are taken, {RATE:g} a second"
+        frames = f"{taken.count} frame{'s' * (taken.count > 1)}"
+        raise ValueError(f"{path} has {frames}{some}; a reconstruction needs at least {FEWEST}: give a longer video")
+    return taken.times
 
 
-def _square(frame: torch.Tensor, aspect: float) -> torch.Tensor:
-    """A frame `[H, W, 3]` whose pixels are so many times as wide as high, with square ones: a lens has one focal length for both."""
-    height, width = round(frame.shape[0] * max(1, 1 / aspect)), round(frame.shape[1] * max(1, aspect))
-    if (height, width) == frame.shape[:2]:
-        return frame
-    return torch.nn.functional.interpolate(frame.movedim(2, 0)[None], (height, width), mode="bilinear")[0].movedim(0, 2)
+def _elsewhere(names: frozenset[str], times: dict[str, int] | None) -> str:
+    """What to tell of pictures that share nothing with those that were placed; times: microseconds by name, of a video's."""
+    told = f"{len(names)} of its pictures share nothing with these"
+    if times is None:
+        some = ", ".join(sorted(names, key=recorded)[:5]) + ", ..." * (len(names) > 5)
+        return f"{told}: {some}; put those of another place into another folder"
+    first, last = (round(which(times[name] for name in names) / 1e6, 1) for which in (min, max))
+    return f"{told}, from {first:g} s to {last:g} s, as before or after a cut; --start and --duration take another part"

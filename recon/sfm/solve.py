@@ -13,6 +13,7 @@ from typing import Any
 from recon.log import image_size
 from recon.sfm.agreement import AGREED, agreement
 from recon.sfm.colmap import extract_features, mapping_options, pycolmap, verification_options
+from recon.sfm.together import together
 from render.progress import Progress
 
 EXHAUSTIVE = 40
@@ -50,11 +51,13 @@ FEWEST_PLACED = 3
 
 @dataclass(frozen=True)
 class Found:
-    """A model of COLMAP's, None for none, how many pictures it places, and how far what they show agrees with that (`agreement`)."""
+    """A model of COLMAP's, None for none, how many pictures it places, and how far what they show agrees with that (`agreement`); and which
+    pictures share nothing with these."""
 
     model: Any = None
     placed: int = 0
     agreed: float = 0.0
+    elsewhere: frozenset[str] = frozenset()
 
     @property
     def right(self) -> int:
@@ -78,8 +81,8 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     source: where the pictures come from, for messages.
 
     SIFT features are matched between all pairs, or between pictures near each other in `names` where these are `ordered` or many, and
-    incremental mapping registers the pictures; the largest of its models is kept. Where too few of the pictures are in one that agrees with
-    what they show, others are tried. ValueError where it has too few pictures.
+    incremental mapping registers the pictures; the largest of its models is kept. Where too few of the pictures of the largest place are in
+    one that agrees with what they show, others are tried. ValueError where it has too few pictures.
     """
     colmap = pycolmap()
     database, models = workspace / "database.db", workspace / "models"
@@ -100,6 +103,8 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
             colmap.match_exhaustive(database, verification_options=verification, device=colmap.Device.cpu)
         steps.step(note="poses")
         options = _solving_options(colmap, angle_of_view, within)
+        places = together(colmap, database)
+        asked = len(places[0])  # no lens places what shares nothing with the rest
 
         def tell(placed: int) -> None:
             steps.step(0, note=f"poses: {placed} of {len(names)} pictures placed")
@@ -107,7 +112,7 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
         def sought(best: Found) -> Found:
             """The best of what was found before and of what the options lead to."""
             for degrees, part in BEGUN_WITH if within < USUAL_ERROR else BEGUN_WITH[:1]:
-                if not best.is_enough(len(names)):
+                if not best.is_enough(asked):
                     options.mapper.init_min_tri_angle, options.mapper.init_max_error = degrees, part * within
                     model, placed = _largest(colmap, database, pictures, models, options, tell)
                     other = Found(model, placed, agreement(colmap, database, model, max(width, height)) if placed else 0.0)
@@ -115,13 +120,13 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
             return best
 
         best, said = sought(Found()), ""
-        if not best.is_enough(len(names)):
+        if not best.is_enough(asked):
             angle = f"{math.degrees(_fix_lens(colmap, database, options)):.0f}deg"
             steps.step(0, note=f"poses once more, with a lens of {angle}")
             held = sought(best)
             if held is not best:
                 if angle_of_view is None:
-                    which = f"a lens of {angle} places {held.placed} of {len(names)}, one that is found {best.right}"
+                    which = f"a lens of {angle} places {held.placed} of {asked}, one that is found {best.right}"
                     fix = f"lengths along its way are right as far as {angle} are: give --angle-of-view where it is known"
                     said = f"{source}: its pictures do not tell how wide its camera sees: {which}; {fix}"
                 best = replace(held, model=_with_distortion(colmap, held.model))
@@ -133,7 +138,8 @@ def solve(pictures: Path, names: list[str], workspace: Path, ordered: bool, angl
     (workspace / "sparse" / "0").mkdir(parents=True)
     best.model.write(workspace / "sparse" / "0")
     database.unlink()
-    return best
+    here = {image.name for image in best.model.images.values() if image.has_pose}
+    return replace(best, elsewhere=frozenset().union(*(place for place in places if not place & here)))
 
 
 def _match_neighbours(colmap, database: Path, names: list[str], verification) -> None:

@@ -12,8 +12,10 @@ from painted import drive as painted_drive
 from PIL import Image
 
 from recon import open_log
+from recon.defaults import choose
 from recon.readers import photos as reader
 from recon.readers.colmap_model import read_model
+from recon.readers.footage import take_frames
 from recon.sfm import solve as sfm
 from recon.sfm.colmap import pycolmap
 from render.video import VideoWriter
@@ -21,6 +23,9 @@ from scenes.pictures import ORIENTATION
 from scenes.poses import pose_from
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+
+
+SHADES = torch.linspace(0, 1, 96)[None, :, None].expand(54, 96, 3)
 
 
 @pytest.fixture(scope="module")
@@ -182,11 +187,11 @@ def test_frames_of_a_video_that_are_unevenly_apart_keep_their_times(tmp_path):
         stream = container.add_stream("mpeg4", rate=30)
         stream.width, stream.height, stream.pix_fmt, stream.codec_context.time_base = 96, 54, "yuv420p", Fraction(1, 1000)
         for i, ms in enumerate(at):
-            frame = av.VideoFrame.from_ndarray(np.full((54, 96, 3), 6 * i, np.uint8), format="rgb24")
+            frame = av.VideoFrame.from_ndarray((SHADES * (i + 6) * 5).numpy().astype(np.uint8), format="rgb24")
             frame.pts, frame.time_base = ms, Fraction(1, 1000)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    times = reader._frames(tmp_path / "uneven.mp4", tmp_path / "frames")
+    times = take_frames(tmp_path / "uneven.mp4", tmp_path / "frames").times
     assert all(t == pytest.approx(1000 * at[int(name[:6])], abs=1000) for name, t in times.items())
     assert {f"{i:06d}.jpg" for i in range(30, 40)} <= times.keys() and len(times) <= 30
 
@@ -215,10 +220,34 @@ def _images(colmap, database):
 def test_a_video_keeps_its_clock(solved, tmp_path):
     with VideoWriter(tmp_path / "drive.mp4", 25, 96, 54) as video:
         for i in range(12):
-            video.write(torch.full((54, 96, 3), i / 12))
+            video.write(SHADES * (i + 6) / 18)
     camera = open_log(tmp_path / "drive.mp4").camera("camera")
     assert solved[0] == ([f"{i:06d}.jpg" for i in range(0, 12, 2)], True, None)  # 25 frames a second, every second one
     assert camera.times_us.diff().unique().tolist() == [80_000] and camera.image(1).shape == (54, 96, 3)
+
+
+def test_a_part_of_a_video_is_placed_by_itself_and_its_start_is_the_videos(solved, tmp_path):
+    with VideoWriter(tmp_path / "drive.mp4", 10, 96, 54) as video:
+        for i in range(12):
+            video.write(SHADES * (i + 6) / 18)
+    log = open_log(tmp_path / "drive.mp4", part_us=(400_000, 600_000))
+    assert (tmp_path / "drive.mp4.0.4s+0.6s.sfm").is_dir() and solved[0][0] == [f"{i:06d}.jpg" for i in range(4, 10)]
+    assert log.name == "drive.mp4" and log.camera("camera").times_us[0] == 400_000
+    first, last = choose(log, None, *log.meta["part_us"])[1]
+    assert first < 400_000 and last > 900_000
+    assert choose(open_log(tmp_path / "drive.mp4"))[1][1] > 1_100_000 and len(solved) == 2
+
+
+def test_frames_beyond_a_cut_are_told_with_their_times(solved, tmp_path, monkeypatch, capsys):
+    with VideoWriter(tmp_path / "drive.mp4", 10, 96, 54) as video:
+        for i in range(9):
+            video.write(SHADES * (i + 6) / 18)
+    really = reader.solve
+    names = frozenset(f"{i:06d}.jpg" for i in range(5, 9))
+    monkeypatch.setattr(reader, "solve", lambda *given: replace(really(*given), elsewhere=names))
+    open_log(tmp_path / "drive.mp4")
+    said = "4 of its pictures share nothing with these, from 0.5 s to 0.8 s, as before or after a cut; --start and --duration take another"
+    assert said in capsys.readouterr().err
 
 
 def test_a_video_of_wide_pixels_is_read_with_square_ones(tmp_path):
@@ -226,9 +255,8 @@ def test_a_video_of_wide_pixels_is_read_with_square_ones(tmp_path):
     for aspect, size in ((Fraction(4, 3), (54, 128)), (Fraction(3, 4), (72, 96))):
         file, folder = tmp_path / f"{aspect.numerator}.mp4", tmp_path / f"frames{aspect.numerator}"
         with VideoWriter(file, 10, 96, 54, pixel_aspect=aspect) as video:
-            for _ in range(4):
-                video.write(torch.linspace(0, 1, 96)[None, :, None].expand(54, 96, 3))
-        for name in reader._frames(file, folder):
+            video.write(SHADES)
+        for name in take_frames(file, folder).times:
             picture = torch.from_numpy(np.array(Image.open(folder / name))).float() / 255
             assert picture.shape == (*size, 3)
             # what H.264 and JPEG leave
@@ -239,9 +267,9 @@ def test_a_video_that_is_too_short_is_told_how_many_frames_are_taken(tmp_path):
     for count, said in ((1, "has 1 frame;"), (12, "has 12 frames, of which 2 are taken, 10 a second;")):
         with VideoWriter(tmp_path / f"{count}.mp4", 60, 96, 54) as video:
             for i in range(count):
-                video.write(torch.full((54, 96, 3), i / 12))
+                video.write(SHADES * (i + 6) / 18)
         with pytest.raises(ValueError, match=f"mp4 {said} a reconstruction needs at least 3: give a longer video"):
-            reader._frames(tmp_path / f"{count}.mp4", tmp_path / f"frames{count}")
+            open_log(tmp_path / f"{count}.mp4")
 
 
 def test_too_few_photos_are_told_from_no_drive_at_all(walk, tmp_path):

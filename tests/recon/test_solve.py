@@ -9,6 +9,7 @@ from PIL import Image
 
 from recon.sfm import solve as sfm
 from recon.sfm.colmap import pycolmap
+from recon.sfm.together import together
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
 
@@ -18,6 +19,7 @@ def test_a_known_angle_is_that_across_also_of_pictures_that_stand(tmp_path, monk
     asked = []
     monkeypatch.setattr(sfm, "extract_features", lambda *given: asked.append(given[4].camera_params))
     monkeypatch.setattr(sfm, "_match_neighbours", lambda *_: None)
+    monkeypatch.setattr(sfm, "together", lambda *_: [{"a.png"}])
     monkeypatch.setattr(sfm, "_largest", lambda *_: (None, 0))
     monkeypatch.setattr(sfm, "_fix_lens", lambda *_: 1.0)
     with pytest.raises(ValueError, match="only 0 of 1 pictures"):
@@ -50,7 +52,7 @@ def test_what_most_pictures_agree_with_is_taken_of_all_that_is_tried(size, model
     """Until four fifths are placed so: that a model has the pictures does not make it right."""
     Image.new("RGB", size).save(tmp_path / "0.png")
     (tmp_path / "database.db").touch()
-    made = [SimpleNamespace(agrees=agrees, placed=placed, write=lambda _: None) for placed, agrees in models]
+    made = [SimpleNamespace(agrees=agrees, placed=placed, images={}, write=lambda _: None) for placed, agrees in models]
     asked = []
 
     def largest(_, __, ___, ____, options, _____):
@@ -67,6 +69,7 @@ def test_what_most_pictures_agree_with_is_taken_of_all_that_is_tried(size, model
     monkeypatch.setattr(sfm, "_fix_lens", fix_lens)
     monkeypatch.setattr(sfm, "_with_distortion", lambda _, model: model)
     monkeypatch.setattr(sfm, "agreement", lambda _, __, model, ___: model.agrees)
+    monkeypatch.setattr(sfm, "together", lambda *_: [{f"{i}.png" for i in range(5)}])
     found = sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, None, "a")
     assert found.model is made[taken] and asked == tried and (found.right > 0) == (models[taken][1] > 0.5)
 
@@ -77,6 +80,7 @@ def test_matches_of_small_pictures_are_off_by_as_little_of_them(size, within, tm
     errors = []
     monkeypatch.setattr(sfm, "extract_features", lambda *_: None)
     monkeypatch.setattr(sfm, "_match_neighbours", lambda *given: errors.append(given[3].ransac.max_error))
+    monkeypatch.setattr(sfm, "together", lambda *_: [{f"{i}.png" for i in range(5)}])
     monkeypatch.setattr(sfm, "_largest", lambda *given: errors.append(given[4].mapper.init_max_error) or (None, 0))
     monkeypatch.setattr(sfm, "_fix_lens", lambda *_: 1.0)
     with pytest.raises(ValueError, match="only 0 of 5"):
@@ -109,3 +113,35 @@ def test_the_largest_of_several_models_is_taken(tmp_path):
     assert found == (large, 7) and told == [2, 3] and not (tmp_path / "made").exists()
     none = SimpleNamespace(incremental_mapping=lambda *_, **__: {})
     assert sfm._largest(none, tmp_path, tmp_path, tmp_path / "made", None, told.append) == (None, 0)
+
+
+def test_pictures_after_a_cut_are_not_asked_for_and_told(tmp_path, monkeypatch):
+    """No lens places what shares nothing with the rest: nothing else is tried where the longer shot is placed."""
+    Image.new("RGB", (480, 270)).save(tmp_path / "0.png")
+    (tmp_path / "database.db").touch()
+    shots = [{"0.png", "1.png", "2.png"}, {"3.png", "4.png"}]
+    placed = {i: SimpleNamespace(name=f"{i}.png", has_pose=True) for i in range(3)}
+    tried = []
+    for name in ("extract_features", "_match_neighbours"):
+        monkeypatch.setattr(sfm, name, lambda *_: None)
+    model = SimpleNamespace(images=placed, write=lambda _: None)
+    monkeypatch.setattr(sfm, "together", lambda *_: shots)
+    monkeypatch.setattr(sfm, "_largest", lambda *_: tried.append(1) or (model, 3))
+    monkeypatch.setattr(sfm, "agreement", lambda *_: 0.9)
+    found = sfm.solve(tmp_path, ["0.png"] * 5, tmp_path, True, None, "a")
+    assert len(tried) == 1 and found.placed == 3 and found.elsewhere == {"3.png", "4.png"}
+
+
+def test_pictures_are_together_that_matches_link_one_by_one_but_not_by_a_logo(tmp_path):
+    colmap = pycolmap()
+    kind = colmap.TwoViewGeometryConfiguration
+    matches = np.stack([np.arange(20, dtype=np.uint32)] * 2, 1)
+    with colmap.Database.open(tmp_path / "database.db") as opened:
+        camera = opened.write_camera(colmap.Camera(model="SIMPLE_RADIAL", width=100, height=50, params=[80, 50, 25, 0]))
+        ids = [opened.write_image(colmap.Image(name=name, camera_id=camera)) for name in "abcde"]
+        for a, b, config in ((0, 1, kind.CALIBRATED), (1, 2, kind.UNCALIBRATED), (2, 3, kind.WATERMARK), (3, 4, kind.PLANAR), (0, 4, None)):
+            geometry = colmap.TwoViewGeometry()
+            if config is not None:
+                geometry.config, geometry.inlier_matches = config, matches
+            opened.write_two_view_geometry(ids[a], ids[b], geometry)
+    assert together(colmap, tmp_path / "database.db") == [{"a", "b", "c"}, {"d", "e"}]
