@@ -235,7 +235,6 @@ def test_a_part_of_a_video_is_placed_by_itself_and_its_start_is_the_videos(solve
     assert log.name == "drive.mp4" and log.camera("camera").times_us[0] == 400_000
     first, last = choose(log, None, *log.meta["part_us"])[1]
     assert first < 400_000 and last > 900_000
-    assert choose(open_log(tmp_path / "drive.mp4"))[1][1] > 1_100_000 and len(solved) == 2
 
 
 def test_frames_beyond_a_cut_are_told_with_their_times(solved, tmp_path, monkeypatch, capsys):
