@@ -1,14 +1,14 @@
 """Where a camera's pictures show the recording car itself: its bonnet stays where it is while the street moves through the picture.
 
-Whatever the camera sees beside the car moves away from where the car goes to, nearer things faster. So an edge across that motion is
-somewhere else in the next picture, but for edges of what rides along; those along it, as of lane lines, say nothing. What is far away
-stays as well, and a car ahead at the same speed: the mask has what stays below the horizon and reaches down to the picture's edge.
+What is far away stays as well, and a car ahead at the same speed: the mask has what stays below the horizon (recon/views/staying.py) and
+reaches down to the picture's edge, but for what is drawn over it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -16,26 +16,11 @@ from scipy import ndimage
 from torch.nn import functional as F
 
 from recon.log import Log, LogCamera
-from render.rays import camera_rays
-from scenes.camera import Camera
-from scenes.poses import inverse
+from recon.views.drawn_over import drawn_over
+from recon.views.staying import SOFT, staying
 
-WIDTH = 320
-"""Width in pixels of the reduced pictures that are searched."""
-
-LOOKS, FEWEST = 48, 12
-"""Pictures that are searched, evenly along the way, and how many are needed."""
-
-APART, FARTHEST = 0.1, 3.0
-"""Metres needed between the pictures before and after each, and from the first picture to the farthest: while a car stands, its poses
-jitter by millimetres, and its street stays in place as its bonnet does."""
-
-FAINT, ALONG = 2.0, 0.25
-"""Levels a pixel below which an edge counts less, as those of dust and reflections in a windscreen; and the part of an edge across the
-motion below which it counts less, as that of a lane line, along which the car does not quite drive."""
-
-SOFT = 9
-"""Pixels over which a change of brightness is no edge: in the car's own headlights the road is brighter near by."""
+WIDTH, BLUR = 320, 0.7
+"""Width in pixels of the reduced pictures that are searched, and by how many of these they are blurred."""
 
 STAYS = 0.25
 """Mean score of an edge, from -1 to 1, from which on it stays in place: in as many pictures of a street one edge in a thousand reaches
@@ -54,77 +39,48 @@ STEEP, BEND, SMOOTH = 2, 0.5, 0.05
 WIDE, MOST, RIM = 0.15, 0.4, 0.02
 """Of the picture's width that an outline must span, of the picture that may lie under it, and of the width by which it is raised."""
 
-STEP = 0.02
-"""Of its distance, how far a point is moved to see which way it goes in the picture."""
-
 
 def with_ego_masks(log: Log, names: Sequence[str], width: int) -> Log:
-    """The log, of whose cameras `names` know what of their pictures shows the car: by pictures `width` pixels wide where nobody says."""
+    """The log, of whose cameras `names` know what of their pictures shows the car, or is drawn over them: by pictures `width` pixels wide
+    where nobody says."""
 
     def told(camera: LogCamera) -> LogCamera:
         size = (width, round(width * camera.height / camera.width))
-        found = ego_mask(camera, range(len(camera)), lambda i: camera.image(i, *size))
-        return replace(camera, ego_mask=np.zeros((1, 1), bool) if found is None else found)
+        car, drawn = not_the_street(log, camera, range(len(camera)), lambda i: camera.image(i, *size))
+        masks = [at_size(mask, *size[::-1]).numpy() for mask in (car, drawn) if mask is not None]
+        return replace(camera, ego_mask=np.logical_or.reduce(masks) if masks else np.zeros((1, 1), bool))
 
     return replace(log, cameras={name: told(camera) if name in names else camera for name, camera in log.cameras.items()})
 
 
-def ego_mask(camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray]) -> np.ndarray | None:
+def not_the_street(
+    log: Log, camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray]
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """What of a camera's frames shows the car (`ego_mask`), and what is drawn over them (`drawn_over`), as data sets' are not."""
+    picture = cache(picture)
+    drawn = drawn_over(camera, indices, picture) if camera.ego_mask is None and not log.sweeps else None
+    return ego_mask(camera, indices, picture, drawn), drawn
+
+
+def ego_mask(
+    camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray], drawn: np.ndarray | None = None
+) -> np.ndarray | None:
     """bool `[h, w]` of what shows the car in a camera's frames, about `WIDTH` pixels wide; None where nothing does. As the camera says,
-    else by some of its frames `indices`, in order, uint8 `[H, W, 3]` of one size; it takes some tens of them while the car drives."""
+    else by some of its frames `indices`, in order, uint8 `[H, W, 3]` of one size; it takes some tens of them while the car drives. `drawn`:
+    what is drawn over them, whose edges do not count."""
     if camera.ego_mask is not None:
         return camera.ego_mask if camera.ego_mask.any() else None
-    looks = _along_the_way(camera, list(indices))
-    if len(looks) < FEWEST:
+    edges = staying(camera, indices, lambda i: picture(i).mean(-1, keepdims=True), WIDTH, BLUR, lambda rises: rises < -DOWN)
+    if edges is None:
         return None
-    total, seen = np.zeros((1, 1)), np.zeros((1, 1))
-    for before, at, after in looks:
-        small = _small(picture(at))
-        view = camera.camera(at, small.shape[1], small.shape[0])
-        way, below = _ways(view, camera.world_from_cam[after, :3, 3] - camera.world_from_cam[before, :3, 3])
-        slope = np.stack([ndimage.sobel(small, 1), ndimage.sobel(small, 0)], -1) / 8
-        slope -= ndimage.uniform_filter(slope, (SOFT, SOFT, 0))
-        across = (slope * way).sum(-1)
-        total = total + np.where(below, across / (np.abs(across) + ALONG * np.linalg.norm(slope, axis=-1) + FAINT), 0)
-        seen = seen + below
-    return _outlined(np.where(seen >= FEWEST, np.abs(total) / np.maximum(seen, 1), 0))
+    if drawn is not None:  # and around it, where edges are told from what is soft
+        edges[ndimage.binary_dilation(at_size(drawn, *edges.shape).numpy(), iterations=SOFT)] = 0
+    return _outlined(edges)
 
 
 def at_size(mask: np.ndarray, height: int, width: int) -> torch.Tensor:
     """A mask `[h, w]` for pictures of a size, bool `[height, width]`."""
     return F.interpolate(torch.from_numpy(mask)[None, None].float(), (height, width))[0, 0] > 0
-
-
-def _along_the_way(camera: LogCamera, indices: list[int]) -> list[tuple[int, int, int]]:
-    """Places of pictures evenly along the way, each between the ones before and after it; none where the car stands or hardly moves."""
-    at = camera.world_from_cam[indices, :3, 3]
-    if len(indices) < FEWEST or (at - at[0]).norm(dim=1).max() < FARTHEST:
-        return []
-    way = at.diff(dim=0).norm(dim=1).cumsum(0).numpy()
-    near = np.unique(np.searchsorted(way, np.linspace(0, way[-1], LOOKS + 2)[1:-1]) + 1)
-    places = [i for i in near if i + 1 < len(indices) and (at[i + 1] - at[i - 1]).norm() >= APART]
-    return [(indices[i - 1], indices[i], indices[i + 1]) for i in places]
-
-
-def _small(picture: np.ndarray) -> np.ndarray:
-    """Levels `[h, w]` of a picture shrunk to `WIDTH`."""
-    grey = torch.from_numpy(picture.mean(-1, dtype=np.float32))
-    width = min(WIDTH, picture.shape[1])
-    size = (round(len(picture) * width / picture.shape[1]), width)
-    return ndimage.gaussian_filter(F.adaptive_avg_pool2d(grey[None], size)[0].numpy(), 0.7)
-
-
-def _ways(view: Camera, travel: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions `[h, w, 2]` in which what stands moves through the picture as the camera goes along `travel`, however far it is, and
-    whether it lies `DOWN` below the horizon, `[h, w]`. Nowhere and nothing where that cannot be told."""
-    rays = F.normalize(camera_rays(view).double(), dim=-1)
-    ahead = F.normalize(inverse(view.world_from_cam)[:3, :3] @ travel, dim=0)
-    motion = (view.lens.project(rays - STEP * ahead) - view.lens.project(rays)).numpy()
-    length = np.linalg.norm(motion, axis=-1, keepdims=True)
-    known = np.isfinite(length) & (length > 0)
-    way = np.where(known, motion / np.where(known, length, 1), 0)
-    falls = (rays @ view.world_from_cam[2, :3]).numpy() < -DOWN
-    return way, falls & known[..., 0]
 
 
 def _outlined(edges: np.ndarray) -> np.ndarray | None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from recon.log import Log, LogCamera
-from recon.views.egomask import at_size, ego_mask
+from recon.views.egomask import at_size, not_the_street
 from recon.views.exposed import balanced, exposed
 from recon.views.skies import WIRE, fine_sky, like_sky
 from recon.views.sky_told import coarse_sky, under_their_sky
@@ -104,7 +104,7 @@ def load_frames(
         for i in chosen:
             images[i] = torch.from_numpy(camera.image(i, *sizes[c]).copy())
             report()
-        ego = _ego(camera, images, sizes[c])
+        ego = _ego(log, camera, images, sizes[c])
         for i, image in images.items():
             views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, coarse_sky(image, ego), ego))
         if not any(v.camera == c and not v.held_out for v in views):
@@ -129,11 +129,13 @@ def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tup
     return max(SMALLEST, round(width * shrink)), max(SMALLEST, round(height * shrink))
 
 
-def _ego(camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:
-    """The recording car in a camera's images of `size` (width, height), bool `[H, W]`; None where they show nothing of it. Says so."""
-    small = ego_mask(camera, list(images), lambda i: images[i].numpy())
-    if small is None:
-        return None
-    part = f"{camera.name}: the lowest part of its pictures, {small.mean():.1%}, shows the recording car itself and is left out"
-    print(part, file=sys.stderr)
-    return at_size(small, size[1], size[0])
+def _ego(log: Log, camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:
+    """The recording car in a camera's images of `size` (width, height), and what is drawn over them, bool `[H, W]`; None where they show
+    nothing of either. Says so."""
+    car, drawn = not_the_street(log, camera, list(images), lambda i: images[i].numpy())
+    masks = []
+    for small, which, what in ((car, "the lowest part", "shows the recording car itself"), (drawn, "a part", "is drawn over them")):
+        if small is not None:
+            print(f"{camera.name}: {which} of its pictures, {small.mean():.1%}, {what} and is left out", file=sys.stderr)
+            masks.append(at_size(small, size[1], size[0]))
+    return torch.stack(masks).any(0) if masks else None

@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from recon import FitConfig, open_log, reconstruct
 from recon.log import Log, LogCamera, Packed
+from recon.views.drawn_over import drawn_over
 from recon.views.egomask import DOWN as FALLING
-from recon.views.egomask import _ways, ego_mask, with_ego_masks
+from recon.views.egomask import ego_mask, not_the_street, with_ego_masks
 from recon.views.frames import load_frames
+from recon.views.staying import _ways
 from render import render_frame
 from render.album import references_of
 from render.compare import psnr
@@ -80,13 +82,13 @@ def test_a_bonnet_is_found_and_little_else(lens, turn):
 def test_what_stands_moves_away_from_where_the_camera_goes_whichever_way_it_looks(turn):
     mount = inverse(CAM_FROM_FLU) @ small_poses(torch.tensor([*turn, 0, 0, 0]))
     view, travel = Camera(Pinhole(30.0, 30.0, 24.0, 16.0), 48, 32, mount), torch.tensor([0.01, 0.0, 0.0], dtype=torch.float64)
-    ways, below = _ways(view, travel)
+    ways, rises, known = _ways(view, travel)
     points = 7 * camera_rays(view).double() @ mount[:3, :3].T
     later = view.lens.project((points - travel) @ mount[:3, :3])
     moved = torch.nn.functional.normalize(later - view.pixel_centres(), dim=-1)
     assert float((moved * torch.from_numpy(ways)).sum(-1).median()) > 0.999
     falls = torch.nn.functional.normalize(points, dim=-1)[..., 2]
-    assert (torch.from_numpy(below) == (falls < -FALLING)).all() and below.any()
+    assert known.all() and torch.allclose(torch.from_numpy(rises), falls) and (falls < -FALLING).any()
 
 
 def test_a_narrow_bonnet_begins_at_the_lower_edge():
@@ -112,6 +114,61 @@ def test_the_light_of_its_own_headlamps_is_no_bonnet():
 def test_a_car_that_stands_or_has_few_pictures_tells_nothing():
     assert found(drive(step=0.0)) is None
     assert found(drive(count=9)) is None
+
+
+def stamped(picture: np.ndarray, i: int) -> np.ndarray:
+    """With the time at its foot, which changes, and a logo at its top."""
+    image = Image.fromarray(picture.copy())
+    draw = ImageDraw.Draw(image)
+    draw.text((8, H - 16), f"2026-11-28  14:{10 + i // 9:02d}:{7 * i % 60:02d}   {30 + 3 * i % 10} km/h", (255, 255, 255))
+    draw.rectangle((W - 60, 6, W - 8, 22), (20, 60, 160))
+    draw.text((W - 54, 8), "ROADCAM", (255, 200, 0))
+    return np.asarray(image)
+
+
+STAMPED = np.any([stamped(np.zeros((H, W, 3), np.uint8), i).any(-1) for i in range(24)], 0)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.004], ids=["straight", "turning"])
+def test_a_stamp_that_changes_and_a_logo_are_found_and_little_else(turn):
+    camera = drive(turn=turn)
+    drawn = drawn_over(camera, range(24), lambda i: stamped(street(camera, i, None), i))
+    assert drawn is not None and drawn[STAMPED].mean() > 0.98
+    assert not drawn[36:-36].any() and drawn.mean() < 0.1
+    assert ego_mask(camera, range(24), lambda i: stamped(street(camera, i, None), i), drawn) is None
+
+
+def test_a_bonnet_is_found_below_a_stamp():
+    camera = drive()
+    stamps = lambda i: stamped(street(camera, i), i)  # noqa: E731
+    drawn = drawn_over(camera, range(24), stamps)
+    mask = ego_mask(camera, range(24), stamps, drawn)
+    assert drawn[:24][STAMPED[:24]].all() and mask[BONNET].mean() > 0.97 and mask[~BONNET].mean() < 0.06
+
+
+def test_what_is_far_away_or_rides_along_is_not_drawn():
+    """A tower from the horizon up to the picture's top, clouds, a car ahead, and a bonnet."""
+    camera = drive()
+
+    def towered(i):
+        picture = street(camera, i, ahead=True).copy()
+        picture[:70, 100:112:3] = 60
+        picture[10:40:4, 200:260] = 215
+        return picture
+
+    assert drawn_over(camera, range(24), towered) is None
+
+
+def test_the_views_of_a_fit_leave_out_what_is_drawn_over_videos_alone(monkeypatch, capsys):
+    camera = drive()
+    monkeypatch.setattr(LogCamera, "image", lambda self, i, *size: stamped(street(self, i, None), i))
+    log = Log("walk", Path("walk"), {"front": camera}, (), (), Trajectory(camera.times_us, camera.world_from_cam), {}, ("front",))
+    view = load_frames(log, ["front"], (0, 2**62), SIZE, 8).views[3]
+    assert view.ego is not None and view.ego[torch.from_numpy(STAMPED)].float().mean() > 0.98 and view.ego.float().mean() < 0.1
+    said = capsys.readouterr().err
+    assert "of its pictures, " in said and "is drawn over them and is left out" in said and "recording car" not in said
+    assert with_ego_masks(log, ["front"], W).camera("front").ego_mask[STAMPED].mean() > 0.98
+    assert not_the_street(replace(log, sweeps=(None,)), camera, range(24), camera.image)[1] is None
 
 
 def creeping(count: int, step: float) -> LogCamera:
