@@ -49,16 +49,18 @@ def take_frames(path: Path, folder: Path, start_us: int = 0, duration_us: int | 
     ValueError where the video does not last as long."""
     video = read_video(path)
     length = video.seconds or max(t for _, t, _ in video.picked(lambda _: True)) / 1e6
-    if start_us >= length * 1e6:
+    if not 0 <= start_us < length * 1e6:
         raise ValueError(f"start {start_us / 1e6:g}s is outside {path}, which lasts {length:g}s")
-    seconds = min(length, (start_us + duration_us) / 1e6 if duration_us else length) - start_us / 1e6
+    if duration_us is not None and duration_us <= 0:
+        raise ValueError(f"duration {duration_us / 1e6:g}s must be positive; {path} lasts {length:g}s")
+    end_us = None if duration_us is None else start_us + duration_us
+    seconds = (length if end_us is None else min(length, end_us / 1e6)) - start_us / 1e6
     step = max(1 / RATE, seconds / MOST)
     if step > FAR_APART:
         part = f"give --start and a --duration of up to {FAR_APART * MOST:g}s, better {MOST / RATE:g}s, for a part of it"
         print(f"{path}: of {seconds:.0f} s a frame every {step:.1f} s is taken, between which a car goes far; {part}", file=sys.stderr)
     # the next one that is due, or comes at most half a frame too early
     apart = max(1, round((step - 0.5 / video.fps) * 1e6))
-    end_us = start_us + duration_us if duration_us else None
     folder.mkdir()
     taken, box = _written(video, folder, start_us, end_us, apart)
     if box is not None:

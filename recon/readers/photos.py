@@ -117,8 +117,8 @@ def read_photos(
 
 def _called(start_us: int, duration_us: int | None) -> str:
     """What names a part of a video, as .2s+3.5s; "" for the whole."""
-    until = f"+{duration_us / 1e6:g}s" if duration_us else ""
-    return f".{start_us / 1e6:g}s{until}" if start_us or duration_us else ""
+    until = "" if duration_us is None else f"+{duration_us / 1e6:g}s"
+    return f".{start_us / 1e6:g}s{until}" if start_us or until else ""
 
 
 def _make(path: Path, workspace: Path, angle_of_view: float | None, part_us: tuple[int, int | None]) -> None:

@@ -28,7 +28,7 @@ DENSE, LETTER = 0.2, 0.02
 """Part of the surroundings, squares of `LETTER` of the picture's width, that such edges cover at least in what is drawn."""
 
 BAND, SMALLEST, MOST = 0.2, 0.0005, 0.15
-"""Of the picture's height, how near to its top or foot a thing is drawn, and of its area, how much each covers at least, and all at most."""
+"""Of the picture's height, how near to its top or foot a thing is drawn; of its area, how much each covers at least, all at most."""
 
 
 def drawn_over(camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray]) -> np.ndarray | None:

@@ -45,9 +45,12 @@ def staying(
     blur: float,
     where: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray | None:
-    """Mean score of edges, 0 where nothing stays to 1, float `[h, w]`, in those of a camera's frames `indices` that lie evenly along its way,
-    about `width` pixels wide and blurred by so many pixels; None where it does not go far enough. `picture` gives a frame's levels `[H, W,
-    C]`, of whose channels the one counts that changes most at a place; `where` picks what counts by the sine `[h, w]` of its angle above the horizon."""
+    """Mean score of edges, 0 where nothing stays to 1, float `[h, w]`, in those of a camera's frames `indices` that lie evenly along its
+    way, about `width` pixels wide and blurred by so many pixels; None where it does not go far enough.
+
+    picture: gives a frame's levels `[H, W, C]`, of whose channels that one counts that changes most at a place. where: picks what counts by
+    the sine `[h, w]` of its angle above the horizon.
+    """
     looks = _along_the_way(camera, list(indices))
     if len(looks) < FEWEST:
         return None

@@ -5,6 +5,7 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from made_drive import write_drive
 from PIL import Image
 from street import car
 
+from enhance.pairs import inputs
 from enhance.pairs.claims import claim_pairs
 from enhance.pairs.clips import Clip, PairConfig, of_scene
 from enhance.pairs.damage import ORDER
@@ -347,6 +349,14 @@ def test_a_scene_of_pictures_alone_is_met_by_its_recording_in_its_own_metres(str
     workspace.rename(tmp_path / "renamed")
     open_recording(tmp_path / "renamed", scene)
     assert "renamed is called renamed, and its scene walk: if it is another drive" in capsys.readouterr().err
+
+
+def test_a_scene_of_a_part_of_a_video_is_met_by_that_part(street, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(inputs, "open_log", lambda path, **given: asked.append(given) or SimpleNamespace(meta=meta, name="walk.mp4"))
+    meta = {"name": "walk.mp4", "world_from_model": {"scale": 2.0}, "part_us": [60_000_000, 15_000_000]}
+    open_recording(tmp_path / "walk.mp4", replace(street, meta=meta))
+    assert asked == [{"metres_per_unit": 2.0, "part_us": (60_000_000, 15_000_000)}]
 
 
 def test_another_drives_recording_is_refused_by_where_it_is(street, tmp_path):

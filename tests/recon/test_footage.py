@@ -90,3 +90,5 @@ def test_a_part_of_a_long_video_has_frames_as_close_as_a_short_one(tmp_path, cap
     assert capsys.readouterr().err == ""
     with pytest.raises(ValueError, match="start 3s is outside .*long.mp4, which lasts 3s"):
         take_frames(file, tmp_path / "none", 3_000_000)
+    with pytest.raises(ValueError, match="duration 0s must be positive; .*long.mp4 lasts 3s"):
+        take_frames(file, tmp_path / "none", 0, 0)
