@@ -177,8 +177,8 @@ class _Path:
                 return
             if round_ == TOLD:
                 self.off = np.clip(1.48 * np.median(np.abs(self.now - self.boxes)[self.has], axis=0), OFF / 5, 2 * OFF)
-            met_ = (met(self.seen[k].points, centre, skin, pose, still, reach, FEWEST) for k, pose in zip(rows, moved, strict=True))
-            self._step(dict(zip(rows, met_, strict=True)))
+            placed = zip(rows, moved, strict=True)
+            self._step({k: met(self.seen[k].points, centre, skin, pose, still, reach, FEWEST) for k, pose in placed})
 
     def _step(self, blocks: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
         """Find the poses anew (Gauss and Newton): those that boxes and forces make likely and, by row, normal equations `[12, 12]`, `[12]`
