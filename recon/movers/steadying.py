@@ -28,6 +28,9 @@ AROUND, ABOVE = 0.4, 0.2
 TWICE_US = 10_000
 """Between two moments of a track, at least: a second lidar may see it at nearly the same."""
 
+PACE_US = 250_000
+"""Half the time over which a speed is taken: boxes that are off are so for one moment."""
+
 CELL = 0.06
 """Metres: a sweep keeps one point of an object in each such cell."""
 
@@ -121,8 +124,13 @@ class _Look:
         own = its if its.sum() >= FEWEST else own
         if own.sum() < FEWEST:
             return None
-        late = float(np.median(read.times_us[near[own]] - stamp_us))
-        local = local[own]
+        # where boxes do not say for which lidar they are, all passed, at moments of their own
+        times, lidars = read.times_us[near[own]] - stamp_us, read.sensor[near[own]]
+        passed = [float(np.median(times[lidars == n])) for n in np.unique(lidars) if (lidars == n).sum() >= FEWEST]
+        late = float(np.mean(passed)) if passed else float(np.median(times))
+        before, after = (self.path.near(stamp_us + d)[:3, 3].numpy() for d in (-PACE_US, PACE_US))
+        on = (after - before) / (2 * PACE_US) @ pose[:3, :3].numpy()
+        local = local[own] - (times - late)[:, None] * on
         return _Seen(local[thinned(local, CELL)], pose, late)
 
 

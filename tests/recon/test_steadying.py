@@ -121,6 +121,14 @@ def test_a_second_lidar_that_passes_later_makes_no_car_jump():
     assert steadied(log, log.sweeps).tracks[0] is drawn
 
 
+def test_two_lidars_that_pass_at_moments_of_their_own_show_one_car():
+    """Half of the points were taken 50 ms later, 0.4 m on; nobody says for which lidar boxes are drawn."""
+    drawn = boxed(STAMPS, shaken(way(STAMPS)), sensor=-1)
+    log = drive(drawn, late_us=lambda k: {0: -25_000, 1: 25_000})
+    (found,) = steadied(log, log.sweeps).tracks
+    assert unrest(found, way(STAMPS))[0] < 0.03
+
+
 def test_what_a_turn_of_the_lidar_begins_and_ends_with_is_seen_twice():
     """Points of its rear were taken 0.1 s before some of its front, in every third sweep."""
     drawn = boxed(STAMPS, shaken(way(STAMPS)))
