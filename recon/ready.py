@@ -74,7 +74,8 @@ def same_sweeps(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
 
 
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
-    """The log, with the movers that `sweeps` show where it has no boxes of its own; on a hill its boxes lean as the road does."""
+    """The log, with the movers that `sweeps` show where it has no boxes of its own; boxes lie where their points meet, and on a hill
+    lean as the road does."""
     if not log.tracks and sweeps:
         with Progress("movers", total=len(sweeps)) as steps:
             found = with_movers(log, sweeps, steps.step)

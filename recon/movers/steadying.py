@@ -134,28 +134,36 @@ class _Look:
         return _Seen(local[thinned(local, CELL)], pose, late)
 
 
+def _rows(look: _Look) -> list[tuple[float, int, int, bool]]:
+    """A track's boxes, and what sweeps show of it between them, in time order: the moment at which the lidar passed, the time that the
+    track has for it, the stamp of the sweep, in microseconds, and whether it is a box."""
+    own = look.track.times_us
+    late = {time: seen.late_us for time, seen in look.seen.items()}
+    dated = [t for t in own.tolist() if t in late]
+    usual = np.interp(own, dated, [late[t] for t in dated]) if dated else np.zeros(len(own))
+    between = np.array(sorted(late.keys() - look.row.keys()), dtype=np.int64)
+    taken = between + np.array([late[int(t)] for t in between])
+    # boxes of that moment, as late as the lidar passes over those around it, would be drawn for these
+    times = np.round(taken - np.interp(taken, own + usual, usual)).astype(np.int64)
+    boxes = zip(own + usual, own, own, np.ones(len(own), dtype=bool), strict=True)
+    others = zip(taken, times, between, np.zeros(len(between), dtype=bool), strict=True)
+    rows: list[tuple[float, int, int, bool]] = []
+    for row in sorted([*boxes, *others]):
+        close = bool(rows) and (row[0] - rows[-1][0] < TWICE_US or row[1] <= rows[-1][1])
+        if close and row[3] and not rows[-1][3]:
+            rows.pop()  # a box tells more
+        if row[3] or not close:
+            rows.append(row)
+    return rows
+
+
 class _Path:
     """A track's poses while they are found: `now` `[K, 4]`, places and headings, and as `poses` `[K, 4, 4]`; its `boxes` `[K, 4]`, of which
     it `has` `[K]` some, and the others lie between; and their poses, `drawn`, for what else they say."""
 
     def __init__(self, look: _Look):
-        self.track, own = look.track, look.track.times_us
-        late = {time: seen.late_us for time, seen in look.seen.items()}
-        dated = [t for t in own.tolist() if t in late]
-        usual = np.interp(own, dated, [late[t] for t in dated]) if dated else np.zeros(len(own))
-        between = np.array(sorted(late.keys() - look.row.keys()), dtype=np.int64)
-        taken = between + np.array([late[int(t)] for t in between])
-        # boxes of that moment, as late as the lidar passes over those around it, would be drawn for these
-        stamps = np.round(taken - np.interp(taken, own + usual, usual)).astype(np.int64)
-        rows: list[tuple[float, int, int, bool]] = []
-        found = zip(own + usual, own, own, np.ones(len(own), dtype=bool), strict=True)
-        for row in sorted([*found, *zip(taken, stamps, between, np.zeros(len(between), dtype=bool), strict=True)]):
-            close = bool(rows) and (row[0] - rows[-1][0] < TWICE_US or row[1] <= rows[-1][1])
-            if close and row[3] and not rows[-1][3]:
-                rows.pop()  # a box tells more
-            if row[3] or not close:
-                rows.append(row)
-        moments, self.times, seen, self.has = map(np.array, zip(*rows, strict=True))
+        self.track = look.track
+        moments, self.times, seen, self.has = map(np.array, zip(*_rows(look), strict=True))
         self.drawn = look.path.near_each(torch.from_numpy(self.times))
         self.boxes = np.column_stack([self.drawn[:, :3, 3].numpy(), np.unwrap(yaw_of(self.drawn).numpy())])
         self.seen = {k: look.seen[t] for k, t in enumerate(seen.tolist()) if t in look.seen}
