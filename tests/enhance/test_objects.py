@@ -240,7 +240,8 @@ def test_objects_are_looked_at_a_pixel_over_their_edge():
 
 def test_cars_of_the_street_that_are_put_into_it_keep_their_colours_in_a_clip():
     """At their edges, where pixels are a mixture of them and the street, they differ from what is around; that is no wrong light. (Of
-    single frames one in six is taken to be a few levels off: what is done is the mean over a clip's.)"""
+    single frames one in six is taken to be a few levels off: what is done is the mean over a clip's, and of what is hardly more than
+    slight, little.)"""
     street, net = load(DATA / "drive002"), Enhancer.load("builtin").net.objects
     start = int(street.frame_times(CAMERA)[0])
     for text in (PARKED, MOVING):
@@ -251,4 +252,7 @@ def test_cars_of_the_street_that_are_put_into_it_keep_their_colours_in_a_clip():
         told = telling(frame, street.anew())
         rgb = told.rgb.permute(2, 0, 1).clamp(0, 1)
         better, before = correct(net, rgb, told.instance, before)
-        assert (told.instance > 0).sum() > 5000 and torch.equal(better[:, told.instance > 0], rgb[:, told.instance > 0])
+        assert (told.instance > 0).sum() > 5000
+        for i in before:
+            made = (better - rgb)[:, told.instance == i]
+            assert made.square().mean().sqrt() < SLIGHT
