@@ -46,7 +46,7 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
     """Take edits out of a scene folder, with all their files, for a block that changes it further; where that fails they are back.
 
     Also one whose layer was deleted by hand. With each go the edits that changed only actors which it brought. ValueError for no such
-    edit, and where an edit changes such an actor and something else.
+    edit, and where an edit that stays changes such an actor and something else.
     """
     scene = Path(scene)
     read_metadata(scene)
@@ -60,7 +60,7 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
                 gone: set[str] = set()
                 for name in names:
                     if name not in gone:
-                        out.append(_taken_out(scene, name, Path(aside)))
+                        out.append(_taken_out(scene, name, Path(aside), names))
                         gone |= {name, *out[-1].idle}
                 yield [replace(u, held={edit: tracks for edit, tracks in u.held.items() if edit not in gone}) for u in out]
             except BaseException:
@@ -71,14 +71,14 @@ def undone(scene: str | Path, names: Sequence[str]) -> Iterator[list[Undone]]:
                 raise
 
 
-def _taken_out(scene: Path, name: str, aside: Path) -> Undone:
-    """Move an edit's files, and those of the edits that go with it, from a scene to the folder `aside`."""
+def _taken_out(scene: Path, name: str, aside: Path, leaving: Sequence[str]) -> Undone:
+    """Move an edit's files, and those of the edits that go with it, from a scene to the folder `aside`; `leaving` are all that will go."""
     edits = scene / "edits"
     with open_stage(scene / "scene.usda") as stage:
         have = [e["name"] for e in read_edits(stage)]
         if name not in have and not (is_edit_name(name) and ((edits / f"{name}.usda").exists() or (edits / name).exists())):
             raise ValueError(unknown("edit", name, str(scene), have, "--undo {}"))
-        gone = Undone(name, tuple(_idle_without(stage, name)), _held(stage, name))
+        gone = Undone(name, tuple(_idle_without(stage, name, leaving)), _held(stage, name))
     for each in (*gone.idle, name):
         drop_sublayer(scene, f"./edits/{each}.usda")
         for path in (p for p in (edits / f"{each}.usda", edits / each) if p.exists()):
@@ -93,8 +93,9 @@ def clear_aside(scene: Path) -> None:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
-    """Edits that change nothing but actors which the edit `name` alone defines, or defined before its layer was deleted."""
+def _idle_without(stage: Usd.Stage, name: str, leaving: Sequence[str]) -> list[str]:
+    """Edits that change nothing but actors which the edit `name` alone defines, or defined before its layer was deleted. ValueError where
+    one changes more, but for those that are `leaving` by themselves."""
     root, out = stage.GetRootLayer(), []
     layers = {Path(sub).stem: Sdf.Layer.Find(root.ComputeAbsolutePath(sub)) for sub in root.subLayerPaths if sub != RECORDED}
     own = layers.pop(name, None)
@@ -103,11 +104,13 @@ def _idle_without(stage: Usd.Stage, name: str) -> list[str]:
     for edit, layer in layers.items():
         actors = layer and layer.GetPrimAtPath("/World/Actors")
         changed = set(actors.nameChildren.keys()) if actors else set()
-        if changed & gone and (changed - gone or layer.subLayerPaths):
+        if not changed & gone:
+            continue
+        if not changed - gone and not layer.subLayerPaths:
+            out.append(edit)
+        elif edit not in leaving:
             lost = ", ".join(sorted(changed & gone))
             raise ValueError(f"the edit {edit} changes more than {lost}, which {name} brought; undo both: --undo {edit} --undo {name}")
-        if changed & gone:
-            out.append(edit)
     return out
 
 

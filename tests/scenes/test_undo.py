@@ -66,6 +66,17 @@ def test_an_edit_may_be_named_that_goes_with_another(saved):
     same(load(saved), busy())
 
 
+@pytest.mark.parametrize("order", [["new", "both"], ["both", "new"]])
+def test_an_edit_of_an_insertion_and_of_more_is_undone_with_it_whichever_is_named_first(saved, order):
+    put_in(saved)
+    add_change(saved, "both", load(saved), Edit(shift={"new": (1.0, 0.0), "veh_2": (0.0, 1.0)}), {})
+    with pytest.raises(ValueError, match="undo both: --undo both --undo new"):
+        undo(saved, "new")
+    with undone(saved, order) as edits:
+        assert [(e.name, e.idle, e.held) for e in edits] == [(name, (), {}) for name in order]
+    same(load(saved), busy())
+
+
 def test_what_was_undone_is_back_where_what_comes_after_fails(saved):
     put_in(saved)
     add_change(saved, "aside", load(saved), Edit(shift={"new": (1.0, 0.0)}), {})
