@@ -83,7 +83,7 @@ def unseen_warning(actor: Actor, cameras: Iterable[Camera]) -> list[str]:
     id = actor.asset.meta.get("id", actor.track)
     said = f"{id} is shown from its {_listed(named)}, from where no photo of it was taken: what stands there is a guess; "
     # what an edit put in another's place goes as that one did
-    turn = "" if actor.asset.meta.get("edited") else "turn it (a yaw of 180deg), or "
+    turn = "" if actor.asset.meta.get("edited") else "turn it (its yaw by 180deg), or "
     return [f"{said}{turn}take another one (sidestep assets show {id} says from where it was seen)"]
 
 

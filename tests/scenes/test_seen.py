@@ -84,7 +84,7 @@ def test_who_shows_an_unseen_side_is_told(street):
     oncoming = insert(street, asset, Placement("car/0007", 12, 0, yaw=torch.pi)).actor
     (said,) = unseen_warning(oncoming, seeing(oncoming, recorded(street)))
     assert said.startswith("car/0007 is shown from its front, from where no photo") and "assets show car/0007" in said
-    assert "turn it (a yaw of 180deg), or take another one" in said
+    assert "turn it (its yaw by 180deg), or take another one" in said
     replaced = replace(oncoming, asset=replace(oncoming.asset, meta={**oncoming.asset.meta, "edited": True}))
     assert "a guess; take another one" in unseen_warning(replaced, seeing(replaced, recorded(street)))[0], "its path is another's"
     assert unseen_warning(oncoming, []) == []
