@@ -18,6 +18,7 @@ from recon.fit.knots import Knots
 from recon.fit.limbs import Limbs
 from recon.fit.motion import Motion
 from recon.fit.population import Population
+from recon.fit.reach import nearest_of
 from recon.fit.strides import stride_of
 from recon.log import Log
 from recon.objects.tracks import LIMBED
@@ -96,7 +97,7 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
     ground = FlatGround(start.ground, start.ground_shown, torch.device(device))
-    population = Population(start.splats.to(device), motion, config, ground, start.swept, clear)
+    population = Population(start.splats.to(device), motion, config, ground, start.swept, clear, nearest_of(start.measured))
     fields = [_flat_field(start.rig[name], exposed.get(name), population.device) for name in frames.names]
     return Fit(frames, population, start.sky, start.exposures, limbs, start.measured, fields)
 

@@ -13,7 +13,7 @@ from recon.begin import begin
 from recon.checkpoint import checkpoint_path, load_checkpoint, plain_config, plain_tracks, save_checkpoint
 from recon.defaults import HELD_OUT, choose, fit_config, fit_size
 from recon.evaluation.live import Live
-from recon.evaluation.offpath import held_out_sweeps, off_path_table, off_path_text
+from recon.evaluation.offpath import held_out_sweeps, off_path_table, off_path_text, shifts_within
 from recon.evaluation.report import held_out_table, table_text
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
@@ -104,7 +104,8 @@ def reconstruct(
     scene.meta["fit"] = {"steps": config.steps, "splats": len(fit.splats), "seconds": round(seconds(), 1), "live": live.curve}
     print(table_text(rows), file=sys.stderr)
     if unseen:
-        scene.meta["off_path"] = off_path_table(there, log, same_sweeps(log, unseen), fit.frames)
+        aside = shifts_within(fit.openings.metres)
+        scene.meta["off_path"] = off_path_table(there, log, same_sweeps(log, unseen), fit.frames, aside)
         print(off_path_text(scene.meta["off_path"]), file=sys.stderr)
     _write(scene, there, fit, start, output, overwrite)
     checkpoint.unlink(missing_ok=True)

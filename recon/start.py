@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 
 from recon.body_path import body_path
 from recon.fit.model import Splats, draw
-from recon.fit.reach import reach_at, reach_of, spanned
+from recon.fit.openings import ASIDE, aside_of
+from recon.fit.reach import nearest_of, reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.ground import STRAY_IN_PICTURES, estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
@@ -127,7 +128,8 @@ def prepare(
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     shares = (street.points, SEED_PART), (street.beyond, BEYOND_PART), (street.aside, ASIDE_PART)
     cloud, sides = _thinned(path, *((points, int(budget * part)) for points, part in shares))
-    background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values()))
+    nearest = nearest_of(street.measured)
+    background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values(), nearest))
     background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
 
     groups, reaches, tracks = [], [], []
@@ -149,7 +151,7 @@ def prepare(
     share = FILLED_PART * budget / max(1, sum(map(len, (filled, *groups))))
     filled, *groups = (fewer(group, max(1, share * len(group))) for group in (filled, *groups))
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
-    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values()), *of_groups])
+    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values(), nearest), *of_groups])
     of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
     ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(shown, ground, STRAY_IN_PICTURES)
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(street.measured), swept, *of_views)
@@ -190,9 +192,9 @@ def _lidar_street(
     if not coloured.any():
         raise ValueError(f"{log.path} has no lidar point that the cameras {', '.join(frames.names)} see; check the span and the poses")
     points = Cloud(split.static[coloured], rgb[coloured])
-    aside = seen_from_aside(log, frames, split.static[~coloured], points, ground)
     report("measuring depth")
     struck = by_lidar(log, frames, sweeps, split, movers)
+    aside = seen_from_aside(log, frames, split.static[~coloured], points, ground, aside_of([struck]) / ASIDE)
     beyond, by_pictures = beyond_lidar(log, frames, struck, ground, movers, gains)
     everything = struck.completed(by_lidar_of_movers(log, frames, sweeps, split))
     measured = [everything, by_all_sweeps(log, frames, split, movers).without(by_pictures), by_pictures]

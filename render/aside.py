@@ -45,8 +45,11 @@ FARTHEST = 200.0
 UNSEEN = 0.05
 """Part of a picture from which on it is told that no camera saw it."""
 
-STEP = 0.5
-"""Metres, of which the largest shift is told in whole ones: it is measured no better."""
+STEP, FINE = 0.5, 0.1
+"""Metres, of which the largest shift is told in whole ones: it is measured no better; the finer where no car drove, as indoors."""
+
+PARTS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+"""Of a car's size, the largest at which what recorded the drive went where it went is its own: robots are narrower than cars."""
 
 MEASURED = 3.0
 """Metres aside up to which it is measured how well views hold (`recon/evaluation/offpath.py`)."""
@@ -172,7 +175,8 @@ def _beyond(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, sai
         ends = f"it is {abs(left):.1f} m to the {side} of the recorded path, and something stands {room + BEFORE:.1f} m to that side of it"
         fix = "stay nearer to the recorded path there"
         return [f"{said} goes beyond what was recorded: {after} {ends}, or the known ground ends, and what is behind is a guess; {fix}"]
-    whole = STEP * math.floor(room / STEP)
+    step = _step(_size(scene, looks))
+    whole = step * math.floor(round(room / step, 6))
     fix = f"the largest shift short of that is {math.copysign(whole, path):g}m" if whole else "no shift to that side makes sense"
     return [
         f"{said} goes beyond what was recorded: {after} something stands, or the known ground ends, "
@@ -214,26 +218,52 @@ def _turned(scene: Scene, looks: Sequence[Camera], path: Trajectory, said: str) 
 
 def _in_the_way(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, said: str) -> list[str]:
     """Told by the car's box, since its camera may look over the roofs of what stands there."""
-    hit = _struck(scene, looks, path) if scene.ground is not None else None
+    if scene.ground is None:
+        return []
+    size = _size(scene, looks)
+    hit = _struck(scene, looks, path, size)
     if hit is None:
         return []
     runs = f"{said} takes the recording car through {hit[0]}, {_after(looks, hit[1])}"
     if isinstance(path, Trajectory):
         return [f"{runs}; lead it past there"]
-    less = math.ceil(abs(path) / STEP) - 1
-    while less > 0 and _struck(scene, looks, math.copysign(less * STEP, path)):
+    step = _step(size)
+    less = math.ceil(round(abs(path) / step, 6)) - 1
+    while less > 0 and _struck(scene, looks, math.copysign(less * step, path), size):
         less -= 1
-    fix = f"at {math.copysign(less * STEP, path):g}m its way is free" if less else "no shift to that side is free"
+    fix = f"at {math.copysign(less * step, path):g}m its way is free" if less else "no shift to that side is free"
     return [f"{runs}; {fix}"]
 
 
-def _struck(scene: Scene, looks: Sequence[Camera], path: float | Trajectory) -> tuple[str, int] | None:
-    """What the recording car runs into first on a path, and when; None where its way is free."""
-    size, times = torch.tensor(CAR, dtype=torch.float64), sorted({camera.time_us for camera in looks})
-    ego = path if isinstance(path, Trajectory) else scene.ego.shifted(lateral=path)
+def _step(size: torch.Tensor) -> float:
+    """What a shift of what has a size `[3]` is told in whole ones of."""
+    return STEP if float(size[0]) >= CAR[0] else FINE
+
+
+def _size(scene: Scene, looks: Sequence[Camera]) -> torch.Tensor:
+    """Length, width and height `[3]` of what recorded the drive: a car's, or as much less as makes its own way free."""
+    sizes = [part * torch.tensor(CAR, dtype=torch.float64) for part in PARTS]
+    if scene.ground is None:
+        return sizes[0]
+    times = _times(looks)
+    return next((size for size in sizes if not into(scene, _car(scene, scene.ego, times, size), times)), sizes[-1])
+
+
+def _times(looks: Sequence[Camera]) -> list[int]:
+    return sorted({camera.time_us for camera in looks})
+
+
+def _car(scene: Scene, ego: Trajectory, times: list[int], size: torch.Tensor) -> Actor:
+    """What recorded the drive, of a size `[3]`, on the ground along a path."""
     poses = [standing_pose(scene, body[:2, 3], float(yaw_of(body)), size) for body in map(ego.at, times)]
     nothing = scene.background.gaussians.select(torch.zeros(0, dtype=torch.int64))
-    car = Actor(Asset(nothing, size, "Car"), Trajectory(torch.tensor(times), torch.stack(poses)), "")
+    return Actor(Asset(nothing, size, "Car"), Trajectory(torch.tensor(times), torch.stack(poses)), "")
+
+
+def _struck(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, size: torch.Tensor) -> tuple[str, int] | None:
+    """What the recording car, of a size `[3]`, runs into first on a path, and when; None where its way is free."""
+    times = _times(looks)
+    car = _car(scene, path if isinstance(path, Trajectory) else scene.ego.shifted(lateral=path), times, size)
     found = [(f"{other.track} ({other.asset.label})", t) for other, t in met(scene, car, times)]
     if standing := into(scene, car, times):
         found.append(("what stands there, as a parked car or a pole", standing[0]))

@@ -18,7 +18,7 @@ SLACK = 0.1
 """Metres by which boxes may overlap: annotators leave that much air."""
 
 CLEARANCE = 0.4
-"""Metres above the ground below which the background is road, kerb and their roughness."""
+"""Metres above the ground below which the background is road, kerb and their roughness; a third of what is lower than thrice as much."""
 
 HALF = 0.9
 """Metres that the recording car is wide to either side."""
@@ -129,5 +129,5 @@ def _inside(means: torch.Tensor, box_from_local: torch.Tensor, size: torch.Tenso
     """How many of the points `[N, 3]` lie in a box, but for its rim and the clearance above the ground."""
     pose = box_from_local.to(means.dtype)
     at = means @ pose[:3, :3].T + pose[:3, 3]
-    half = size[:2].to(means.dtype) / 2 - SLACK
-    return int(((at[:, :2].abs() < half).all(1) & (at[:, 2] > CLEARANCE) & (at[:, 2] < float(size[2]) - SLACK)).sum())
+    half, low = size[:2].to(means.dtype) / 2 - SLACK, min(CLEARANCE, float(size[2]) / 3)
+    return int(((at[:, :2].abs() < half).all(1) & (at[:, 2] > low) & (at[:, 2] < float(size[2]) - SLACK)).sum())

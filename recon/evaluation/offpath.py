@@ -46,6 +46,11 @@ def held_out_sweeps(log: Log, every: int) -> tuple[Sweep, ...]:
     return tuple(s for s in log.sweeps if every > 0 and s.index % every == every // 2)
 
 
+def shifts_within(metres: float) -> list[float]:
+    """`SHIFTS`, or as much less as makes `metres` the last: indoors three metres aside is another room."""
+    return [round(shift * min(1.0, metres / SHIFTS[-1]), 1) for shift in SHIFTS]
+
+
 def off_path_table(
     scene: Scene, log: Log, sweeps: Sequence[Sweep], frames: Frames | None = None, shifts: Sequence[float] = SHIFTS
 ) -> list[dict]:

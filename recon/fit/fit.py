@@ -17,7 +17,7 @@ from recon.fit.lines import LOOKS, STRAIGHTENED_AT, StreetLines
 from recon.fit.losses import STEP, PictureLoss
 from recon.fit.model import Splats, dimmed_actors, draw
 from recon.fit.motion import Shot
-from recon.fit.openings import ASIDE, Openings
+from recon.fit.openings import Openings, aside_of
 from recon.fit.population import Population
 from recon.fit.refill import REFILLED_AT, missed
 from recon.fit.sight import Eye, in_sight
@@ -95,7 +95,7 @@ class Fit:
         self.recent_loss = 0.0
         self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
-        self.openings = Openings(frames, self.motion, self.device)
+        self.openings = Openings(frames, self.motion, self.device, aside_of(measured))
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
         self._optimise()
@@ -139,7 +139,7 @@ class Fit:
         camera, target = shot.camera, self.targets.picture(view, self.shrink())
         aside = None
         if self.step_count % ASIDE_EVERY == 0:
-            metres = ASIDE * (2 * float(torch.rand((), generator=self.generator)) - 1)
+            metres = self.openings.metres * (2 * float(torch.rand((), generator=self.generator)) - 1)
             beside = self.openings.aside(view, camera, metres).resized(*self.targets.size(view, 2 * self.shrink()))
             aside = self.motion.beside(shot, beside)
         rates = self._rates()

@@ -27,6 +27,9 @@ that its middle then lies lower, since of splats that overlap the nearer is draw
 painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds. Sunk by 0.02 depth is a
 thirtieth nearer to lidar's, and the road's colours 3 m aside are 0.3 dB farther from the photo's."""
 
+LOWEST = 0.3
+"""Metres that the eye must be above what is pulled so, or half of how high it is above the ground below it, where that is less."""
+
 ON = 0.08
 """Metres from the ground up to which a splat lies on it, and its standard deviation across it at most: what is thicker stands there."""
 
@@ -99,6 +102,8 @@ class FlatGround:
         with stage(which.device):
             moved = [view(which, wp.int64), splats.sizes[0], view(descent.last, float), rates.now]
             ground = [self.grid, view(self.heights, float), view(self.slopes, wp.vec2), view(self.near, wp.vec2), settle * PRESSED]
-            pull = [wp.vec3(*eye.tolist()), settle * PULLED, SUNK]
+            high = float(eye[2] - self.ground.height(eye[None, :2].cpu()))
+            lowest = min(LOWEST, high / 2) if high > 0 else LOWEST
+            pull = [wp.vec3(*eye.tolist()), lowest, settle * PULLED, SUNK]
             unseen = [view(descent.moments, float), COLOURS, settle * UNSEEN_PRESSED]
             run(press, len(which), [*moved, *ground, *pull, *unseen, *fields], which.device)

@@ -16,14 +16,13 @@ from scipy.spatial import cKDTree
 from recon.fit.densify import joined, kept
 from recon.fit.fit import Fit
 from recon.fit.motion import Shot
-from recon.fit.openings import ASIDE
 from recon.fit.unseen import LOW, SEEN, off_ground
 from scenes.gaussians import Gaussians
 from scenes.poses import matrix_from_quat
 from scenes.spread import spread
 
 LOOKS, BESIDE = 10, (-1.0, -0.5, 0.5, 1.0)
-"""Pictures of each camera that are taken again from beside the path, and where: in parts of `ASIDE` to the left."""
+"""Pictures of each camera that are taken again from beside the path, and where: in parts to the left of `Openings.metres`."""
 
 KNOWN = 0.2
 """Part of a splat that a picture must show for it to be an example."""
@@ -74,7 +73,7 @@ def _looks(fit: Fit) -> Iterator[Shot]:
         for view in spread([v for v in fit.training if v.camera == c], LOOKS):
             shot = fit.coarse(view)
             for part in BESIDE:
-                yield fit.motion.beside(shot, fit.openings.aside(view, shot.camera, part * ASIDE))
+                yield fit.motion.beside(shot, fit.openings.aside(view, shot.camera, part * fit.openings.metres))
 
 
 def by_example(splats: Gaussians, hidden: torch.Tensor, known: torch.Tensor, seed: int) -> tuple[Gaussians, torch.Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -10,6 +10,7 @@ import torch.nn.functional as F
 
 from recon.fit.behind import masked, sampled
 from recon.fit.motion import Motion
+from recon.seeds.measured import Measured, nearer
 from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
 from recon.views.skies import always_hidden
@@ -27,8 +28,9 @@ itself, which the last of them alone could change, left 1.3 % of drive 002's sky
 SOLID_WEIGHT = 0.1
 """Of 1 - alpha of pixels below the horizon: a road that the sky shines through looks right from the recorded path alone."""
 
-ASIDE, ASIDE_WEIGHT = 3.0, 0.3
-"""Metres to either side of the path from which the road must be closed too, and what always hides the sky, and the weight of that."""
+ASIDE, WITHIN, ASIDE_WEIGHT = 3.0, 0.25, 0.3
+"""Metres to either side of the path from which the road must be closed too, and what always hides the sky, and the weight of that; as far
+as what this part of the pictures show at most, since indoors cameras 3 m aside are behind a wall."""
 
 LOOKS = 40
 """Pictures of a camera by which it is known where the sky is never seen."""
@@ -37,15 +39,21 @@ HORIZON = -0.01
 """Rays that fall more than this (half a degree) are below the horizon where no photo says what is sky."""
 
 
+def aside_of(measured: Sequence[Measured]) -> float:
+    """Metres to either side of the path from which a scene must be closed, by the depths in pictures."""
+    return min(ASIDE, nearer(measured, WITHIN))
+
+
 class Openings:
     """What a fit's pictures say of the sky.
 
     sky     by a training view's camera and index, what of it is surely sky, bool `[H, W]`
     hidden  bool `[HIDDEN, 2 HIDDEN]`: directions in which none of them shows it, though some look there (`recon/views/skies.py`)
+    metres  to either side of the path from which a scene must be closed (`aside_of`)
     """
 
-    def __init__(self, frames: Frames, motion: Motion, device: torch.device):
-        self.motion, self.device = motion, device
+    def __init__(self, frames: Frames, motion: Motion, device: torch.device, metres: float):
+        self.motion, self.device, self.metres = motion, device, metres
         views = frames.training()
         masks = side_by_side(frames.sky_with_rim, views)
         self.sky = {(v.camera, v.index): torch.from_numpy(mask).to(device) for v, mask in zip(views, masks, strict=True)}

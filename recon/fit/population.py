@@ -26,12 +26,13 @@ class Population:
     """The splats of a fit, and what each carries.
 
     splats; descent, growth: of each of them; guessed: bool `[N]`, what no picture shows: it keeps its colours, and
-    movers' all that it is; None before any is.
+    movers' all that it is; None before any is. nearest: metres of the path within which nothing is seen sharper.
     """
 
-    def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear):
+    def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear, nearest: float):
         self.device = splats.reach.device
         self.splats, self.motion, self.config = splats, motion, config
+        self.nearest = nearest
         self.swept, self.clear, self.flat_ground, self.ground = swept.to(self.device), clear, ground, ground.ground
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.guessed: torch.Tensor | None = None
@@ -46,7 +47,7 @@ class Population:
     def add(self, more: Gaussians, path: Trajectory) -> None:
         """Some more of the background, as many as the budget leaves room for. path: of the body, along which cameras see them."""
         more = fewer(more, max(0, self.config.budget - len(self.splats)))
-        reach = reach_of(more, path, self.motion.rig).to(self.device)
+        reach = reach_of(more, path, self.motion.rig, self.nearest).to(self.device)
         self._renew(*joined(self.splats, self.descent.tensors(), [more], [reach]))
 
     def drop(self, which: torch.Tensor) -> None:

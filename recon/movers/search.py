@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from recon.movers.following import FEWEST, Cluster, Followed, Patience, follow
 from recon.movers.freespace import RangeImage, range_images, tally
 from recon.objects.actors import MARGIN, SWEPT_MARGIN, inside
 from recon.objects.tracks import named
+from recon.readers.recorder import LENGTH, WIDTH, highest_of, size_of
 from scenes.ground import Ground
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
@@ -42,7 +43,8 @@ SHARE = 0.4
 """Part of all points in and around an object's box that must have moved: leaves and edges seem to, in the midst of what stands."""
 
 OWN = 4.2, 1.2
-"""Metres ahead or behind and aside of the body within which what goes is the recording car's own bonnet."""
+"""Metres ahead or behind and aside of the body within which what goes is the recording car's own bonnet; of a robot as much less, and what
+moves is looked for as much lower (`recon.readers.recorder.size_of`)."""
 
 TILE = 0.1
 """Metres: beside the lidar thousands of points lie within one, and one of each tile of this side stands for all in it."""
@@ -57,13 +59,14 @@ def with_movers(log: Log, sweeps: Sequence[Sweep], report: Callable[[], None] = 
     followed: list[Followed] = []
     patience = Patience.of(list(read))
     asked: dict[int, np.ndarray] = {}
+    part = _size(log, read)
     for time, points in read.items():
-        asked[time] = candidates(log, time, points, ground)
+        asked[time] = candidates(log, time, points, ground, part)
         eye = log.ego.near(time)[:3, 3].numpy()
         follow(followed, clusters(time, asked[time], images, eye), time, eye, asked[time], patience)
         report()
     stamps = np.unique([s.time_us for s in log.sweeps])
-    made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed and not _own(f, log.ego)]
+    made = [(f, boxed(f.clusters, ground, stamps)) for f in followed if f.believed and not _own(f, log.ego, part)]
     tracks = [(f, t) for f, t in made if t is not None and _moved(f.clusters, t, asked) >= SHARE]
     return replace(log, tracks=named(_apart(tracks), log.ego))
 
@@ -77,10 +80,21 @@ def _read(sweeps: Sequence[Sweep]) -> dict[int, LidarPoints]:
     return {time: LidarPoints(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields)) for time, parts in read.items()}
 
 
-def _own(one: Followed, ego: Trajectory) -> bool:
+def _size(log: Log, read: Mapping[int, LidarPoints]) -> float:
+    """What part of a car's size the recording one has."""
+    top = highest_of(log)
+    return float(np.median([size_of(_in_body(log, time, points.xyz), top) for time, points in read.items()]))
+
+
+def _in_body(log: Log, time_us: int, xyz: np.ndarray) -> np.ndarray:
+    pose = log.ego.near(time_us).numpy()
+    return (xyz - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _own(one: Followed, ego: Trajectory, part: float) -> bool:
     """Whether what was followed is the recording car itself, most of the time."""
     local = _seen_from(torch.stack([ego.near(c.time_us) for c in one.clusters]), np.array(one.places))
-    return bool((np.median(np.abs(local), axis=0) < OWN).all())
+    return bool((np.median(np.abs(local), axis=0) < part * np.array(OWN)).all())
 
 
 def _seen_from(poses: torch.Tensor, places: np.ndarray) -> np.ndarray:
@@ -118,15 +132,15 @@ def _within(one: Followed, track: Track) -> float:
     return float((np.abs(local) < track.size[:2] / 2 + MARGIN).all(1).sum()) / len(times)
 
 
-def candidates(log: Log, time_us: int, points: LidarPoints, ground: Ground) -> np.ndarray:
-    """The points `[N, 3]` of a sweep that may move: over the ground, within reach, and not the recording car itself."""
+def candidates(log: Log, time_us: int, points: LidarPoints, ground: Ground, part: float) -> np.ndarray:
+    """The points `[N, 3]` of a sweep that may move: over the ground, within reach, and not the recording car itself, which has that part of
+    a car's size."""
     xyz = points.xyz
-    pose = log.ego.near(time_us).numpy()
-    local = (xyz - pose[:3, 3]) @ pose[:3, :3]
+    local = _in_body(log, time_us, xyz)
     height = xyz[:, 2] - ground.height(torch.from_numpy(xyz[:, :2])).numpy()
-    own = (np.abs(local[:, 0]) < 2.6) & (np.abs(local[:, 1]) < 1.1)
+    own = (np.abs(local[:, 0]) < part * LENGTH / 2) & (np.abs(local[:, 1]) < part * WIDTH / 2)
     away = np.linalg.norm(local[:, :2], axis=1)
-    kept = xyz[(height > HEIGHTS[0]) & (height < HEIGHTS[1]) & (away < REACH) & ~own]
+    kept = xyz[(height > part * HEIGHTS[0]) & (height < HEIGHTS[1]) & (away < REACH) & ~own]
     return kept[:: max(1, -(-len(kept) // MOST))]
 
 

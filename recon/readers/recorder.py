@@ -18,6 +18,10 @@ LENGTH, WIDTH = 5.2, 2.2
 """Metres of the box about the middle of the lidars on its roof that is the car's: bodies begin at the rear axle, under the lidar, or
 anywhere. Of the road in it a lidar on the roof sees nothing."""
 
+HIGH, AROUND, LOW, TELLING = 1.2, 15.0, 0.02, 200
+"""Metres above the ground that a car's highest lidar or camera stands at least; a robot, whose stands lower, is as much smaller. The ground
+is where this part of the points within so many metres is lower, of so many points at least."""
+
 ROOF = 0.5
 """Metres below the highest lidar up to which others are on the roof, too."""
 
@@ -36,21 +40,36 @@ def without_recorder(log: Log) -> Log:
     log = replace(log, tracks=tuple(track for track in log.tracks if track.name not in own))
     top = max((float(place[2]) for place in log.lidars.values()), default=0.0)
     ahead = [float(place[0]) for place in log.lidars.values() if place[2] > top - ROOF] or [0.0]
-    middle = (min(ahead) + max(ahead)) / 2
+    middle, highest = (min(ahead) + max(ahead)) / 2, highest_of(log)
 
     def freed(sweep: Sweep) -> Sweep:
         def read() -> LidarPoints:
             points = sweep.read()
             # freed of the car's motion, its own points stand where it was when each was taken
             moments, which = np.unique(points.times_us // MOMENT_US, return_inverse=True)
-            back = inverse(log.ego.near_each(torch.from_numpy(moments * MOMENT_US))).numpy()[which, :2]
+            back = inverse(log.ego.near_each(torch.from_numpy(moments * MOMENT_US))).numpy()[which, :3]
             local = np.einsum("nij,nj->ni", back[..., :3], points.xyz) + back[..., 3]
-            beside = (np.abs(local[:, 0] - middle) > LENGTH / 2) | (np.abs(local[:, 1]) > WIDTH / 2)
+            part = size_of(local, highest)
+            beside = (np.abs(local[:, 0] - middle) > part * LENGTH / 2) | (np.abs(local[:, 1]) > part * WIDTH / 2)
             return LidarPoints(points.xyz[beside], points.times_us[beside], points.sensor[beside])
 
         return replace(sweep, read=read)
 
     return replace(log, sweeps=tuple(map(freed, log.sweeps)))
+
+
+def highest_of(log: Log) -> float:
+    """Metres above the body's own place at which its highest lidar or camera stands."""
+    mounts = [inverse(log.ego.near_each(c.times_us)) @ c.world_from_cam for c in log.cameras.values() if len(c)]
+    lidars = [float(place[2]) for place in log.lidars.values()]
+    return max([*lidars, *(float(mount[:, 2, 3].median()) for mount in mounts)], default=0.0)
+
+
+def size_of(local: np.ndarray, top: float) -> float:
+    """What part of a car's size the recording one has, by a sweep's points `[N, 3]` in its body and the height of what stands highest
+    there."""
+    near = local[np.linalg.norm(local[:, :2], axis=1) < AROUND, 2]
+    return 1.0 if len(near) < TELLING else float(np.clip((top - np.quantile(near, LOW)) / HIGH, 0.0, 1.0))
 
 
 def _is_recorder(track: Track, ego: Trajectory) -> bool:

@@ -39,20 +39,21 @@ VIEWS = 24
 """Of a camera, spread over the drive, from beside which it is asked."""
 
 
-def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, ground: Ground) -> Cloud:
+def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, ground: Ground, part: float = 1.0) -> Cloud:
     """Those of world points `[N, 3]` that stand off the ground and the path and lie in no training view's frustum, but in that of one moved
-    aside, with the colours of what is `known` around them; at most one a cell."""
+    aside, with the colours of what is `known` around them; at most one a cell. part: of `SIDES` and `CLEAR`, where gaps are closed less far
+    aside."""
     points = points[one_a_voxel(points, CELL)]
     path = cKDTree(log.ego.world_from_body[:, :2, 3].numpy())
     off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy() > NEAR_GROUND
-    points = points[off & (path.query(points[:, :2], workers=2)[0] > CLEAR)]
+    points = points[off & (path.query(points[:, :2], workers=2)[0] > part * CLEAR)]
     wanted = np.zeros(len(points), dtype=bool)
     for c in range(len(frames.names)):
         for view in spread(frames.of(c), VIEWS):
             camera, left = frames.camera(log, view), log.ego.near(view.time_us)[:3, 1]
             for metres in SIDES:
                 rest = np.flatnonzero(~wanted)
-                wanted[rest] = _in_view(points[rest], _moved(camera, metres * left))
+                wanted[rest] = _in_view(points[rest], _moved(camera, part * metres * left))
     points = points[wanted]
     for view in frames.training():
         points = points[~_in_view(points, frames.camera(log, view), np.inf)]

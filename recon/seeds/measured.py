@@ -27,9 +27,10 @@ SOON_US = 100_000
 HIDING, AROUND = 1.1, (9, 5)
 """How many times nearer a point within so many rows and columns must be to hide another: lidar looks over what hides it from cameras."""
 
-ROAD = 1.2
-"""Metres above the road that a camera stands at least: below the horizon what a lower point hides rises more steeply from there than a road
-does, whose near end hides nothing of its far one. From some 50 metres on nothing lower hides anything."""
+ROAD, UNDER, LOWER = 1.2, 8.0, 0.05
+"""Metres above the road that a car's camera stands at least: below the horizon what a lower point hides rises more steeply from there than
+a road does, whose near end hides nothing of its far one. From some 50 metres on nothing lower hides anything. A robot's stands as far above
+its floor as above this part of the points within so many metres."""
 
 SLACK = 0.05
 """Part of a depth by which it may be off at little cost; what a mistake costs grows with its logarithm from there on."""
@@ -65,6 +66,13 @@ class Measured:
         return Measured({which: depth.to(device) for which, depth in self.views.items()}, self.weight)
 
 
+def nearer(measured: Sequence[Measured], part: float) -> float:
+    """Depth than which this part of what is known of the views is nearer; infinite where nothing is known."""
+    known = [depth[::4, ::4].flatten() for m in measured for depth in m.views.values()]
+    depths = torch.cat([torch.zeros(0), *(d[d.isfinite()].float().cpu() for d in known)])
+    return float(np.quantile(depths.numpy(), part)) if len(depths) else np.inf
+
+
 def grid_of(camera: Camera) -> Camera:
     """A view's camera on the grid, as fine as plates are."""
     return camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
@@ -74,8 +82,16 @@ def by_lidar(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split, mo
     """What the sweep nearest to each training view measured of what stands still, and no mover hides; split: the sweeps' points."""
     measured = {}
     for _, static, view, camera in _soon(log, frames, sweeps, split):
-        measured[view.camera, view.index] = as_known(nearest_points(static, camera, nearest_box(camera, movers)))
+        stands = min(ROAD, _stands(camera.world_from_cam[:3, 3].numpy(), static))
+        measured[view.camera, view.index] = as_known(nearest_points(static, camera, nearest_box(camera, movers), stands))
     return Measured(measured, LIDAR)
+
+
+def _stands(eye: np.ndarray, points: np.ndarray) -> float:
+    """Metres of an eye `[3]` above what points `[N, 3]` show of the ground around; infinite where they show none below it."""
+    low = points[np.linalg.norm(points[:, :2] - eye[:2], axis=1) < UNDER, 2]
+    height = eye[2] - np.quantile(low, LOWER) if len(low) else 0.0
+    return float(height) if height > 0 else np.inf
 
 
 def by_lidar_of_movers(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> Measured:
@@ -106,9 +122,9 @@ def _soon(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> It
             yield sweeps[k], static, view, grid_of(frames.camera(log, view))
 
 
-def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np.ndarray:
-    """Depth `[h, w]` of points `[N, 3]` that a camera sees, NaN where it sees none; neither behind others, which a road is not behind its
-    own near end, nor behind what is `before`."""
+def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray, stands: float = ROAD) -> np.ndarray:
+    """Depth `[h, w]` of points `[N, 3]` that a camera sees which `stands` so many metres above the road, NaN where it sees none; neither
+    behind others, which a road is not behind its own near end, nor behind what is `before`."""
     row, column, found, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
     cell, found = row[inside] * camera.width + column[inside], found[inside]
     nearest = np.full(camera.height * camera.width, np.inf)
@@ -121,7 +137,7 @@ def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray) -> np
     around = ndimage.minimum_filter(depth, AROUND)
     rows, columns = AROUND[0] // 2, AROUND[1]
     no_lower = ndimage.minimum_filter(depth, (rows + 1, columns), origin=(rows // 2, 0))
-    steepest = rows / (ROAD * camera.lens.focal()[1])  # a plane's inverse depth falls by as much with every row
+    steepest = rows / (stands * camera.lens.focal()[1])  # a plane's inverse depth falls by as much with every row
     may_be_road = (world_directions(camera)[..., 2] < 0).numpy() & (1 / around - 1 / depth < steepest)
     hidden = (depth > HIDING * np.where(may_be_road, no_lower, around)) | (depth > before)
     return np.where(hidden | np.isinf(depth), np.nan, depth)

@@ -16,11 +16,13 @@ import torch
 from scipy import ndimage
 
 from recon.log import Log, SparsePoints
+from recon.views.ceilings import MOST, without_ceilings
 from recon.views.project import project
 from recon.views.skies import closed, even, like_sky, reaching_top, sky_mask
 from recon.views.view import View
 from render.rays import world_directions
 from scenes.poses import inverse
+from scenes.spread import spread
 
 RIM = 6
 """Cells, of about 240 across an image, by which what looks like the sky beside it may reach into its rim."""
@@ -43,6 +45,9 @@ TOLD = 300
 
 LIGHTNESS, COLOUR, GRAIN = 32, 32, 5
 """Bins by which looks are counted."""
+
+ASKED = 8
+"""Sweeps, or views, that tell how far away what stands is."""
 
 DARK = 12.0
 """Levels about which differences count by levels no more, but by parts."""
@@ -70,7 +75,7 @@ def under_their_sky(log: Log, names: Sequence[str], views: list[View], points: S
     """The views with their skies as lidar, or without it the `points` that pictures showed, tell them; as they are where neither tells
     enough of a camera's views, and smooth blue is all that is known of sky."""
     told = dict(zip(range(len(views)), views, strict=True))
-    cells = _cells(log, names, views, points)
+    cells, far = _cells(log, names, views, points), _farthest(log, names, views, points)
     for camera in range(len(names)):
         mine = [i for i in cells if views[i].camera == camera]
         odds = _taught([cells[i] for i in mine if not views[i].held_out])
@@ -80,7 +85,21 @@ def under_their_sky(log: Log, names: Sequence[str], views: list[View], points: S
             sky = torch.from_numpy(_sky(cells[i], odds))
             ego = views[i].ego
             told[i] = replace(views[i], sky=sky if ego is None else sky & ~_coarse(ego, sky.shape))
-    return list(told.values())
+    return without_ceilings(log, names, list(told.values()), far)
+
+
+def _farthest(log: Log, names: Sequence[str], views: list[View], points: SparsePoints | None) -> float:
+    """Metres from the cameras, or the lidars, within which `MOST` of what stands is; infinite where nothing tells."""
+    sweeps = spread(log.sweeps_within((min(v.time_us for v in views), max(v.time_us for v in views))), ASKED)
+    if sweeps:
+        away = [np.linalg.norm(s.read().xyz - log.ego.near(s.time_us)[:3, 3].numpy(), axis=1) for s in sweeps]
+    elif points is not None:
+        shown = [(log.camera(names[v.camera]).world_from_cam[v.index, :3, 3].numpy(), points.seen[names[v.camera]][v.index]) for v in views]
+        away = [np.linalg.norm(points.xyz[which] - eye, axis=1) for eye, which in spread(shown, ASKED)]
+    else:
+        return np.inf
+    away = np.concatenate([np.zeros(0), *away])
+    return float(np.quantile(away, MOST)) if len(away) else np.inf
 
 
 def coarse_sky(image: torch.Tensor, ego: torch.Tensor | None) -> torch.Tensor:

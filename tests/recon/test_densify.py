@@ -8,6 +8,7 @@ from recon.fit.config import FitConfig
 from recon.fit.densify import BOX_MARGIN, Growth, grow, kept, shade_of
 from recon.fit.model import Splats
 from recon.fit.population import Population
+from recon.fit.reach import NEAREST
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians
 from scenes.harmonics import sh_from_rgb
@@ -149,7 +150,7 @@ def test_what_is_added_to_the_background_takes_no_more_room_than_there_is(budget
     standing = Trajectory(torch.zeros(1, dtype=torch.int64), torch.eye(4, dtype=torch.float64)[None])
     motion = SimpleNamespace(rig=[RigCamera(Pinhole(100.0, 100.0, 50.0, 50.0), 100, 100, torch.eye(4))], tracks=[])
     nobody = SimpleNamespace(to=lambda device: None)
-    there = Population(splats(), motion, FitConfig(budget=budget), SimpleNamespace(ground=None), nobody, None)
+    there = Population(splats(), motion, FitConfig(budget=budget), SimpleNamespace(ground=None), nobody, None, NEAREST)
     more = some(30, 4)
     there.add(more, standing)
     assert there.splats.sizes == [50 + room, 20, 10] and len(there.growth.errors) == len(there.splats) == 80 + room

@@ -153,6 +153,17 @@ def test_what_lies_off_the_ground_is_drawn_to_it_along_the_rays_to_the_eye(heigh
     torch.testing.assert_close(at[:, 2].double(), hillside().height(at[:, :2]) - SUNK, atol=0.001, rtol=0)
 
 
+def test_a_robots_eye_draws_what_lies_on_its_floor_to_it_too():
+    """It is 0.28 m above the floor, less than a car's camera ever is above what it looks down on."""
+    floor = ground_of(lambda x, y: 0.0 * x)
+    splats = lying(floor, height=0.05)
+    descent = Descent.begin(splats)
+    descent.moments[:, 1, COLOURS:], descent.last[:] = 1, NOW
+    for _ in range(10):
+        flat_on(floor).press(splats, torch.arange(60), descent, rates_at(NOW, {}), 1.0, torch.tensor([0.0, 0.0, 0.28], dtype=torch.float64))
+    assert (splats.fields["means"][:30, 2] < 0.95 * 0.05).all()
+
+
 def test_what_is_laid_onto_the_ground_is_thin_and_lies_along_it():
     splats = lying(hillside(), height=0.15)
     splats.fields["log_scales"] += 2

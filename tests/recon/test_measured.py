@@ -5,11 +5,12 @@ import pytest
 import torch
 from painted import SIZE, drive, sweep_of, wall
 
-from recon.log import Track
+from recon.log import LidarPoints, Sweep, Track
 from recon.objects.actors import split_points
 from recon.seeds.measured import SLACK, SOON_US, Measured, by_lidar, by_lidar_of_movers, by_pictures, grid_of, mistake, nearest_points
 from recon.seeds.stereo import plate_of
-from recon.views.frames import load_frames
+from recon.views.frames import Frames, load_frames
+from recon.views.view import View
 from scenes.camera import Camera
 from scenes.lenses import Fisheye, OpenCV, Pinhole
 from scenes.poses import translation
@@ -123,6 +124,25 @@ def test_a_road_hides_nothing_of_itself(size, apart):
         # rows of the grid are 0.31 and 0.4 degrees apart
         assert there.mean() > 0.5, (near, far)
         assert abs(off.mean()) < 0.015 and np.abs(off).max() < 0.2, (near, far)
+
+
+def test_a_floor_hides_nothing_of_itself_from_a_robots_camera():
+    """0.3 m above it: taken for a car's, whose road is never so steep, what lies some metres ahead is hidden by what lies before it."""
+    down, turn = np.meshgrid(np.radians(np.arange(1, 15, 0.5)), np.radians(np.arange(-30, 30, 0.2)), indexing="ij")
+    away = 0.45 / np.tan(down)
+    floor = np.stack([away * np.cos(turn), away * np.sin(turn), np.zeros_like(away)], -1).reshape(-1, 3)
+    pose = AHEAD.clone()
+    pose[2, 3] = 0.3
+    log = drive([0.0, 0.5], ("front",))
+    camera = replace(log.cameras["front"], lens=Pinhole(190, 190, 160, 120), width=320, height=240, world_from_cam=pose.expand(2, 4, 4))
+    log = replace(log, cameras={"front": camera})
+    views = [View(0, 0, 20_000, torch.zeros(240, 320, 3, dtype=torch.uint8), False, torch.zeros(1, 1, dtype=torch.bool))]
+    sweep = Sweep(0, 20_000, lambda: LidarPoints(floor, np.full(len(floor), 20_000), np.zeros(len(floor), np.int64)))
+    (depth,) = _by_lidar(log, Frames(["front"], [(320, 240)], views), [sweep], []).views.values()
+    grid = grid_of(log.cameras["front"].camera(0))
+    cars = nearest_points(floor, grid, np.full(depth.shape, np.inf))
+    known = int(depth.isfinite().sum())
+    assert known > 1.3 * np.isfinite(cars).sum()
 
 
 @pytest.mark.parametrize("size", [(960, 540), (1242, 375)])

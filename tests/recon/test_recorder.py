@@ -65,3 +65,15 @@ def test_a_box_around_the_recording_car_is_left_out(capsys):
     log = Log("street", "street", {}, (), (box("own", poses), box("ahead", ahead), box("brushes", brushes)), ego, {})
     assert [t.name for t in without_recorder(log).tracks] == ["ahead", "brushes"]
     assert "box own stands around the recording car" in capsys.readouterr().err
+
+
+def test_a_robot_is_smaller_than_a_car():
+    """Its lidar stands 0.45 m above the floor of a corridor, whose walls a car's box would hold; its own mast is left out all the same."""
+    floor = np.random.default_rng(0).uniform([1.5, -0.7, -0.46], [4.0, 0.7, -0.44], (300, 3))
+    mast, walls = [0.2, 0.1, 0.05], [[0.5, 0.75, 0.2], [1.0, -0.75, 0.3]]
+    xyz = np.concatenate([floor, [mast], walls])
+    points = LidarPoints(xyz, np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64))
+    ego = Trajectory(torch.tensor([0, 100_000]), torch.stack([translation(0.0, 0, 0), translation(0.05, 0, 0)]))
+    log = Log("corridor", "corridor", {}, (Sweep(0, 0, lambda: points),), (), ego, {})
+    left = without_recorder(log).sweeps[0].read().xyz
+    np.testing.assert_array_equal(left, np.concatenate([floor, walls]))

@@ -77,7 +77,7 @@ def test_a_lane_change_that_leads_farther_than_is_measured_says_when(street):
 
 def test_beside_a_wall_no_shift_makes_sense(street):
     wall = box((30.0, 0.3, 3.0), (0.6, 0.6, 0.6))
-    wall = replace(wall, means=wall.means + torch.tensor([5.0, 0.9, 0.0]))
+    wall = replace(wall, means=wall.means + torch.tensor([5.0, 0.6, 0.0]))
     walled = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, wall])))
     (said,) = told(walled, 2.0)
     assert said.endswith("no shift to that side makes sense") and not told(walled, -2.0)
@@ -92,6 +92,16 @@ def test_a_car_below_the_cameras_eye_is_in_the_cars_way(street):
     (said,) = told(parked, -2.5)
     assert "-2.5m takes the recording car through what stands there" in said and said.endswith("at -0.5m its way is free")
     assert not told(parked, -0.5) and not told(parked, 2.5) and not told(street, -2.5)
+
+
+def test_in_a_corridor_that_no_car_fits_into_a_robot_can_go_aside_a_little(street):
+    """Walls 0.7 m to either side, from the floor up: what drove between them is narrower than a car."""
+    walls = [box((30.0, 0.2, 3.0), (0.3, 0.1, 0.3)) for _ in range(2)]
+    walls = [replace(w, means=w.means + torch.tensor([5.0, side, 0.0])) for w, side in zip(walls, (0.8, -0.8), strict=True)]
+    corridor = replace(street, background=replace(street.background, gaussians=Gaussians.cat([street.background.gaussians, *walls])))
+    assert not told(corridor, 0.1)
+    (said,) = told(corridor, 0.6)
+    assert "something stands" in said and said.endswith(("short of that is 0.1m", "short of that is 0.2m"))
 
 
 def test_an_actor_is_in_the_cars_way_as_long_as_it_is_there(street):
