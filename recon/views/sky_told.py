@@ -98,8 +98,8 @@ def _farthest(log: Log, names: Sequence[str], views: list[View], points: SparseP
         away = [np.linalg.norm(points.xyz[which] - eye, axis=1) for eye, which in spread(shown, ASKED)]
     else:
         return np.inf
-    away = np.concatenate([np.zeros(0), *away])
-    return float(np.quantile(away, MOST)) if len(away) else np.inf
+    all_of_it = np.concatenate([np.zeros(0), *away])
+    return float(np.quantile(all_of_it, MOST)) if len(all_of_it) else np.inf
 
 
 def coarse_sky(image: torch.Tensor, ego: torch.Tensor | None) -> torch.Tensor:

@@ -165,7 +165,7 @@ def test_a_scene_is_measured_by_sweeps_where_the_corrected_path_has_them(drive, 
         return moved(log, Trajectory(log.ego.times_us[:1], translation(0.0, 0.0, 0.5)[None]))
 
     monkeypatch.setattr("recon.ready.aligned", raised)
-    monkeypatch.setattr("recon.build.off_path_table", lambda scene, log, sweeps, frames: measured.extend(sweeps) or [])
+    monkeypatch.setattr("recon.build.off_path_table", lambda scene, log, sweeps, frames, shifts: measured.extend(sweeps) or [])
     reconstruct(log, tmp_path / "scene", size=SIZE, held_out=4, config=replace(CONFIG, steps=1))
     assert [s.index for s in measured] == [2, 6]
     recorded = {s.index: s.read().xyz for s in log.sweeps}
