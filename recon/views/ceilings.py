@@ -85,7 +85,8 @@ class _Seen:
         back = inverse(self.camera.world_from_cam).numpy()
         local = torch.from_numpy(points @ back[:3, :3].T + back[:3, 3])
         x, y = np.moveaxis(self.camera.lens.project(local).numpy(), -1, 0)
-        inside = (local[..., 2] > 0).numpy() & (x > 0) & (x < self.camera.width) & (y > 0) & (y < self.camera.height)
+        seen = ((local[..., 2] > 0) & self.camera.lens.valid(local)).numpy()
+        inside = seen & (x > 0) & (x < self.camera.width) & (y > 0) & (y < self.camera.height)
         at = [np.where(inside, v - 0.5, 0.0) for v in (y, x)]
         return np.where(inside, ndimage.map_coordinates(self.grey, at, order=1, mode="nearest"), np.nan)
 

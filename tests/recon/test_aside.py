@@ -29,11 +29,11 @@ def ahead() -> tuple[Log, Frames]:
     return log, Frames(["front"], [(96, 54)], views)
 
 
-def found(*points: list[float]) -> np.ndarray:
+def found(*points: list[float], part: float = 1.0) -> np.ndarray:
     log, frames = ahead()
     level = Ground(torch.zeros(2, 2), (-50.0, -50.0), 100.0)
     known = Cloud(np.array([[6.0, 5.9, 1.5]] * 9 + [[9.0, -8.9, 1.5]] * 9), np.array([RED] * 9 + [GREY] * 9))
-    cloud = seen_from_aside(log, frames, np.array(points), known, level)
+    cloud = seen_from_aside(log, frames, np.array(points), known, level, part)
     return np.column_stack([cloud.xyz, cloud.rgb])
 
 
@@ -57,3 +57,9 @@ def test_what_pictures_show_and_what_no_view_from_aside_sees_is_left_to_others()
 
 def test_a_cell_gives_one_point():
     assert len(found([5.01, 6.01, 1.51], [5.02, 6.02, 1.52], [5.03, 6.03, 1.53], [5.01, 6.31, 1.53])) == 2
+
+
+def test_in_a_room_cameras_go_less_far_aside_and_nearer_things_count():
+    beyond, near = [5.0, 6.0, 1.5], [2.0, 2.2, 1.0]  # in view from 1 m aside, and from 0.2 m
+    np.testing.assert_allclose(found(beyond, near)[:, :3], [beyond])
+    np.testing.assert_allclose(found(beyond, near, part=0.1)[:, :3], [near])

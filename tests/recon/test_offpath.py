@@ -6,7 +6,7 @@ import torch
 
 from recon import open_log
 from recon.defaults import choose
-from recon.evaluation.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text
+from recon.evaluation.offpath import depth_errors, flicker_along, held_out_sweeps, off_path_table, off_path_text, shifts_within
 from recon.evaluation.road import photo_at, road_errors, road_points
 from recon.views.frames import load_frames
 from scenes import Gaussians
@@ -134,3 +134,7 @@ def test_the_recording_car_and_what_lies_off_the_road_are_no_road(street, log, f
     assert road_errors(1 - picture, camera, view, camera, points).mean() > 0.01
     assert not len(road_errors(picture, camera, replace(view, ego=torch.ones(54, 96, dtype=torch.bool)), camera, points))
     assert not len(road_points(points + [0, 0, 1.0], street.ground))
+
+
+def test_shifts_are_a_streets_or_end_where_a_room_does():
+    assert shifts_within(3.0) == shifts_within(9.0) == [0.0, 1.0, 2.0, 3.0] and shifts_within(1.2) == [0.0, 0.4, 0.8, 1.2]
