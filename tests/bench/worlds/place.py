@@ -1,0 +1,195 @@
+"""A place with what moves in it, seen along any rays at any time, in the light of a sun and of what is open around."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from render.rays import camera_rays
+from render.tracer import Blockers, Mesh, TracedMesh, fibonacci
+from scenes.camera import Camera, RigCamera
+from scenes.poses import inverse
+from scenes.sky import linear_from_srgb, srgb_from_linear
+from scenes.trajectory import Trajectory
+
+SAMPLES = 2
+"""Rays a pixel along each side of it."""
+
+AROUND = 24
+"""Directions in which a point is asked whether it is open."""
+
+OFF = 4e-3
+"""Metres off a surface at which its light is looked for."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """sun: unit direction to it; sunlight and ambient: linear colours that a white surface that faces it, or is wholly open, sends back;
+    reach: metres within which what stands around takes of the ambient light."""
+
+    sun: tuple[float, float, float]
+    sunlight: tuple[float, float, float]
+    ambient: tuple[float, float, float]
+    reach: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rigid piece of a mover, in the frame of the box that `trajectory` moves, base centre, x forward: `swing` turns it about y through
+    `joint` by so many radians at a time in seconds."""
+
+    mesh: Mesh
+    joint: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    amplitude: float = 0.0
+    hertz: float = 0.0
+    phase: float = 0.0
+
+    def in_box(self, seconds: float) -> torch.Tensor:
+        """box_from_part `[4, 4]`, float64."""
+        angle = self.amplitude * np.sin(2 * np.pi * self.hertz * seconds + self.phase)
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 0] = pose[2, 2] = np.cos(angle)
+        pose[0, 2], pose[2, 0] = np.sin(angle), -np.sin(angle)
+        joint = torch.tensor(self.joint, dtype=torch.float64)
+        pose[:3, 3] = joint - pose[:3, :3] @ joint
+        return pose
+
+
+@dataclass(frozen=True)
+class Mover:
+    """Someone on a way through the place: `size` is length, width and height of the box."""
+
+    track: str
+    label: str
+    size: tuple[float, float, float]
+    parts: tuple[Part, ...]
+    trajectory: Trajectory
+
+    @cached_property
+    def traced(self) -> list[TracedMesh]:
+        return [TracedMesh(part.mesh) for part in self.parts]
+
+    def poses(self, time_us: int) -> list[torch.Tensor]:
+        """world_from_part `[4, 4]` of each."""
+        base, seconds = self.trajectory.near(time_us), time_us * 1e-6
+        return [base @ part.in_box(seconds) for part in self.parts]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A world with a recorder in it. lidar: elevations of its beams in degrees, and where it stands on the body; aside: shifts, metres to the
+    left, and upwards, at which the truth is looked at."""
+
+    name: str
+    still: Mesh
+    movers: tuple[Mover, ...]
+    light: Light
+    ego: Trajectory
+    rig: dict[str, RigCamera]
+    lidar: tuple[tuple[float, ...], tuple[float, float, float]]
+    aside: tuple[tuple[float, float], ...]
+
+    @cached_property
+    def traced(self) -> TracedMesh:
+        return TracedMesh(self.still)
+
+    def seen(self, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What a camera of a global shutter takes: rgb `[H, W, 3]` display-referred; depth `[H, W]` in metres, inf in the sky, and who is
+        there, `[H, W]`, -1 sky, 0 what stands still, movers from 1, both along the rays through the pixels' centres."""
+        fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
+        colours = self._shaded(fine, *self._hits(fine))
+        small = colours.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
+        (_, distance, _, who), rays = self._hits(camera), camera_rays(camera)
+        depth = distance.reshape(camera.height, camera.width) / rays.norm(dim=-1)
+        return srgb_from_linear(small.clamp(0, 1)), depth, who.reshape(camera.height, camera.width)
+
+    def distances(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Metres along unit world rays `[N, 3]` to the first surface, inf for none, and who it is, as `seen` says."""
+        _, distance, _, who = self._first(origins, directions, time_us)
+        return distance, who
+
+    def _hits(self, camera: Camera) -> tuple[torch.Tensor, ...]:
+        pose = camera.world_from_cam.detach().float()
+        directions = torch.nn.functional.normalize(camera_rays(camera).reshape(-1, 3) @ pose[:3, :3].T, dim=1)
+        return self._first(pose[:3, 3].expand(len(directions), 3), directions, camera.time_us)
+
+    def _first(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, ...]:
+        """Albedo `[N, 3]` sRGB, metres `[N]`, world normals `[N, 3]`, and who `[N]`."""
+        colours, normals, distance = self.traced.trace(origins, directions)
+        who = torch.where(distance.isfinite(), 0, -1)
+        for number, mover in enumerate(self.movers, 1):
+            for traced, pose in zip(mover.traced, mover.poses(time_us), strict=True):
+                back, forth = inverse(pose).float(), pose.float()
+                near = _meets(traced.mesh, origins @ back[:3, :3].T + back[:3, 3], directions @ back[:3, :3].T)
+                if not near.any():
+                    continue
+                o, d = origins[near] @ back[:3, :3].T + back[:3, 3], directions[near] @ back[:3, :3].T
+                c, n, t = traced.trace(o, d)
+                at = near.nonzero()[:, 0][t < distance[near]]
+                first = t < distance[near]
+                colours[at], distance[at], who[at] = c[first], t[first], number
+                normals[at] = n[first] @ forth[:3, :3].T
+        return colours[:, :3], distance, normals, who
+
+    def _shaded(self, camera: Camera, albedo: torch.Tensor, distance: torch.Tensor, normals: torch.Tensor, who: torch.Tensor) -> torch.Tensor:
+        """Linear colours `[N, 3]`."""
+        pose = camera.world_from_cam.detach().float()
+        directions = torch.nn.functional.normalize(camera_rays(camera).reshape(-1, 3) @ pose[:3, :3].T, dim=1)
+        solid = who >= 0
+        points = pose[:3, 3] + directions[solid] * distance[solid, None] + OFF * normals[solid]
+        blockers, sun = Blockers(self._triangles(camera.time_us)), torch.tensor(self.light.sun)[None]
+        lit = blockers.open_share(points, sun, torch.ones(1), 1e3) * (normals[solid] @ sun[0]).clamp_min(0)
+        open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach)
+        light = lit[:, None] * torch.tensor(self.light.sunlight) + 2 * open_[:, None] * torch.tensor(self.light.ambient)
+        colours = sky(directions, self.light)
+        colours[solid] = linear_from_srgb(albedo[solid]) * light
+        return colours
+
+    def _triangles(self, time_us: int) -> np.ndarray:
+        found = [self.still.vertices[self.still.faces]]
+        for mover in self.movers:
+            for part, pose in zip(mover.parts, mover.poses(time_us), strict=True):
+                m = pose.numpy().astype(np.float32)
+                found.append((part.mesh.vertices @ m[:3, :3].T + m[:3, 3])[part.mesh.faces])
+        return np.concatenate(found)
+
+
+def _meets(mesh: Mesh, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """Which rays meet the sphere around a mesh."""
+    low, high = torch.from_numpy(mesh.vertices.min(0)), torch.from_numpy(mesh.vertices.max(0))
+    to, radius = (low + high) / 2 - origins, float((high - low).norm()) / 2
+    along = (to * directions).sum(1)
+    return (along > -radius) & ((to * to).sum(1) - along**2 < radius**2)
+
+
+def sky(directions: torch.Tensor, light: Light) -> torch.Tensor:
+    """Linear colours `[N, 3]` of a blue sky with clouds that is white at the horizon."""
+    up = directions[:, 2:].clamp_min(0)
+    blue = torch.tensor([0.75, 0.85, 0.95]) * (1 - up) ** 3 + torch.tensor([0.16, 0.34, 0.75]) * (1 - (1 - up) ** 3)
+    x, y = (directions[:, i] / (directions[:, 2].clamp_min(0) + 0.15) for i in (0, 1))
+    clouds = sum((torch.sin(f * x + 1.3 * f) * torch.sin(f * y + 0.7 * f * x) for f in (1.1, 2.3, 4.9)), torch.zeros(len(x)))
+    return torch.lerp(blue, torch.ones(3), (0.35 * clouds[:, None]).clamp(0, 0.7))
+
+
+def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor, start_m: float = 0.0) -> Trajectory:
+    """A trajectory over the ground through points `[x, y]` at a constant speed in m/s, `start_m` along at the first time."""
+    way = np.asarray(points, np.float64)
+    metres = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    at = start_m + speed * (times_us - times_us[0]).numpy() * 1e-6
+
+    def where(m: np.ndarray) -> np.ndarray:
+        inside = np.stack([np.interp(m, metres, way[:, i]) for i in (0, 1)], 1)
+        last = (way[-1] - way[-2]) / np.linalg.norm(way[-1] - way[-2])
+        return inside + (m - metres[-1]).clip(0)[:, None] * last
+
+    heading = where(at + 0.4) - where(np.maximum(at - 0.4, 0))
+    yaw = np.arctan2(heading[:, 1], heading[:, 0])
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(yaw)
+    poses[:, 1, 0], poses[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    poses[:, :2, 3] = where(at)
+    return Trajectory(times_us, torch.from_numpy(poses))
