@@ -4,14 +4,16 @@
         [--splats 80000] [--look OUT]
 
 FOLDER keeps what was traced, for the next run. Of frames that no fit saw, at the recorded place and beside it: PSNR of all, of what stands
-still, and of what moves; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times ("beyond")
-their true depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was rendered beside the truth.
+still, and of what moves; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times
+("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was rendered over
+the truth.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,8 +30,10 @@ from scenes.scene import Scene
 from tests.bench.recon import fitted
 from tests.bench.worlds.place import Place
 from tests.bench.worlds.record import Truth, looks, recorded
+from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
 
+PLACES: dict[str, Callable[[Path], Place]] = {"street": street, "room": lambda _: room(False), "room with people": lambda _: room(True)}
 HEADS = ("dB", "still", "movers", "depth off", "in the way", "beyond", "open")
 OPEN = 0.5
 """Alpha under which a pixel counts as sky."""
@@ -59,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.bench.truth", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("place", choices=("street",))
+    parser.add_argument("place", choices=tuple(PLACES))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--meshes", type=Path, default=Path("../shared/data/meshes"))
     parser.add_argument("--without", nargs="+", default=[], choices=("lidar", "boxes"))
@@ -69,8 +73,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--look", type=Path)
     asked = parser.parse_args()
-    place: Place = street(asked.meshes)
-    log = recorded(place, asked.folder)
+    place = PLACES[asked.place](asked.meshes)
+    log = recorded(place, [asked.camera], asked.folder)
     unseen = held_out_sweeps(log, HELD_OUT)
     log = without(replace(log, sweeps=tuple(s for s in log.sweeps if s not in unseen)), asked.without)
     camera, began = place.rig[asked.camera], time.time()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,10 +10,11 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from render.rays import camera_rays
+from render.rays import camera_rays, world_directions
 from render.tracer import Blockers, Mesh, TracedMesh, fibonacci
+from scenes import Pinhole
 from scenes.camera import Camera, RigCamera
-from scenes.poses import inverse
+from scenes.poses import inverse, pose_from
 from scenes.sky import linear_from_srgb, srgb_from_linear
 from scenes.trajectory import Trajectory
 
@@ -81,8 +83,8 @@ class Mover:
 
 @dataclass(frozen=True)
 class Place:
-    """A world with a recorder in it. lidar: elevations of its beams in degrees, and where it stands on the body; aside: shifts, metres to the
-    left, and upwards, at which the truth is looked at."""
+    """A world with a recorder in it. lidar: elevations of its beams in degrees, and where it stands on the body; aside: shifts, metres to
+    the left and upwards, at which the truth is looked at."""
 
     name: str
     still: Mesh
@@ -101,7 +103,7 @@ class Place:
         """What a camera of a global shutter takes: rgb `[H, W, 3]` display-referred; depth `[H, W]` in metres, inf in the sky, and who is
         there, `[H, W]`, -1 sky, 0 what stands still, movers from 1, both along the rays through the pixels' centres."""
         fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
-        colours = self._shaded(fine, *self._hits(fine))
+        colours = self._shaded(fine)
         small = colours.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
         (_, distance, _, who), rays = self._hits(camera), camera_rays(camera)
         depth = distance.reshape(camera.height, camera.width) / rays.norm(dim=-1)
@@ -113,9 +115,8 @@ class Place:
         return distance, who
 
     def _hits(self, camera: Camera) -> tuple[torch.Tensor, ...]:
-        pose = camera.world_from_cam.detach().float()
-        directions = torch.nn.functional.normalize(camera_rays(camera).reshape(-1, 3) @ pose[:3, :3].T, dim=1)
-        return self._first(pose[:3, 3].expand(len(directions), 3), directions, camera.time_us)
+        origin, directions = _rays(camera)
+        return self._first(origin.expand(len(directions), 3), directions, camera.time_us)
 
     def _first(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, ...]:
         """Albedo `[N, 3]` sRGB, metres `[N]`, world normals `[N, 3]`, and who `[N]`."""
@@ -135,12 +136,12 @@ class Place:
                 normals[at] = n[first] @ forth[:3, :3].T
         return colours[:, :3], distance, normals, who
 
-    def _shaded(self, camera: Camera, albedo: torch.Tensor, distance: torch.Tensor, normals: torch.Tensor, who: torch.Tensor) -> torch.Tensor:
-        """Linear colours `[N, 3]`."""
-        pose = camera.world_from_cam.detach().float()
-        directions = torch.nn.functional.normalize(camera_rays(camera).reshape(-1, 3) @ pose[:3, :3].T, dim=1)
+    def _shaded(self, camera: Camera) -> torch.Tensor:
+        """Linear colours `[N, 3]` of all pixels."""
+        albedo, distance, normals, who = self._hits(camera)
+        origin, directions = _rays(camera)
         solid = who >= 0
-        points = pose[:3, 3] + directions[solid] * distance[solid, None] + OFF * normals[solid]
+        points = origin + directions[solid] * distance[solid, None] + OFF * normals[solid]
         blockers, sun = Blockers(self._triangles(camera.time_us)), torch.tensor(self.light.sun)[None]
         lit = blockers.open_share(points, sun, torch.ones(1), 1e3) * (normals[solid] @ sun[0]).clamp_min(0)
         open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach)
@@ -158,6 +159,12 @@ class Place:
         return np.concatenate(found)
 
 
+def _rays(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where a camera's eye is `[3]`, and unit world directions through its pixels' centres `[H W, 3]`."""
+    directions = world_directions(camera).reshape(-1, 3)
+    return camera.world_from_cam[:3, 3].float(), torch.nn.functional.normalize(directions, dim=1)
+
+
 def _meets(mesh: Mesh, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """Which rays meet the sphere around a mesh."""
     low, high = torch.from_numpy(mesh.vertices.min(0)), torch.from_numpy(mesh.vertices.max(0))
@@ -173,6 +180,15 @@ def sky(directions: torch.Tensor, light: Light) -> torch.Tensor:
     x, y = (directions[:, i] / (directions[:, 2].clamp_min(0) + 0.15) for i in (0, 1))
     clouds = sum((torch.sin(f * x + 1.3 * f) * torch.sin(f * y + 0.7 * f * x) for f in (1.1, 2.3, 4.9)), torch.zeros(len(x)))
     return torch.lerp(blue, torch.ones(3), (0.35 * clouds[:, None]).clamp(0, 0.7))
+
+
+def looking(size: tuple[int, int], angle: float, yaw: float, at: Sequence[float], times_us: torch.Tensor) -> RigCamera:
+    """A pinhole camera `angle` degrees wide, `at` metres ahead, left and up on the body, turned to the left by `yaw` degrees."""
+    focal, half = size[0] / 2 / math.tan(math.radians(angle) / 2), math.radians(yaw) / 2
+    body = pose_from([math.cos(half), 0.0, 0.0, math.sin(half)], at)
+    optical = torch.eye(4, dtype=torch.float64)
+    optical[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return RigCamera(Pinhole(focal, focal, size[0] / 2, size[1] / 2), *size, body @ optical, times_us=times_us)
 
 
 def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor, start_m: float = 0.0) -> Trajectory:

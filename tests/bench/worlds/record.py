@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,11 +37,12 @@ class Truth:
     who: torch.Tensor
 
 
-def recorded(place: Place, folder: Path) -> Log:
-    """The drive as a log: its pictures and sweeps are traced where the folder does not hold them yet."""
+def recorded(place: Place, names: Sequence[str], folder: Path) -> Log:
+    """The drive as a log of these cameras: pictures and sweeps are traced where the folder does not hold them yet."""
     ego = place.ego
     cameras = {}
-    for name, camera in place.rig.items():
+    for name in names:
+        camera = place.rig[name]
         views = [camera.along(ego, int(t)) for t in camera.times_us]
         files = tuple(_picture(place, view, folder / f"{name}_{i:03d}.png") for i, view in enumerate(views))
         poses = torch.stack([view.world_from_cam for view in views])

@@ -10,10 +10,8 @@ import torch
 
 from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
-from scenes import Pinhole, RigCamera
-from scenes.poses import pose_from
 from tests.bench.worlds.people import straight, walker
-from tests.bench.worlds.place import Light, Mover, Part, Place, along
+from tests.bench.worlds.place import Light, Mover, Part, Place, along, looking
 from tests.bench.worlds.solids import blob, box, facade, grain, joined, moved, panel, plain
 
 START_US, STEP_US, FRAMES = 1_700_000_000_000_000, 100_000, 80
@@ -22,6 +20,15 @@ HALF, KERB, JUNCTION, LENGTH = 6.5, 0.13, (62.0, 72.0), (-20.0, 140.0)
 
 CARS = ("hatchback", "hatchback_blue", "hatchback_red", "pickup", "prius_hybrid")
 SPEED = 6.0
+STANDING = (
+    ("fire_hydrant", 18.0, -HALF - 0.6),
+    ("postbox", 24.0, HALF + 0.8),
+    ("dumpster", 36.0, -HALF - 2.4),
+    ("construction_cone", 47.0, -HALF + 0.9),
+    ("postbox", 52.0, -HALF - 0.8),
+    ("stop_sign", JUNCTION[0] - 1.5, -HALF - 0.6),
+)
+"""Models, and where they stand, metres along and to the left."""
 
 
 def street(meshes: Path, seed: int = 0) -> Place:
@@ -34,7 +41,7 @@ def street(meshes: Path, seed: int = 0) -> Place:
         tuple(_movers(models)),
         Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0),
         along([(x, 0.25 * math.sin(x / 12) - 2.2) for x in np.arange(-2.0, 60.0)], SPEED, times(1)),
-        {"front": _camera(480, 270, 64.0, 0.0), "left": _camera(480, 270, 64.0, 75.0)},
+        {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times()) for name, yaw in (("front", 0.0), ("left", 75.0))},
         (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85)),
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (-1.0, 0.0), (-1.5, 0.0)),
     )
@@ -44,20 +51,11 @@ def times(more: int = 0) -> torch.Tensor:
     return START_US + STEP_US * torch.arange(FRAMES + more)
 
 
-def _camera(width: int, height: int, angle: float, yaw: float) -> RigCamera:
-    """1.55 m above the road, turned to the left by `yaw` degrees."""
-    focal = width / 2 / math.tan(math.radians(angle) / 2)
-    half = math.radians(yaw) / 2
-    body = pose_from([math.cos(half), 0.0, 0.0, math.sin(half)], [1.5, 0.0, 1.55])
-    optical = torch.eye(4, dtype=torch.float64)
-    optical[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return RigCamera(Pinhole(focal, focal, width / 2, height / 2), width, height, body @ optical, times_us=times())
-
-
 def _ground(seed: int) -> list[Mesh]:
     """Road, side street, pavements with kerbs, dashes, a crossing, patches of newer asphalt, and the country beyond."""
-    asphalt, patch, flags = grain(seed, (0.34, 0.34, 0.36), 0.12), grain(seed + 1, (0.25, 0.25, 0.27), 0.12), grain(seed + 2, (0.6, 0.57, 0.53))
-    white, low, high = grain(seed + 3, (0.85, 0.85, 0.82), 0.06), *LENGTH
+    asphalt, patch = grain(seed, (0.34, 0.34, 0.36), 0.12), grain(seed + 1, (0.25, 0.25, 0.27), 0.12)
+    flags, white = grain(seed + 2, (0.6, 0.57, 0.53)), grain(seed + 3, (0.85, 0.85, 0.82), 0.06)
+    low, high = LENGTH
     out = [panel((low, -HALF, 0), (high - low, 0, 0), (0, 2 * HALF, 0), asphalt, 4.0)]
     out.append(panel((JUNCTION[0], -60, 0.001), (JUNCTION[1] - JUNCTION[0], 0, 0), (0, 120, 0), asphalt, 4.0))
     out.append(panel((-600, -600, -0.05), (1200, 0, 0), (0, 1200, 0), grain(seed + 4, (0.38, 0.42, 0.3)), 30.0))
@@ -114,8 +112,7 @@ def _furniture(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mes
             else:
                 out.append(box((at, y, KERB), (0.14, 0.14, 6.5), steel))
                 out.append(box((at, y - side * 0.8, 6.5), (0.2, 1.8, 0.12), steel))
-    for name, x, y in (("fire_hydrant", 18.0, -HALF - 0.6), ("postbox", 24.0, HALF + 0.8), ("dumpster", 36.0, -HALF - 2.4),
-                       ("stop_sign", JUNCTION[0] - 1.5, -HALF - 0.6), ("construction_cone", 47.0, -HALF + 0.9), ("postbox", 52.0, -HALF - 0.8)):  # fmt: skip
+    for name, x, y in STANDING:
         out.append(moved(models[name], (x, y, 0.0 if name == "construction_cone" else KERB), math.pi / 2))
     return out
 
