@@ -1,0 +1,105 @@
+"""Made-up places: what a camera and a lidar see of a box and of someone who passes, and what the bench makes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from render.rays import world_directions
+from scenes.poses import inverse
+from tests.bench.worlds.people import straight
+from tests.bench.worlds.place import Light, Mover, Part, Place, along, looking
+from tests.bench.worlds.record import LOOKS, looks, recorded
+from tests.bench.worlds.room import room
+from tests.bench.worlds.solids import box, joined, panel, plain
+
+TIMES = 1_700_000_000_000_000 + 100_000 * torch.arange(6)
+SUN = (0.0, -0.6, 0.8)
+
+
+@pytest.fixture
+def place() -> Place:
+    """A grey plain with a red box 10 m ahead, which casts its shadow to the left, and a blue one that crosses 6 m ahead."""
+    ground = panel((-50, -50, 0), (100, 0, 0), (0, 100, 0), plain((0.5, 0.5, 0.5)))
+    crosses = straight((6.0, -1.5), (6.0, -0.5), TIMES)
+    return Place(
+        "plain",
+        joined([ground, box((10.5, 0, 0), (1, 2, 2), plain((0.8, 0.1, 0.1)))]),
+        (Mover("blue", "car", (0.5, 0.5, 0.5), (Part(box((0, 0, 0), (0.5, 0.5, 0.5), plain((0.1, 0.1, 0.8)))),), crosses),),
+        Light(SUN, (0.8, 0.8, 0.8), (0.2, 0.2, 0.2), 5.0),
+        along([(0.0, 0.0), (10.0, 0.0)], 1.0, TIMES),
+        {"front": looking((64, 48), 90.0, 0.0, (0.0, 0.0, 1.0), TIMES[:-1])},
+        ((-10.0, 0.0, 5.0), (0.0, 0.0, 1.5)),
+        ((0.0, 0.0), (1.0, 0.0)),
+    )
+
+
+def pixel(camera, point) -> tuple[int, int]:
+    """Row and column of a world point."""
+    x, y, z = (inverse(camera.world_from_cam) @ torch.tensor([*point, 1.0], dtype=torch.float64))[:3].tolist()
+    return int(camera.lens.fy * y / z + camera.lens.cy), int(camera.lens.fx * x / z + camera.lens.cx)
+
+
+def test_a_camera_sees_colours_depths_and_who_is_there(place):
+    camera = place.rig["front"].along(place.ego, int(TIMES[0]))
+    rgb, depth, who = place.seen(camera)
+    at = pixel(camera, (10.0, 0.5, 1.0))
+    assert depth[at] == pytest.approx(10.0, abs=1e-3) and who[at] == 0
+    assert rgb[at][0] > 2 * rgb[at][2]
+    assert who[0, 0] == -1 and depth[0, 0].isinf()
+    mover = pixel(camera, (5.75, -1.5, 0.25))
+    assert who[mover] == 1 and rgb[mover][2] > 2 * rgb[mover][0] and depth[mover] == pytest.approx(5.75, abs=1e-3)
+
+
+def test_the_sun_casts_shadows_away_from_itself(place):
+    camera = place.rig["front"].along(place.ego, int(TIMES[0])).resized(256, 192)
+    rgb, *_ = place.seen(camera)
+    shade, sunny = (rgb[pixel(camera, (10.5, side * 1.6, 0.0))].mean() for side in (1, -1))
+    assert shade < 0.7 * sunny
+
+
+def test_limbs_swing_about_their_joint():
+    part = Part(box((0, 0, 0), (0.1, 0.1, 1), plain((1, 1, 1))), (0.0, 0.0, 1.0), 0.5, 1.0)
+    pose = part.in_box(0.25)
+    assert torch.allclose(pose @ torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0, 1.0]).double())
+    assert float((pose @ torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64))[0].abs()) == pytest.approx(np.sin(0.5))
+
+
+def test_a_drive_reads_as_the_place_is(place, tmp_path):
+    log = recorded(place, ["front"], tmp_path)
+    image = log.camera("front").image(2)
+    assert np.abs(image / 255 - place.seen(log.camera("front").camera(2))[0].numpy()).max() < 0.5 / 255 + 1e-6
+    points = log.sweeps[3].read()
+    assert np.array_equal(log.sweeps[3].read().xyz, points.xyz), "kept, not traced anew"
+    assert len(np.unique(points.times_us)) > 10
+    box_from_world = inverse(place.movers[0].trajectory.near(int(points.times_us[0]))).numpy()
+    own = points.xyz @ box_from_world[:3, :3].T + box_from_world[:3, 3]
+    on_mover = (np.abs(own[:, :2]) < 0.5).all(1) & (own[:, 2] > 0.05) & (own[:, 2] < 0.6)
+    on_ground, on_box = np.abs(points.xyz[:, 2]) < 0.1, np.abs(points.xyz - [10.5, 0, 1]).max(1) < 1.15
+    assert (on_ground | on_box | on_mover).all() and on_box.any()
+    assert [t.name for t in log.tracks] == ["veh_1"]
+
+
+def test_truth_beside_the_path_is_seen_from_beside_the_path(place, tmp_path):
+    found = list(looks(place, "front", tmp_path, [1, 3]))
+    assert [(aside, i) for aside, i, _ in found] == [((0.0, 0.0), 1), ((0.0, 0.0), 3), ((1.0, 0.0), 1), ((1.0, 0.0), 3)]
+    truth = found[2][2]
+    camera = place.rig["front"].along(place.ego.shifted(lateral=1.0), int(TIMES[1]))
+    assert torch.equal(truth.depth, place.seen(camera)[1])
+    again = next(iter(looks(replace(place, movers=()), "front", tmp_path, [1])))[2]
+    assert (again.who == 1).any(), "kept, not traced anew"
+    assert LOOKS > 1
+
+
+def test_the_room_is_closed_but_for_its_windows():
+    """No ray through a gap between walls, ceiling and floor: all that is seen of the sky is above a window's sill."""
+    place = room(people=False)
+    for name in place.rig:
+        camera = place.rig[name].along(place.ego, int(place.rig[name].times_us[30]))
+        pose = camera.world_from_cam.float()
+        rays = torch.nn.functional.normalize(world_directions(camera).reshape(-1, 3)[::7], dim=1)
+        metres, who = place.distances(pose[:3, 3].expand(len(rays), 3), rays, camera.time_us)
+        sky = rays[who < 0]
+        assert (sky[:, 1] > 0).all(), "windows are to the left"
+        assert len(sky) < 0.1 * len(rays) and metres[who == 0].max() < 60
