@@ -22,18 +22,18 @@ class Grid:
 def press(
     which: wp.array[wp.int64], count: int, last: wp.array[float], now: float,
     grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], near: wp.array2d[wp.vec2],
-    part: float, eye: wp.vec3, lowest: float, pull: float, sunk: float,
+    part: float, level: float, eye: wp.vec3, lowest: float, pull: float, sunk: float,
     moments: wp.array3d[float], colour: int, part_unseen: float,
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
     """Of splats `which`, those of the first `count` that moved `now`, are less than `near` says, metres below and above, from the ground,
-    and no thicker than it says above, lose `part` of their extent along its normal, and `pull` of how far they are above what lies `sunk`
-    below it, along the ray to the eye, if that is `lowest` above them. Those that no picture has pulled at, as moments from `colour` on
-    tell, lose another part, however thick they are.
+    and no thicker than it says above, lose `part` of their extent along its normal and `level` of their axes' tilt against it, and `pull`
+    of how far they are above what lies `sunk` below it, along the ray to the eye, if that is `lowest` above them. Those that no picture has
+    pulled at, as moments from `colour` on tell, lose another part of both, however thick they are.
 
     With D = 1 - part n n^T a covariance becomes D C D, to first order in `part`: in the splat's own axes its diagonal is what its scales
-    lose, and the rest is a turn of its axes.
+    lose, and the rest is a turn of its axes, which is made as if the part were `level`.
     """
     i = int(which[first + wp.tid()])
     if i >= count or last[i] != now:
@@ -71,6 +71,7 @@ def press(
     thick = wp.length(wp.vec3(n[0] * wp.exp(scales[0]), n[1] * wp.exp(scales[1]), n[2] * wp.exp(scales[2])))
     if unseen:
         part = part_unseen
+        level = part_unseen
     elif thick > limits[1]:
         return
     drop = eye[2] - p[2]
@@ -81,7 +82,7 @@ def press(
         a = (k + 1) % 3
         b = (k + 2) % 3
         longer = wp.tanh(scales[a] - scales[b])  # (a^2 - b^2) / (a^2 + b^2) of the two axes
-        turn[k] = -part * n[a] * n[b] * longer / (longer * longer + ROUNDNESS)
+        turn[k] = -level * n[a] * n[b] * longer / (longer * longer + ROUNDNESS)
     half = 0.5 * turn
     turned = w * half + xyz + wp.cross(xyz, half)
     quats[i] = wp.vec4(w - wp.dot(xyz, half), turned[0], turned[1], turned[2])

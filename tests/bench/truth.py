@@ -3,8 +3,8 @@
     python -m tests.bench.truth PLACE FOLDER [--meshes ../shared/data/meshes] [--without lidar boxes] [--camera front] [--steps 1000]
         [--splats 80000] [--look OUT]
 
-FOLDER keeps what was traced, for the next run. Of frames that no fit saw, at the recorded place and beside it: PSNR of all, of what stands
-still, and of what moves; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times
+FOLDER keeps what was traced, for the next run. Of frames that no fit saw, at the recorded place and beside it: PSNR of all, of the
+ground, and of what moves; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times
 ("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was rendered over
 the truth.
 """
@@ -26,6 +26,7 @@ from recon.evaluation.offpath import held_out_sweeps
 from recon.log import Log
 from render import render_frame
 from render.compare import psnr
+from render.rays import world_directions
 from scenes.scene import Scene
 from tests.bench.recon import fitted
 from tests.bench.worlds.place import Place
@@ -34,9 +35,12 @@ from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
 
 PLACES: dict[str, Callable[[Path], Place]] = {"street": street, "room": lambda _: room(False), "room with people": lambda _: room(True)}
-HEADS = ("dB", "still", "movers", "depth off", "in the way", "beyond", "open")
+HEADS = ("dB", "ground", "movers", "depth off", "in the way", "beyond", "open")
 OPEN = 0.5
 """Alpha under which a pixel counts as sky."""
+
+LOW = 0.2
+"""Metres above the floor up to which something is the ground: road, kerb and pavement, all of which these places have level."""
 
 
 def without(log: Log, what: list[str]) -> Log:
@@ -55,7 +59,9 @@ def figures(scene: Scene, name: str, index: int, aside: tuple[float, float], tru
     drawn = (frame.depth / truth.depth)[solid]
     shares = [float(((drawn - 1).abs()).median()), *(float(part.float().mean()) for part in (drawn < 0.8, drawn > 1.25))]
     open_ = float((frame.alpha[solid] < OPEN).float().mean())
-    parts = [psnr(frame.rgb, truth.rgb, part) if part.any() else float("nan") for part in (~moving, moving)]
+    heights = camera.world_from_cam[2, 3] + world_directions(camera)[..., 2] * truth.depth
+    ground = (truth.who == 0) & (heights < LOW)
+    parts = [psnr(frame.rgb, truth.rgb, part) if part.any() else float("nan") for part in (ground, moving)]
     return [psnr(frame.rgb, truth.rgb), *parts, *(100 * s for s in (*shares, open_))], frame.rgb.clamp(0, 1)
 
 
