@@ -22,8 +22,8 @@ PRESSED = 0.008
 road is; seen at a grazing angle the upper sides of thick splats hide what is behind, and depth is too near."""
 
 LEVELLED = 0.04
-"""Of its axes' tilt against the ground, what it loses in such a step. A splat that is long along a line painted on the road may be turned in
-the plane of that line and a straight path without any picture telling: it climbs and goes aside, and from 2 m aside the line has teeth."""
+"""Of its axes' tilt against the ground, what it loses in such a step. A splat that is long along a line painted on the road may be turned
+in the plane of that line and a straight path without any picture telling: it climbs and goes aside, and 2 m aside the line has teeth."""
 
 PULLED, SUNK = 0.01, 0.012
 """Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays; and metres

@@ -10,7 +10,7 @@ from recon import open_log
 from recon.begin import begin
 from recon.defaults import choose
 from recon.fit.descent import COLOURS, Descent, rates_at
-from recon.fit.flat import ON, OVER, PRESSED, SUNK, THIN, UNDER, FlatGround
+from recon.fit.flat import LEVELLED, ON, OVER, PRESSED, SUNK, THIN, UNDER, FlatGround
 from recon.fit.model import Splats
 from recon.ground import BARE, GROUND
 from scenes.ground import Ground
@@ -67,7 +67,9 @@ def changed(splats: Splats, before: torch.Tensor) -> torch.Tensor:
     return (covariance(splats) != before).any(dim=(1, 2))
 
 
-def test_covariances_are_squeezed_along_the_normal():
+def test_covariances_are_squeezed_along_the_normal(monkeypatch):
+    """But for the turn, which is faster."""
+    monkeypatch.setattr("recon.fit.flat.LEVELLED", PRESSED)
     splats = lying(hillside())
     before = covariance(splats)
     pressed(splats, hillside(), 0.1)
@@ -76,6 +78,19 @@ def test_covariances_are_squeezed_along_the_normal():
     change, off = (meant - before)[:30].norm(dim=(1, 2)), (covariance(splats) - meant)[:30].norm(dim=(1, 2))
     assert (off < 0.03 * change).all()  # of axes of nearly one length it would be more: there the turn is damped
     assert torch.equal(covariance(splats)[30:], before[30:])  # an actor is no ground
+
+
+def test_what_is_long_is_laid_down_without_becoming_shorter():
+    """As along a line on the road, and climbing: of which a straight path tells nothing."""
+    level = ground_of(lambda x, y: 0 * x)
+    splats, tilt = lying(level), 0.2
+    splats.fields["log_scales"][:] = torch.tensor([-1.5, -3.5, -6.0])
+    splats.fields["quats"][:] = torch.tensor([np.cos(tilt / 2), 0, -np.sin(tilt / 2), 0])
+    steps = round(1 / LEVELLED)
+    pressed(splats, level, times=steps)
+    along = matrix_from_quat(splats.fields["quats"])[:30, :, 0]
+    assert along[:, 2].asin() == pytest.approx(tilt / np.e, rel=0.1)
+    assert splats.fields["log_scales"][:30, 0] == pytest.approx(-1.5, abs=2 * steps * PRESSED * tilt**2)
 
 
 def test_what_is_pressed_for_long_lies_flat_along_the_slope():
