@@ -25,11 +25,11 @@ LEVELLED = 0.04
 """Of its axes' tilt against the ground, what it loses in such a step. A splat that is long along a line painted on the road may be turned
 in the plane of that line and a straight path without any picture telling: it climbs and goes aside, and 2 m aside the line has teeth."""
 
-PULLED, SUNK = 0.01, 0.012
-"""Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays; and metres
-that its middle then lies lower, since of splats that overlap the nearer is drawn first. Pictures of a straight drive do not tell a line
-painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in shreds. Sunk by 0.02 depth is a
-thirtieth nearer to lidar's, and the road's colours 3 m aside are 0.3 dB farther from the photo's."""
+PULLED = 0.01
+"""Of its height off the ground, what such a splat loses in such a step, along the ray to the eye, so that the picture stays. Pictures of a
+straight drive do not tell a line painted along the road from one beside it and higher up; from 2 m aside it lies where it should not, in
+shreds. That of splats which overlap the nearer is drawn first, so that depth is a little too near, is no reason to sink them: lines would
+be drawn beside where they are."""
 
 LOWEST = 0.3
 """Metres that the eye must be above what is pulled so, or half of how high it is above the ground below it, where that is less."""
@@ -115,6 +115,6 @@ class FlatGround:
             ]
             high = float(eye[2] - self.ground.height(eye[None, :2].cpu()))
             lowest = min(LOWEST, high / 2) if high > 0 else LOWEST
-            pull = [wp.vec3(*eye.tolist()), lowest, settle * PULLED, SUNK]
+            pull = [wp.vec3(*eye.tolist()), lowest, settle * PULLED]
             unseen = [view(descent.moments, float), COLOURS, settle * UNSEEN_PRESSED]
             run(press, len(which), [*moved, *ground, *pull, *unseen, *fields], which.device)

@@ -22,15 +22,15 @@ class Grid:
 def press(
     which: wp.array[wp.int64], count: int, last: wp.array[float], now: float,
     grid: Grid, heights: wp.array2d[float], slopes: wp.array2d[wp.vec2], near: wp.array2d[wp.vec2],
-    part: float, level: float, eye: wp.vec3, lowest: float, pull: float, sunk: float,
+    part: float, level: float, eye: wp.vec3, lowest: float, pull: float,
     moments: wp.array3d[float], colour: int, part_unseen: float,
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     first: int,
 ):  # fmt: skip
     """Of splats `which`, those of the first `count` that moved `now`, are less than `near` says, metres below and above, from the ground,
     and no thicker than it says above, lose `part` of their extent along its normal and `level` of their axes' tilt against it, and `pull`
-    of how far they are above what lies `sunk` below it, along the ray to the eye, if that is `lowest` above them. Those that no picture has
-    pulled at, as moments from `colour` on tell, lose another part of both, however thick they are.
+    of how far they are off it, along the ray to the eye, if that is `lowest` above them. Those that no picture has pulled at, as moments
+    from `colour` on tell, lose another part of both, however thick they are.
 
     With D = 1 - part n n^T a covariance becomes D C D, to first order in `part`: in the splat's own axes its diagonal is what its scales
     lose, and the rest is a turn of its axes, which is made as if the part were `level`.
@@ -76,7 +76,7 @@ def press(
         return
     drop = eye[2] - p[2]
     if drop > lowest:
-        means[i] = p + (pull * (rise + sunk) / drop) * (p - eye)
+        means[i] = p + (pull * rise / drop) * (p - eye)
     turn = wp.vec3()
     for k in range(3):
         a = (k + 1) % 3
