@@ -10,20 +10,18 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from functools import partial
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from scipy import ndimage
 
 from recon import FitConfig
 from recon.evaluation.report import read_out
-from recon.log import Log, LogCamera, Packed
+from recon.log import Log
 from render import render_frame
 from render.compare import psnr
+from tests.bench.changed_pictures import repainted
 from tests.bench.recon import fitted, opened
 
 
@@ -35,21 +33,18 @@ def bonnet(width: int, height: int) -> np.ndarray:
 
 def painted(log: Log, name: str) -> Log:
     """The drive, with a bonnet in all pictures of a camera."""
-    camera = log.camera(name)
-    files = tuple(Packed(f"{file}, painted", partial(_painted, camera, i)) for i, file in enumerate(camera.files))
-    return replace(log, cameras={**log.cameras, name: replace(camera, files=files)})
+    return repainted(log, "painted", _painted, [name], format="JPEG", quality=93)
 
 
-def _painted(camera: LogCamera, index: int) -> bytes:
-    picture, packed = camera.image(index).copy(), BytesIO()
+def _painted(picture: np.ndarray, index: int) -> np.ndarray:
+    picture = picture.copy()
     height, width = picture.shape[:2]
     shine = ndimage.gaussian_filter(np.roll(picture[::-1], -int(0.3 * height), 0).astype(np.float32), (height / 135, height / 135, 0))
     grain = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=(height, width)), height / 180) * 0.05 * height
     lacquer = np.array([70, 30, 35]) + 0.35 * shine + grain[..., None]
     where = bonnet(width, height)
     picture[where] = lacquer.clip(0, 255).astype(np.uint8)[where]
-    Image.fromarray(picture).save(packed, "JPEG", quality=93)
-    return packed.getvalue()
+    return picture
 
 
 def main() -> None:

@@ -168,9 +168,12 @@ def told(scene: Scene, frames: Frames, rig: dict[str, RigCamera], masks: dict[st
     return {r["camera"]: r["psnr"] for r in rows} | {of: masked_psnr(scene, frames, rig, m) for of, m in masks.items()}
 
 
-def fitted(log: Log, config: FitConfig, names: list[str], size: tuple[int, int]) -> tuple[Scene, Frames, dict[str, RigCamera], float, Log]:
-    """The fitted scene, the frames, the log's cameras, CPU seconds of the fit, and the log by its corrected path."""
-    _, span = choose(log, names)
+def fitted(
+    log: Log, config: FitConfig, names: list[str], size: tuple[int, int], span: tuple[int, int] | None = None
+) -> tuple[Scene, Frames, dict[str, RigCamera], float, Log]:
+    """The fitted scene of a span of time, all where None, the frames, the log's cameras, CPU seconds of the fit, and the log by its
+    corrected path."""
+    span = span or choose(log, names)[1]
     log = readied(log, log.sweeps_within(span), config, names, span, size)
     start, fit = begin(log, names, span, size, config)
     began = time.process_time()
