@@ -129,10 +129,24 @@ def stretched(log: Log, factor: float) -> Log:
     )
 
 
+def _aside(log: Log, radians: float) -> Log:
+    return turned(log, {name: (0.0, radians, 0.0, 0.0, 0.0, 0.0, 0.0) for name in log.cameras})
+
+
+def _late(log: Log, seconds: float) -> Log:
+    return turned(log, {name: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, seconds) for name in log.cameras})
+
+
 @change()
 def camera_turned(log: Log) -> Log:
     """The camera turned aside by 5 mrad."""
-    return turned(log, {name: (0.0, 0.005, 0.0, 0.0, 0.0, 0.0, 0.0) for name in log.cameras})
+    return _aside(log, 0.005)
+
+
+@change()
+def half_a_degree(log: Log) -> Log:
+    """The camera turned aside by half a degree."""
+    return _aside(log, np.radians(0.5))
 
 
 @change()
@@ -148,7 +162,13 @@ def long_lens(log: Log) -> Log:
 @change()
 def late_pictures(log: Log) -> Log:
     """Pictures dated 30 ms late."""
-    return turned(log, {name: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.030) for name in log.cameras})
+    return _late(log, 0.030)
+
+
+@change()
+def later_pictures(log: Log) -> Log:
+    """Pictures dated 50 ms late."""
+    return _late(log, 0.050)
 
 
 @change(spoilt="boxes")

@@ -1,12 +1,13 @@
 """A drive as if something of it were otherwise, fitted for a short time: what is taken for granted because a test drive has it.
 
     python -m tests.bench.otherwise DRIVE [--camera front_camera] [--only NAME ...] [--start 3s] [--duration 4s] [--steps 1000]
-        [--splats 80000] [--size 480 270]
+        [--splats 80000] [--size 480 270] [--without KIND ...]
 
 DRIVE has lidar and boxes. Held-out pictures are those of the drive that is fitted, so that darker ones have more dB. Everything else is as
 `sidestep recon` reports it of held-out sweeps, on the path and 3 m aside; where boxes are what is otherwise, movers are measured in those
 recorded, and where the path is, by the sweeps as recorded, laid on it as a whole. Names are of the functions in changed_records.py and
-changed_pictures.py, as in "half rate".
+changed_pictures.py, as in "half rate". --without: what is not put right, as "surfaces", by which cameras are found turned, or their clock
+late.
 """
 
 from __future__ import annotations
@@ -87,8 +88,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--splats", type=int, default=80_000)
     parser.add_argument("--size", type=int, nargs=2, default=(480, 270), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--without", nargs="+", default=[], choices=FitConfig().refine, metavar="KIND")
     asked = parser.parse_args()
-    log, config = opened(asked.drive), FitConfig(steps=asked.steps, budget=asked.splats)
+    log, config = opened(asked.drive), FitConfig(steps=asked.steps, budget=asked.splats).without(*asked.without)
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", flush=True)
     for name in asked.only:
         change = CHANGES[name]
