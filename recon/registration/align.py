@@ -46,8 +46,15 @@ ALIKE = 20.0
 STEP = (3e-4, 3e-4, 3e-4, 0.01, 0.01, 0.01)
 """Standard deviations, in radians and metres, of the difference between the corrections of consecutive sweeps."""
 
+SHAKES, LOOSE = 2.0, 2.0
+"""Times as much as `STEP` by which corrections jump from sweep to sweep where a path shakes, and times as much as they jump that they may
+differ by then."""
+
 WHOLE = (0.05, 0.05, 0.05, 2.0, 2.0, 2.0)
 """Standard deviations of a correction itself."""
+
+NORMAL = 0.6745
+"""The median size of what is normally distributed, in standard deviations."""
 
 PROBE = 4
 """Every how many sweeps one is tried, to see whether anything has to be corrected."""
@@ -201,10 +208,25 @@ def met(
     return (jacobian * weight[:, None]).T @ jacobian, -(jacobian * weight[:, None]).T @ off
 
 
+def _differ(deltas: np.ndarray, step: int) -> np.ndarray:
+    """By how much corrections of consecutive sweeps may differ, `[6]` standard deviations: a path drifts by little (`STEP`), but each of
+    its poses may be off by itself. Corrections found so far tell that by how far each is off the middle of those beside it, as none is
+    where a path drifts, or sweeps are laid on what moves."""
+    usual = np.sqrt(step) * np.array(STEP)
+    if len(deltas) < 3:
+        return usual
+    jumps = np.abs(np.diff(deltas, 2, axis=0)) / np.sqrt(2)
+    for level in ([0, 1], [2], [3, 4], [5]):  # neither of the world's level axes is the car's
+        jump = np.median(jumps[:, level]) / NORMAL
+        if jump > SHAKES * usual[level[0]]:
+            usual[level] = LOOSE * jump
+    return usual
+
+
 def _solved(deltas: np.ndarray, pairs: list[tuple[int, int]], blocks: list[tuple[np.ndarray, np.ndarray]], step: int) -> np.ndarray:
     """The corrections after one step of Gauss and Newton."""
     count = len(deltas)
-    own, steady = 1 / np.array(WHOLE) ** 2, 1 / (step * np.array(STEP) ** 2)
+    own, steady = 1 / np.array(WHOLE) ** 2, 1 / _differ(deltas, step) ** 2
     rows: list[np.ndarray] = []
     columns: list[np.ndarray] = []
     values: list[np.ndarray] = []

@@ -9,6 +9,7 @@ import torch
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track, lengthened
 from recon.objects.tracks import named
+from recon.registration.align import about
 from recon.registration.corrected import moved, turned
 from scenes.lenses import Lens
 from scenes.poses import small_poses, translation, yaw
@@ -196,14 +197,9 @@ def shaken_boxes(log: Log) -> Log:
 @change(spoilt="path")
 def shaken_path(log: Log) -> Log:
     """Each pose of the path, and all that lies along it, off by 5 cm and 3 mrad at random (standard deviations along each axis)."""
-    count = len(log.ego)
-    off = np.random.default_rng(0).normal(0, 1, (count, 6)) * np.repeat([0.003, 0.05], 3)
     body = log.ego.world_from_body
-    middle = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
-    middle[:, :3, 3] = body[:, :3, 3]
-    back = middle.clone()
-    back[:, :3, 3] *= -1
-    return moved(log, Trajectory(log.ego.times_us, middle @ small_poses(torch.from_numpy(off)) @ back))
+    off = np.random.default_rng(0).normal(0, 1, (len(body), 6)) * np.repeat([0.003, 0.05], 3)
+    return moved(log, Trajectory(log.ego.times_us, about(body[:, :3, 3].numpy(), off)))
 
 
 def _with_boxes(track: Track, kept: np.ndarray) -> Track:

@@ -30,8 +30,9 @@ def street(centre: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     return np.concatenate([road, fronts, corners]) + generator.normal(0, 0.01, (18_000, 3))
 
 
-def drifting(height: float, metres: float = 0.0, radians: float = 0.0) -> tuple[Log, torch.Tensor]:
-    """A log along the street whose recorded poses drift away, and by which poses `[T, 4, 4]` its world must be moved back at its stamps."""
+def drifting(height: float, metres: float = 0.0, radians: float = 0.0, shake: float = 0.0) -> tuple[Log, torch.Tensor]:
+    """A log along the street whose recorded poses drift away, and by which poses `[T, 4, 4]` its world must be moved back at its stamps.
+    shake: metres, and sixteenths in radians, that each is off by itself."""
     generator = np.random.default_rng(5)
     times = torch.arange(COUNT) * STEP_US
     truth = torch.eye(4, dtype=torch.float64).repeat(COUNT, 1, 1)
@@ -40,6 +41,7 @@ def drifting(height: float, metres: float = 0.0, radians: float = 0.0) -> tuple[
     slow = torch.sin(torch.linspace(0, 3, COUNT, dtype=torch.float64))
     deltas = torch.zeros(COUNT, 6, dtype=torch.float64)
     deltas[:, 2], deltas[:, 4], deltas[:, 5] = radians * slow, metres * slow.flip(0), height * slow
+    deltas += shake * torch.from_numpy(np.random.default_rng(6).normal(0, 1, (COUNT, 6))) / torch.tensor([16.0] * 3 + [1.0] * 3)
     drift = about(truth[:, :3, 3].numpy(), deltas.numpy())
     sweeps = []
     for i in range(COUNT):
@@ -71,6 +73,19 @@ def test_a_path_that_drifts_is_bent_back(capsys):
     for k in (1, 30):
         way = (inverse(body[:-k]) @ body[k:])[:, :3, 3]
         assert float((way - torch.tensor([0.8 * k, 0, 0], dtype=torch.float64)).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize("shake", [0.02, 0.05])
+def test_poses_that_are_each_off_by_themselves_are_put_right(shake):
+    """By 5 cm and 3 mrad, say, where a drift between two is a centimetre at most."""
+    log, _ = drifting(height=0.0, shake=shake)
+    body = aligned(log, log.sweeps).ego.world_from_body
+    assert apart(log.tracks[0].world_from_box) > 2 * shake
+    for k in (1, 9):
+        way = inverse(body[:-k]) @ body[k:]
+        off = (way[:, :3, 3] - torch.tensor([0.8 * k, 0, 0], dtype=torch.float64)).abs().max()
+        assert float(off) < 0.005, "the car goes evenly"
+        assert float((way[:, :3, :3] - torch.eye(3)).abs().max()) < 1.5e-3
 
 
 @pytest.mark.parametrize("step", [1, 4])
