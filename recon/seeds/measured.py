@@ -20,9 +20,11 @@ from recon.views.view import View
 from render.rays import camera_rays, world_directions
 from scenes.camera import Camera
 from scenes.poses import inverse
+from scenes.trajectory import Trajectory
 
-SOON_US = 100_000
-"""How far a sweep may be from a picture that it measures."""
+SOON_US, LATE_US, WAY = 100_000, 500_000, 1.0
+"""How far a sweep may be from a picture that it measures; and how far, where the body has gone less than so many metres by then: a slow car
+sees the same."""
 
 HIDING, AROUND = 1.1, (9, 5)
 """How many times nearer a point within so many rows and columns must be to hide another: lidar looks over what hides it from cameras."""
@@ -114,12 +116,18 @@ def _soon(log: Log, frames: Frames, sweeps: Sequence[Sweep], split: Split) -> It
     near: dict[int, list[View]] = {}
     for view in frames.training() if len(times) else []:
         k = int(np.abs(times - view.time_us).argmin())
-        if abs(int(times[k]) - view.time_us) <= SOON_US:
+        if _measures(log.ego, int(times[k]), view.time_us):
             near.setdefault(k, []).append(view)
     for k, views in near.items():
         static = split.static[split.static_sweep == sweeps[k].index]
         for view in views:
             yield sweeps[k], static, view, grid_of(frames.camera(log, view))
+
+
+def _measures(ego: Trajectory, sweep_us: int, picture_us: int) -> bool:
+    """Whether a sweep is near enough to a picture."""
+    late = abs(sweep_us - picture_us)
+    return late <= SOON_US or (late <= LATE_US and float((ego.near(sweep_us) - ego.near(picture_us))[:3, 3].norm()) <= WAY)
 
 
 def nearest_points(points: np.ndarray, camera: Camera, before: np.ndarray, stands: float = ROAD) -> np.ndarray:

@@ -7,7 +7,18 @@ from painted import SIZE, drive, sweep_of, wall
 
 from recon.log import LidarPoints, Sweep, Track
 from recon.objects.actors import split_points
-from recon.seeds.measured import SLACK, SOON_US, Measured, by_lidar, by_lidar_of_movers, by_pictures, grid_of, mistake, nearest_points
+from recon.seeds.measured import (
+    LATE_US,
+    SLACK,
+    SOON_US,
+    Measured,
+    by_lidar,
+    by_lidar_of_movers,
+    by_pictures,
+    grid_of,
+    mistake,
+    nearest_points,
+)
 from recon.seeds.stereo import plate_of
 from recon.views.frames import Frames, load_frames
 from recon.views.view import View
@@ -49,8 +60,18 @@ def test_lidar_measures_what_the_camera_sees_and_stands_still():
     round_ = replace(log, cameras={"front": replace(log.cameras["front"], lens=Fisheye(100, 100, 160, 90))})
     distance = _by_lidar(round_, frames, [sweep_of(20_000, wall(12.0, -12, 12))], []).views[0, 0].float().numpy()
     assert np.nanmax(distance) == pytest.approx(17.0, abs=0.3) and np.nanmin(distance) == pytest.approx(12.0, abs=0.1)
-    assert (0, 1) in measured and (0, 2) not in _by_lidar(log, frames, [sweep_of(200_000 - SOON_US - 1, wall(12.0, -3, 3))], []).views
+    assert (0, 1) in measured
     assert _by_lidar(log, frames, [], []).views == {}
+
+
+@pytest.mark.parametrize(
+    ("late", "way", "seen"), [(SOON_US, 3.0, True), (SOON_US + 1, 3.0, False), (SOON_US + 1, 0.9, True), (LATE_US + 1, 0.0, False)]
+)
+def test_a_sweep_measures_what_is_seen_soon_or_from_about_the_same_place(late, way, seen):
+    log = drive([0.0, 0.0, way], ("front",))
+    frames = load_frames(log, ["front"], ALL, SIZE, 0)
+    assert frames.views[2].time_us == 200_000
+    assert ((0, 2) in _by_lidar(log, frames, [sweep_of(200_000 - late, wall(12.0, -3, 3))], []).views) == seen
 
 
 def test_lidar_measures_what_moves_where_it_is_when_the_picture_is_taken():
