@@ -1,9 +1,9 @@
 """Corrects the path of a drive whose lidar sweeps do not agree by its recorded poses.
 
 Heights by GPS drift by decimetres within seconds (KITTI), or are not recorded at all (nuScenes), cheaper receivers and odometry shake from
-pose to pose, and splats made from such sweeps lie in layers. Every sweep is registered point to plane (Chen and Medioni 1992) to others that saw the same surfaces, and all poses are optimised
-together in a pose graph, with the recorded motion as a prior: what sweeps do not determine, as the way along a bare road, stays as
-recorded.
+pose to pose, and splats made from such sweeps lie in layers. Every sweep is registered point to plane (Chen and Medioni 1992) to others
+that saw the same surfaces, and all poses are optimised together in a pose graph, with the recorded motion as a prior: what sweeps do not
+determine, as the way along a bare road, stays as recorded.
 """
 
 from __future__ import annotations
