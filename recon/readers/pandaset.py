@@ -38,6 +38,11 @@ LABELS = {
     "Cones": "cone",
 }
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+LIDAR = (1.5, 0.0, 1.77)
+"""Where the turning lidar stands in the body, whose place is the middle of the rear axle, metres. PandaSet does not say; seen from there,
+and from nowhere else within a decimetre, drive 002's points lie in beams, each at one elevation. Of the one that looks ahead nothing is
+known."""
+
 READOUT_US, MIDDLE_US = 30_000, -10_000
 """How long an image is read out, and its middle row against its stamp. PandaSet does not say; SplatAD (Hess et al. 2025) takes these."""
 
@@ -81,7 +86,8 @@ def read_pandaset(path: Path) -> Log:
         **_geodetic(path / "meta" / "gps.json"),
     }
     tracks = _tracks(path, lidar_times, origin.numpy(), ego)
-    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, tuple(n for n in FRONT if n in cameras))
+    front, lidars = tuple(n for n in FRONT if n in cameras), {0: np.array(LIDAR)}
+    return Log(meta["name"], path, cameras, sweeps, tracks, ego, meta, front, lidars=lidars)
 
 
 def _json(path: Path):
