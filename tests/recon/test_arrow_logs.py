@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 pytest.importorskip("pyarrow", reason="needs pyarrow: pip install 'sidestep[arrow]'")
 
 from made_argoverse2 import NAMES as RING  # noqa: E402
 from made_argoverse2 import write_argoverse2  # noqa: E402
-from made_tape import STEP_US, check, tape  # noqa: E402
+from made_tape import STAMPS, STEP_US, check, tape  # noqa: E402
 from made_waymo import NAMES as FIVE  # noqa: E402
 from made_waymo import READOUT_US, SEGMENT, near_points, write_waymo  # noqa: E402
 
@@ -22,6 +23,7 @@ from recon.readers.arrow import Rows  # noqa: E402
 from recon.readers.waymo import BODY, POSE, STAMP, _from_range, _rotations, read_waymo  # noqa: E402
 from scenes.lenses import OpenCV, Pinhole  # noqa: E402
 from scenes.poses import inverse, pose_from, translation, yaw  # noqa: E402
+from tests.layouts.waymo import MAP  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -106,24 +108,22 @@ def test_waymo_boxes_stand_where_each_alone_is_placed(waymo):
 
     log = open_log(waymo / SEGMENT)
     table = pd.read_parquet(waymo / f"lidar_box/{SEGMENT}.parquet")
+    frames = dict(zip(STAMPS.tolist(), log.ego.world_from_body[1:-1], strict=True))
     for track in log.tracks:
         rows = table[table["key.laser_object_id"] == track.sources[0]]
         keys = [f"[LiDARBoxComponent].box.{k}" for k in ("center.x", "center.y", "center.z", "size.z", "heading")]
         values = zip(rows["key.frame_timestamp_micros"], rows[keys].to_numpy(), track.world_from_box, strict=True)
         for t, (x, y, z, height, heading), pose in values:
-            alone = log.ego.at(t) @ translation(x, y, z - height / 2) @ yaw(heading)
+            alone = frames[t] @ translation(x, y, z - height / 2) @ yaw(heading)
             torch.testing.assert_close(pose, alone, atol=1e-9, rtol=0)
 
 
-def test_a_waymo_frames_pose_is_that_of_its_front_picture(own_waymo):
+def test_a_waymo_frames_pose_is_that_of_its_front_picture(own_waymo, near):
     """Its stamp is that of the first lidar column (waymo-open-dataset, issue 464): at 15 m/s the car is 0.7 m farther at the pose."""
     import pandas as pd
 
     images = pd.read_parquet(own_waymo / f"camera_image/{SEGMENT}.parquet")
     front = images[images["key.camera_name"] == 1]
-    path = own_waymo / f"vehicle_pose/{SEGMENT}.parquet"
-    poses = pd.read_parquet(path).assign(**{BODY: front[POSE].to_list()})
-    poses.to_parquet(path, row_group_size=4)
     log = open_log(own_waymo / SEGMENT)
     assert log.ego.times_us[1:-1].tolist() == (front[STAMP] * 1e6).round().astype(int).to_list()
     boxes = pd.read_parquet(own_waymo / f"lidar_box/{SEGMENT}.parquet")
@@ -133,13 +133,19 @@ def test_a_waymo_frames_pose_is_that_of_its_front_picture(own_waymo):
         x, y = (rows[f"[LiDARBoxComponent].box.center.{k}"].to_numpy() for k in "xy")
         local = torch.linalg.inv(log.ego.world_from_body[1:-1]) @ track.world_from_box
         np.testing.assert_allclose(local[:, :2, 3], np.stack([x, y], 1), atol=1e-9)
+    poses = [(MAP @ near.ego.at(t)).numpy().ravel() for t in STAMPS.tolist()]
+    changed(own_waymo / f"vehicle_pose/{SEGMENT}.parquet", lambda table: table.assign(**{BODY: poses}))
+    assert open_log(own_waymo / SEGMENT).ego.times_us[1:-1].tolist() == STAMPS.tolist(), "no picture has these"
 
 
 def test_waymo_points_were_taken_when_the_car_passed_by_their_pixels_pose(waymo, near):
-    for sweep in read_waymo(waymo / SEGMENT).sweeps:
-        local = near.scan(sweep.time_us, STEP_US)
+    log = read_waymo(waymo / SEGMENT)
+    home = near.ego.at(int(log.ego.times_us[1])) @ inverse(log.ego.world_from_body[1])
+    for sweep in log.sweeps:
+        local, points = near.scan(sweep.time_us, STEP_US), sweep.read()
         wanted = sweep.time_us + np.arctan2(local[:, 1], local[:, 0]) / (2 * np.pi) * STEP_US
-        assert np.abs(sweep.read().times_us - wanted).max() < 3000
+        which = cKDTree(near.points).query(points.xyz @ home[:3, :3].numpy().T + home[:3, 3].numpy())[1]
+        assert np.abs(points.times_us - wanted[which]).max() < 3000
 
 
 def test_the_way_to_a_box_and_to_a_camera_is_that_of_each_moment_alone(argoverse):
