@@ -1,13 +1,13 @@
 """One drive as other data sets would have published it: written in their layouts, read again, fitted and measured.
 
-    python -m tests.bench.layouts DRIVE -o FOLDER [--only nuscenes argoverse2 waymo kitti] [--camera front_camera]
+    python -m tests.bench.layouts DRIVE -o FOLDER [--only pandaset nuscenes argoverse2 waymo kitti] [--camera front_camera]
 
 Of frames 24 to 75 of a PandaSet drive one camera's pictures are written, as they are, with its boxes and with made-up lidars such as these
 data sets have (`tests/layouts/lidar.py`), which show what the sweeps that are not held out do. The car's path is that by which these sweeps
 meet, its camera is fixed to it. What is in FOLDER already is read as it is. Each is fitted for 4 seconds from frame 30 on, at 480x270, with
 1,000 steps and 80,000 splats, and measured by PandaSet's own held-out pictures and sweeps, carried to where the car was; the first row is
-PandaSet itself, of the same frames. "movers" is all pixels of held-out pictures in the boxes of what moves, as in `recon`; "above" is 3 m
-aside.
+PandaSet itself, of the same frames. "Movers' boxes" are all pixels of held-out pictures in the boxes of what moves, where the first row's
+scene without them shows nothing nearer.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ HEADS = (
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """What a data set records. lidars: those on the car, which turn together, the first where the drive's own stands; write: puts a log
-    into a folder, below which `opens` is what is read; turns: so many a picture; stamped: the part of a turn after which a sweep has its
-    stamp; annotated: every how many sweeps boxes are drawn."""
+    """What a data set records. lidars: those on the car, which turn together; write: puts a log into a folder, below which `opens` is what is
+    read; turns: so many a picture; stamped: the part of a turn after which a sweep has its stamp; annotated: every how many sweeps boxes are
+    drawn."""
 
     lidars: tuple[Spinner, ...]
     write: Callable[[Path, Log], Path]
@@ -61,21 +61,24 @@ def _beams(low: float, high: float, count: int) -> np.ndarray:
     return np.radians(np.linspace(low, high, count))
 
 
-HDL32 = Spinner((0.94, 0.0, 1.84), _beams(-30, 10, 32), 1090, 50_000, True, 80.0)
-VLP32 = Spinner((1.35, 0.0, 1.64), _beams(-30, 10, 32), 1800, 100_000, True, 150.0)
-TOP = Spinner((1.43, 0.0, 2.18), _beams(-17.6, 2.4, 64), 2650, 100_000, True, 75.0)
-HDL64 = Spinner((0.81, -0.32, 0.80), _beams(-24.8, 2.0, 64), 2083, 100_000, False, 120.0)
+HDL32 = Spinner((0.0, 0.0, 1.84), _beams(-30, 10, 32), 1090, 50_000, True, 80.0)
+VLP32 = Spinner((0.0, 0.0, 1.64), _beams(-30, 10, 32), 1800, 100_000, True, 150.0)
+TOP = Spinner((0.0, 0.0, 2.18), _beams(-17.6, 2.4, 64), 2650, 100_000, True, 75.0)
+HDL64 = Spinner((0.0, 0.0, 1.43), _beams(-24.8, 2.0, 64), 2083, 100_000, False, 120.0)
 HALF = float(VLP32.beams[1] - VLP32.beams[0]) / 2
 
 LAYOUTS = {
     "nuscenes": Layout(
         (HDL32,), partial(nuscenes.write, body_from_lidar=HDL32.body_from_lidar), nuscenes.SCENE, turns=2, stamped=1.0, annotated=10
     ),
-    "argoverse2": Layout((VLP32, replace(VLP32, place=(1.35, 0.0, 1.54), beams=VLP32.beams + HALF)), argoverse2.write),
+    "argoverse2": Layout((VLP32, replace(VLP32, place=(0.0, 0.0, 1.54), beams=VLP32.beams + HALF)), argoverse2.write),
     "waymo": Layout((TOP,), partial(waymo.write, body_from_lidar=TOP.body_from_lidar, beams=TOP.beams, columns=TOP.columns), waymo.SEGMENT),
     "kitti": Layout((HDL64,), partial(kitti.write, body_from_lidar=HDL64.body_from_lidar), kitti.DRIVE, stamped=0.5),
 }
-"""Boxes twice a second and a lidar 20 times in nuScenes; range images in Waymo's; a lidar that looks ahead at its stamp in KITTI's."""
+"""Boxes twice a second and a lidar 20 times in nuScenes; range images in Waymo's; a lidar that looks ahead at its stamp in KITTI's.
+PandaSet's body is 0.3 m above the road."""
+
+ROWS = ["pandaset", *LAYOUTS]
 
 
 def part_of(log: Log, name: str, frames: range) -> Log:
@@ -93,10 +96,9 @@ def part_of(log: Log, name: str, frames: range) -> Log:
 
 
 def recorded(log: Log, street: Street, name: str, layout: Layout) -> Log:
-    """What another data set's car would have recorded of a street on a log's path: its body is another, its camera called front, and its
-    lidars look where the camera does when that takes its pictures."""
+    """What another data set's car would have recorded of a street on a log's path: its camera is called front, and its lidars look where
+    that does when it takes its pictures."""
     lidar = layout.lidars[0]
-    ego = Trajectory(log.ego.times_us, log.ego.world_from_body @ inverse(lidar.body_from_lidar))
     camera, mount = log.camera(name), mean_pose(log.offsets(name))
     fixed = replace(camera, name="front", world_from_cam=log.ego.at_each(camera.times_us) @ mount)
     before = round(float(lidar.passes(mount[None, :3, 2].numpy())[0]) * lidar.turn_us)
@@ -104,30 +106,30 @@ def recorded(log: Log, street: Street, name: str, layout: Layout) -> Log:
     stamps = [t + round(layout.stamped * lidar.turn_us) for t in begun]
 
     def turned(begun_us: int) -> LidarPoints:
-        parts = [sweep(street, each, ego, begun_us, k) for k, each in enumerate(layout.lidars)]
+        parts = [sweep(street, each, log.ego, begun_us, k) for k, each in enumerate(layout.lidars)]
         return LidarPoints(*(np.concatenate([getattr(p, field) for p in parts]) for field in ("xyz", "times_us", "sensor")))
 
     sweeps = tuple(Sweep(i, stamp, partial(turned, t)) for i, (t, stamp) in enumerate(zip(begun, stamps, strict=True)))
-    drawn = boxes(street, lidar, ego, begun[:: layout.annotated], stamps[:: layout.annotated])
+    drawn = boxes(street, lidar, log.ego, begun[:: layout.annotated], stamps[:: layout.annotated])
     lidars = {k: np.array(each.place) for k, each in enumerate(layout.lidars)}
-    return Log("front", log.path, {"front": fixed}, sweeps, drawn, ego, {}, lidars=lidars)
+    return Log("front", log.path, {"front": fixed}, sweeps, drawn, log.ego, {}, lidars=lidars)
 
 
-def carried(log: Log, path: Trajectory, new: Trajectory) -> Log:
-    """A log moved to where its car, which went along one path, is by another of the same body."""
+def carried(log: Log, new: Trajectory) -> Log:
+    """A log moved to where its car is by another path of the same body."""
     times = torch.tensor([s.time_us for s in log.sweeps])
-    return moved(log, Trajectory(times, new.near_each(times) @ inverse(path.near_each(times))))
+    return moved(log, Trajectory(times, new.near_each(times) @ inverse(log.ego.near_each(times))))
 
 
-def row(title: str, log: Log, truth: Callable[[Log], Log], seen: list[Masks]) -> str:
-    """A line of the table: a log that is read, fitted and measured by the sweeps of what `truth` makes of it as it is corrected. seen: the
-    pixels that show movers, which the first row finds."""
+def row(title: str, log: Log, truth: Log, seen: list[Masks]) -> str:
+    """A line of the table: a log that is read, fitted and measured by the held-out sweeps of `truth`. seen: the pixels that show movers,
+    which the first row finds."""
     name = log.front[0]
     times = log.camera(name).times_us
     names, span = choose(log, [name], int(times[START - FRAMES.start] - times[0]), LASTS_US)
     config = replace(fit_config(log, names, span), steps=STEPS, budget=SPLATS)
     scene, frames, rig, _, used = fitted(log, config, names, SIZE, span)
-    there = truth(used)
+    there = carried(truth, used.ego)
     tracks: list[Track] = [t for t in there.tracks if t.moving]
     with torch.no_grad():
         seen[:] = seen or [shown(scene, tracks, frames)]
@@ -145,7 +147,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("drive", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--only", nargs="+", default=list(LAYOUTS), choices=["pandaset", *LAYOUTS], metavar="LAYOUT")
+    parser.add_argument("--only", nargs="+", default=ROWS, choices=ROWS, metavar="LAYOUT")
     parser.add_argument("--camera", default="front_camera")
     asked = parser.parse_args()
     part = part_of(open_log(asked.drive), asked.camera, FRAMES)
@@ -153,20 +155,18 @@ def main() -> None:
     meets = aligned(part, kept.sweeps)
     seen: list[Masks] = []
     print(f"| {' | '.join(HEADS)} |\n|{len(HEADS) * '---|'}", flush=True)
-    print(row("PandaSet", kept, lambda used: carried(meets, meets.ego, used.ego), seen), flush=True)
+    if "pandaset" in asked.only:
+        print(row("PandaSet", kept, meets, seen), flush=True)
     asked.output.mkdir(exist_ok=True)
     street = None
     for name in (n for n in LAYOUTS if n in asked.only):
-        street = street or Street.of(meets, without_held_out(meets, HELD_OUT).sweeps)
-        as_recorded = recorded(meets, street, asked.camera, LAYOUTS[name])
         root = asked.output / name
         if not root.exists():
+            street = street or Street.of(meets, without_held_out(meets, HELD_OUT).sweeps)
             with atomic_folder(root) as folder:
                 folder.rmdir()  # the writers make it
-                LAYOUTS[name].write(folder, as_recorded)
-        print(
-            row(name, open_log(root / LAYOUTS[name].opens), lambda used, r=as_recorded: carried(meets, r.ego, used.ego), seen), flush=True
-        )
+                LAYOUTS[name].write(folder, recorded(meets, street, asked.camera, LAYOUTS[name]))
+        print(row(name, open_log(root / LAYOUTS[name].opens), meets, seen), flush=True)
 
 
 if __name__ == "__main__":
