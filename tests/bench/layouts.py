@@ -45,9 +45,9 @@ HEADS = (
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """What a data set records. lidars: those on the car, which turn together; write: puts a log into a folder, below which `opens` is what is
-    read; turns: so many a picture; stamped: the part of a turn after which a sweep has its stamp; annotated: every how many sweeps boxes are
-    drawn."""
+    """What a data set records. lidars: those on the car, which turn together; write: puts a log into a folder, below which `opens` is what
+    is read; turns: so many a picture; stamped: the part of a turn after which a sweep has its stamp; annotated: every how many sweeps boxes
+    are drawn."""
 
     lidars: tuple[Spinner, ...]
     write: Callable[[Path, Log], Path]
