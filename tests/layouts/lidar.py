@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.ndimage import minimum_filter
+from scipy.spatial import cKDTree
 
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.objects.actors import split_points
@@ -22,6 +23,10 @@ these: the nearest is the noise nearest to the car."""
 GAP, HIDING = 0.4, 1.25
 """Degrees between the points of sparse sweeps, which lets no beam through: what is so many times as far as something within that of it is
 hidden."""
+
+AROUND, BESIDE, OFTEN = 0.4, 12, 3
+"""Metres within which so many neighbours of a point must be of so many sweeps for it to be the street's: each turn would show the dust of
+all sweeps."""
 
 NEAREST = 1.0
 """Metres from a lidar at which it begins to see."""
@@ -78,7 +83,16 @@ class Street:
     def of(log: Log, sweeps: Sequence[Sweep]) -> Street:
         split = split_points(log, sweeps, [t for t in log.tracks if t.moving])
         found = {name: points for name, (points, _) in split.actors.items()}
-        return Street(split.static, found, (*split.tracks, *(t for t in log.tracks if not t.moving)))
+        return Street(
+            split.static[_again(split.static, split.static_sweep)], found, (*split.tracks, *(t for t in log.tracks if not t.moving))
+        )
+
+
+def _again(points: np.ndarray, sweeps: np.ndarray) -> np.ndarray:
+    """Which of the points `[N, 3]` of `sweeps` `[N]` several of them show, bool `[N]`."""
+    beside = cKDTree(points).query(points, BESIDE, distance_upper_bound=AROUND)[1]
+    of = np.sort(np.append(sweeps, -1)[beside], axis=1)  # -1 where there is no neighbour
+    return (of[:, 0] >= 0) + (np.diff(of, axis=1) > 0).sum(1) >= OFTEN
 
 
 def sweep(street: Street, lidar: Spinner, ego: Trajectory, begun_us: int, sensor: int = 0) -> LidarPoints:
