@@ -1,5 +1,7 @@
 """What the layouts' writers put on disk reads back as it was, and made-up lidars see what is there."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from made_drive import write_drive
 from scipy.spatial import cKDTree
 
 from recon import open_log
-from recon.log import LidarPoints, Log, Track, mean_pose
+from recon.log import LidarPoints, Log, Sweep, Track, mean_pose
 from recon.objects.actors import box_skin
 from recon.readers.recorder import without_recorder
 from recon.registration.corrected import moved
@@ -107,3 +109,18 @@ def test_a_mover_is_seen_where_it_was_when_the_lidar_looked_there():
     assert drawn.times_us.tolist() == [777]
     looked = (10.0 - float(drawn.world_from_box[0, 0, 3])) / 15 * 1e6
     assert found.times_us.min() < looked < found.times_us.max()
+
+
+def test_dust_of_one_sweep_is_no_street():
+    noise = np.random.default_rng(0)
+    ego = Trajectory(torch.tensor([0, 600_000]), torch.stack([translation(), translation(6.0, 0.0, 0.0)]))
+
+    def swept(i: int) -> Sweep:
+        wall = np.stack([noise.uniform(-4, 4, 500), np.full(500, 5.0), noise.uniform(0, 3, 500)], 1)
+        xyz = np.concatenate([wall, np.full((int(i == 2), 3), 10.0)])
+        points = LidarPoints(xyz, np.full(len(xyz), i * 100_000), np.zeros(len(xyz), np.int64))
+        return Sweep(i, i * 100_000, lambda: points)
+
+    log = Log("dust", Path("dust"), {}, tuple(map(swept, range(7))), (), ego, {})
+    static = Street.of(log, log.sweeps).static
+    assert len(static) > 3000 and np.abs(static[:, 1] - 5.0).max() == 0

@@ -24,7 +24,7 @@ GAP, HIDING = 0.4, 1.25
 """Degrees between the points of sparse sweeps, which lets no beam through: what is so many times as far as something within that of it is
 hidden."""
 
-AROUND, BESIDE, OFTEN = 0.4, 12, 3
+AROUND, BESIDE, OFTEN = 0.4, 12, 5
 """Metres within which so many neighbours of a point must be of so many sweeps for it to be the street's: each turn would show the dust of
 all sweeps."""
 
