@@ -215,3 +215,22 @@ def test_a_place_is_known_from_where_gps_has_one(own_drive):
     assert open_log(own_drive).meta["geodetic_origin"]["lat"] == rows[1]["lat"]
     path.write_text(json.dumps([nothing] * len(rows)))
     assert "geodetic_origin" not in open_log(own_drive).meta
+
+
+def test_its_lidar_stands_where_its_beams_meet(pandaset):
+    """From there a beam's points lie at one elevation, from elsewhere they do not: the car stands in the first sweeps."""
+    log = open_log(pandaset)
+    found = [sweep.read() for sweep in log.sweeps[:8]]
+    back = inverse(log.ego.at(log.sweeps[0].time_us)).numpy()
+    local = np.concatenate([p.xyz[p.sensor == 0] for p in found]) @ back[:3, :3].T + back[:3, 3]
+    local = local[np.abs(np.linalg.norm(local, axis=1) - 25) < 20]
+
+    def sharp(place) -> float:
+        from_there = local - place
+        elevations = np.degrees(np.arctan2(from_there[:, 2], np.linalg.norm(from_there[:, :2], axis=1)))
+        counts = np.histogram(elevations, np.arange(-26, 16, 0.05))[0].astype(float)
+        return float(np.square(counts).sum() / counts.sum() ** 2)
+
+    there = sharp(log.lidars[0])
+    for off in ([0, 0, -1.77], [0, 0, 0.3], [0, 0, -0.3], [0.6, 0, 0], [-0.6, 0, 0], [0, 0.4, 0], [0, -0.4, 0]):
+        assert there > 1.005 * sharp(log.lidars[0] + off), off
