@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from recon.log import LidarPoints, Log, LogCamera, Sweep, Track
+from scenes.atomic import atomic_file
 from scenes.camera import Camera
 from tests.bench.worlds.place import Place
 
@@ -25,7 +26,7 @@ REACH = 100.0
 """Metres beyond which a lidar sees nothing."""
 
 LOOKS = 8
-"""Moments at which the truth is looked at, evenly along the drive."""
+"""Moments at which the truth is looked at, evenly along the drive, or up to twice as many."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +78,21 @@ def _picture(place: Place, view: Camera, file: Path) -> Path:
 
 def _save(rgb: torch.Tensor, file: Path) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}")
-    Image.fromarray((rgb.numpy() * 255).round().astype(np.uint8)).save(part, "PNG")
-    part.rename(file)
+    with atomic_file(file) as part:
+        Image.fromarray((rgb.numpy() * 255).round().astype(np.uint8)).save(part, "PNG")
+
+
+def _keep(file: Path, **arrays: np.ndarray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(file) as part:
+        np.savez_compressed(part, **arrays)  # type: ignore[arg-type] - numpy's own stub takes no dict
 
 
 def _truth(place: Place, view: Camera, stem: Path) -> Truth:
     picture, measured = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.npz")
     if not (picture.exists() and measured.exists()):
         rgb, depth, who = place.seen(view)
-        np.savez_compressed(measured, depth=depth.numpy(), who=who.numpy().astype(np.int8))
+        _keep(measured, depth=depth.numpy(), who=who.numpy().astype(np.int8))
         _save(rgb, picture)
     with np.load(measured) as kept, Image.open(picture) as shown:
         rgb = torch.from_numpy(np.asarray(shown).copy()).float() / 255
@@ -109,9 +115,6 @@ def _sweep(place: Place, stamp: int, file: Path) -> LidarPoints:
             hit = metres < REACH
             ranges = metres[hit].double() + torch.from_numpy(chance.normal(0, NOISE, int(hit.sum())))
             found.append((origin + ranges[:, None] * rays[hit], np.full(int(hit.sum()), time)))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_name(f".{file.name}")
-        np.savez(part, xyz=torch.cat([xyz for xyz, _ in found]).numpy(), times=np.concatenate([t for _, t in found]))
-        part.rename(file)
+        _keep(file, xyz=torch.cat([xyz for xyz, _ in found]).numpy(), times=np.concatenate([t for _, t in found]))
     with np.load(file) as kept:
         return LidarPoints(kept["xyz"], kept["times"], np.zeros(len(kept["xyz"]), np.int64))
