@@ -121,6 +121,11 @@ class Track:
     sensor: np.ndarray
     sources: tuple[str, ...]
 
+    def part(self, kept: np.ndarray) -> Track:
+        """The track with these of its boxes only: indices, or bool `[T]`."""
+        poses = self.world_from_box[torch.from_numpy(kept)]
+        return replace(self, times_us=self.times_us[kept], world_from_box=poses, sensor=self.sensor[kept])
+
     def trajectory(self) -> Trajectory:
         return Trajectory(torch.from_numpy(self.times_us), self.world_from_box)
 

@@ -139,7 +139,7 @@ def _part(track: Track, boxes: np.ndarray) -> Track:
     times = track.times_us[boxes]
     if len(boxes) == 1:
         boxes, times = boxes.repeat(3), times + MOMENT_US * np.arange(-1, 2)
-    return replace(track, times_us=times, world_from_box=track.world_from_box[torch.from_numpy(boxes)], sensor=track.sensor[boxes])
+    return replace(track.part(boxes), times_us=times)
 
 
 def nearness(track: Track, ego: Trajectory) -> float:

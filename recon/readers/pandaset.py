@@ -39,8 +39,8 @@ LABELS = {
 }
 LIDAR_FROM_BODY = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 LIDAR = (1.5, 0.0, 1.77)
-"""Where the turning lidar stands in the body, whose place is the middle of the rear axle, metres. PandaSet does not say; seen from there,
-and from nowhere else within a decimetre, drive 002's points lie in beams, each at one elevation. Of the one that looks ahead nothing is
+"""Where the turning lidar stands in the body, whose place is the middle of the rear axle, metres. PandaSet does not say; seen from there
+drive 002's points lie in beams, each at one elevation, and the less so the farther from there. Of the one that looks ahead nothing is
 known."""
 
 READOUT_US, MIDDLE_US = 30_000, -10_000

@@ -95,7 +95,7 @@ def thinned(log: Log, every: int) -> Log:
 
     def track(t: Track) -> Track:
         nearest = (torch.from_numpy(t.times_us)[:, None] - path).abs().argmin(1).numpy()
-        return _with_boxes(t, nearest % every == 0)
+        return t.part(nearest % every == 0)
 
     ego = lengthened(path[::every].numpy(), log.ego.world_from_body[1:-1][::every])
     cameras = {name: c.part(slice(None, None, every)) for name, c in log.cameras.items()}
@@ -189,7 +189,7 @@ def shaken_boxes(log: Log) -> Log:
         motions[:, 2], motions[:, 3:5] = chance.normal(0, np.radians(2), count), chance.normal(0, 0.15, (count, 2))
         size, kept = t.size * (1 + 0.05 * chance.choice([-1, 1])), chance.random(count) >= 0.3
         kept[chance.integers(count)] = True
-        return _with_boxes(replace(t, size=size, world_from_box=t.world_from_box @ small_poses(torch.from_numpy(motions))), kept)
+        return replace(t, size=size, world_from_box=t.world_from_box @ small_poses(torch.from_numpy(motions))).part(kept)
 
     return replace(log, tracks=named([track(t) for t in log.tracks], log.ego))
 
@@ -200,7 +200,3 @@ def shaken_path(log: Log) -> Log:
     body = log.ego.world_from_body
     off = np.random.default_rng(0).normal(0, 1, (len(body), 6)) * np.repeat([0.003, 0.05], 3)
     return moved(log, Trajectory(log.ego.times_us, about(body[:, :3, 3].numpy(), off)))
-
-
-def _with_boxes(track: Track, kept: np.ndarray) -> Track:
-    return replace(track, times_us=track.times_us[kept], world_from_box=track.world_from_box[kept], sensor=track.sensor[kept])

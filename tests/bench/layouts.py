@@ -90,8 +90,7 @@ def part_of(log: Log, name: str, frames: range) -> Log:
     for track in log.tracks:
         kept = (first <= track.times_us) & (track.times_us <= last)
         if kept.any():
-            poses = track.world_from_box[torch.from_numpy(kept)]
-            tracks.append(replace(track, times_us=track.times_us[kept], world_from_box=poses, sensor=track.sensor[kept]))
+            tracks.append(track.part(kept))
     return replace(log, cameras={name: camera}, sweeps=sweeps, tracks=tuple(tracks), front=(name,))
 
 

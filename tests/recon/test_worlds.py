@@ -8,7 +8,6 @@ import torch
 
 from render.rays import world_directions
 from scenes.poses import inverse
-from tests.bench.worlds.people import straight
 from tests.bench.worlds.place import Light, Mover, Part, Place, along, looking
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
@@ -22,7 +21,7 @@ SUN = (0.0, -0.6, 0.8)
 def place() -> Place:
     """A grey plain with a red box 10 m ahead, which casts its shadow to the left, and a blue one that crosses 6 m ahead."""
     ground = panel((-50, -50, 0), (100, 0, 0), (0, 100, 0), plain((0.5, 0.5, 0.5)))
-    crosses = straight((6.0, -1.5), (6.0, -0.5), TIMES)
+    crosses = along([(6.0, -1.5), (6.0, -0.5)], 2.0, TIMES)
     return Place(
         "plain",
         joined([ground, box((10.5, 0, 0), (1, 2, 2), plain((0.8, 0.1, 0.1)))]),

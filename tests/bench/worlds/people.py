@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from scenes.trajectory import Trajectory
-from tests.bench.worlds.place import Mover, Part
+from tests.bench.worlds.place import Mover, Part, along
 from tests.bench.worlds.solids import blob, grain, moved, plain
 
 STRIDE = 1.4
 """Metres that two steps take."""
 
 
-def walker(track: str, trajectory: Trajectory, seed: int) -> Mover:
-    """A person 1.75 m tall whose limbs swing as fast as the trajectory goes."""
+def walker(track: str, points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor, seed: int) -> Mover:
+    """A person 1.75 m tall who goes through points `[x, y]` at a speed in m/s, and whose limbs swing as fast as that."""
     chance = np.random.default_rng(seed)
     shirt, jeans = grain(seed, tuple(chance.uniform(0.1, 0.8, 3)), 0.2, 64), grain(seed + 1, tuple(chance.uniform(0.05, 0.4, 3)), 0.2, 64)
     skin, hair = plain((0.78, 0.58, 0.46)), plain(tuple(chance.uniform(0.05, 0.3, 3)))
     trunk = Part(blob((0, 0, 1.15), (0.14, 0.2, 0.36), shirt))
     head = [Part(blob((0, 0, 1.6), (0.1, 0.09, 0.13), skin)), Part(blob((-0.02, 0, 1.66), (0.1, 0.095, 0.1), hair))]
+    trajectory = along(points, speed, times_us)
     span = trajectory.span_us()
     metres = float((trajectory.world_from_body[-1] - trajectory.world_from_body[0])[:3, 3].norm())
     hertz = metres / ((span[1] - span[0]) * 1e-6) / STRIDE
@@ -34,15 +35,3 @@ def walker(track: str, trajectory: Trajectory, seed: int) -> Mover:
         limbs += [Part(m, at, 0.42, hertz, phase) for m in (leg, shoe)]
         limbs.append(Part(arm, (0.0, 0.25 * side, 1.42), 0.35, hertz, phase + math.pi))
     return Mover(track, "pedestrian", (0.9, 0.7, 1.75), (trunk, *head, *limbs), trajectory)
-
-
-def straight(start: tuple[float, float], end: tuple[float, float], times_us: torch.Tensor) -> Trajectory:
-    """From one place on the ground to another, at a constant speed, facing where it goes."""
-    share = torch.linspace(0, 1, len(times_us), dtype=torch.float64)[:, None]
-    first, last = torch.tensor(start, dtype=torch.float64), torch.tensor(end, dtype=torch.float64)
-    yaw = math.atan2(end[1] - start[1], end[0] - start[0])
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(times_us), 1, 1)
-    poses[:, 0, 0] = poses[:, 1, 1] = math.cos(yaw)
-    poses[:, 1, 0], poses[:, 0, 1] = math.sin(yaw), -math.sin(yaw)
-    poses[:, :2, 3] = first + share * (last - first)
-    return Trajectory(times_us, poses)

@@ -14,9 +14,12 @@ from render.rays import camera_rays, world_directions
 from render.tracer import Blockers, Mesh, TracedMesh, fibonacci
 from scenes import Pinhole
 from scenes.camera import Camera, RigCamera
-from scenes.poses import inverse, pose_from
+from scenes.poses import CAM_FROM_FLU, inverse, translation
+from scenes.poses import yaw as turn
 from scenes.sky import linear_from_srgb, srgb_from_linear
 from scenes.trajectory import Trajectory
+
+START_US = 1_700_000_000_000_000
 
 SAMPLES = 2
 """Rays a pixel along each side of it."""
@@ -41,8 +44,8 @@ class Light:
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid piece of a mover, in the frame of the box that `trajectory` moves, base centre, x forward: `swing` turns it about y through
-    `joint` by so many radians at a time in seconds."""
+    """A rigid piece of a mover, in the frame of the box that `trajectory` moves, base centre, x forward, which swings about y through
+    `joint` by up to `amplitude` radians, so many times a second."""
 
     mesh: Mesh
     joint: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -105,7 +108,8 @@ class Place:
         fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
         colours = self._shaded(fine)
         small = colours.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
-        (_, distance, _, who), rays = self._hits(camera), camera_rays(camera)
+        origins, directions = _rays(camera)
+        (_, distance, _, who), rays = self._first(origins, directions, camera.time_us), camera_rays(camera)
         depth = distance.reshape(camera.height, camera.width) / rays.norm(dim=-1)
         return srgb_from_linear(small.clamp(0, 1)), depth, who.reshape(camera.height, camera.width)
 
@@ -114,10 +118,6 @@ class Place:
         _, distance, _, who = self._first(origins, directions, time_us)
         return distance, who
 
-    def _hits(self, camera: Camera) -> tuple[torch.Tensor, ...]:
-        origin, directions = _rays(camera)
-        return self._first(origin.expand(len(directions), 3), directions, camera.time_us)
-
     def _first(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, ...]:
         """Albedo `[N, 3]` sRGB, metres `[N]`, world normals `[N, 3]`, and who `[N]`."""
         colours, normals, distance = self.traced.trace(origins, directions)
@@ -125,28 +125,28 @@ class Place:
         for number, mover in enumerate(self.movers, 1):
             for traced, pose in zip(mover.traced, mover.poses(time_us), strict=True):
                 back, forth = inverse(pose).float(), pose.float()
-                near = _meets(traced.mesh, origins @ back[:3, :3].T + back[:3, 3], directions @ back[:3, :3].T)
-                if not near.any():
+                local, ways = origins @ back[:3, :3].T + back[:3, 3], directions @ back[:3, :3].T
+                near = _meets(traced.mesh, local, ways).nonzero()[:, 0]
+                if not len(near):
                     continue
-                o, d = origins[near] @ back[:3, :3].T + back[:3, 3], directions[near] @ back[:3, :3].T
-                c, n, t = traced.trace(o, d)
-                at = near.nonzero()[:, 0][t < distance[near]]
+                c, n, t = traced.trace(local[near], ways[near])
                 first = t < distance[near]
+                at = near[first]
                 colours[at], distance[at], who[at] = c[first], t[first], number
                 normals[at] = n[first] @ forth[:3, :3].T
         return colours[:, :3], distance, normals, who
 
     def _shaded(self, camera: Camera) -> torch.Tensor:
         """Linear colours `[N, 3]` of all pixels."""
-        albedo, distance, normals, who = self._hits(camera)
-        origin, directions = _rays(camera)
+        origins, directions = _rays(camera)
+        albedo, distance, normals, who = self._first(origins, directions, camera.time_us)
         solid = who >= 0
-        points = origin + directions[solid] * distance[solid, None] + OFF * normals[solid]
+        points = origins[solid] + directions[solid] * distance[solid, None] + OFF * normals[solid]
         blockers, sun = Blockers(self._triangles(camera.time_us)), torch.tensor(self.light.sun)[None]
         lit = blockers.open_share(points, sun, torch.ones(1), 1e3) * (normals[solid] @ sun[0]).clamp_min(0)
         open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach)
         light = lit[:, None] * torch.tensor(self.light.sunlight) + 2 * open_[:, None] * torch.tensor(self.light.ambient)
-        colours = sky(directions, self.light)
+        colours = sky(directions)
         colours[solid] = linear_from_srgb(albedo[solid]) * light
         return colours
 
@@ -160,9 +160,9 @@ class Place:
 
 
 def _rays(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where a camera's eye is `[3]`, and unit world directions through its pixels' centres `[H W, 3]`."""
+    """Where a camera's rays begin, and unit world directions through its pixels' centres, `[H W, 3]` both."""
     directions = world_directions(camera).reshape(-1, 3)
-    return camera.world_from_cam[:3, 3].float(), torch.nn.functional.normalize(directions, dim=1)
+    return camera.world_from_cam[:3, 3].float().expand(len(directions), 3), torch.nn.functional.normalize(directions, dim=1)
 
 
 def _meets(mesh: Mesh, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
@@ -173,7 +173,7 @@ def _meets(mesh: Mesh, origins: torch.Tensor, directions: torch.Tensor) -> torch
     return (along > -radius) & ((to * to).sum(1) - along**2 < radius**2)
 
 
-def sky(directions: torch.Tensor, light: Light) -> torch.Tensor:
+def sky(directions: torch.Tensor) -> torch.Tensor:
     """Linear colours `[N, 3]` of a blue sky with clouds that is white at the horizon."""
     up = directions[:, 2:].clamp_min(0)
     blue = torch.tensor([0.75, 0.85, 0.95]) * (1 - up) ** 3 + torch.tensor([0.16, 0.34, 0.75]) * (1 - (1 - up) ** 3)
@@ -184,18 +184,21 @@ def sky(directions: torch.Tensor, light: Light) -> torch.Tensor:
 
 def looking(size: tuple[int, int], angle: float, yaw: float, at: Sequence[float], times_us: torch.Tensor) -> RigCamera:
     """A pinhole camera `angle` degrees wide, `at` metres ahead, left and up on the body, turned to the left by `yaw` degrees."""
-    focal, half = size[0] / 2 / math.tan(math.radians(angle) / 2), math.radians(yaw) / 2
-    body = pose_from([math.cos(half), 0.0, 0.0, math.sin(half)], at)
-    optical = torch.eye(4, dtype=torch.float64)
-    optical[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return RigCamera(Pinhole(focal, focal, size[0] / 2, size[1] / 2), *size, body @ optical, times_us=times_us)
+    focal = size[0] / 2 / math.tan(math.radians(angle) / 2)
+    mount = translation(*at) @ turn(math.radians(yaw)) @ inverse(CAM_FROM_FLU)
+    return RigCamera(Pinhole(focal, focal, size[0] / 2, size[1] / 2), *size, mount, times_us=times_us)
 
 
-def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor, start_m: float = 0.0) -> Trajectory:
-    """A trajectory over the ground through points `[x, y]` at a constant speed in m/s, `start_m` along at the first time."""
+def clock(frames: int, step_us: int) -> torch.Tensor:
+    """When so many pictures are taken, microseconds."""
+    return START_US + step_us * torch.arange(frames)
+
+
+def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor) -> Trajectory:
+    """A trajectory over the ground from the first of points `[x, y]` through the others, and straight on, at a constant speed in m/s."""
     way = np.asarray(points, np.float64)
     metres = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
-    at = start_m + speed * (times_us - times_us[0]).numpy() * 1e-6
+    at = speed * (times_us - times_us[0]).numpy() * 1e-6
 
     def where(m: np.ndarray) -> np.ndarray:
         inside = np.stack([np.interp(m, metres, way[:, i]) for i in (0, 1)], 1)
@@ -203,9 +206,5 @@ def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tenso
         return inside + (m - metres[-1]).clip(0)[:, None] * last
 
     heading = where(at + 0.4) - where(np.maximum(at - 0.4, 0))
-    yaw = np.arctan2(heading[:, 1], heading[:, 0])
-    poses = np.tile(np.eye(4), (len(at), 1, 1))
-    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(yaw)
-    poses[:, 1, 0], poses[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
-    poses[:, :2, 3] = where(at)
-    return Trajectory(times_us, torch.from_numpy(poses))
+    poses = [translation(x, y) @ turn(math.atan2(dy, dx)) for (x, y), (dx, dy) in zip(where(at), heading, strict=True)]
+    return Trajectory(times_us, torch.stack(poses))

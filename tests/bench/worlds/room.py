@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from render.tracer import Mesh
-from tests.bench.worlds.people import straight, walker
-from tests.bench.worlds.place import Light, Place, along, looking
+from tests.bench.worlds.people import walker
+from tests.bench.worlds.place import Light, Place, along, clock, looking
 from tests.bench.worlds.solids import box, grain, joined, moved, painted, panel, plain, poster
 
-START_US, STEP_US, FRAMES, SPEED = 1_700_000_000_000_000, 160_000, 112, 0.5
+FRAMES, STEP_US, SPEED = 112, 160_000, 0.5
+LASTS = 1e-6 * FRAMES * STEP_US
+"""Seconds."""
+
 HIGH, THICK = 2.7, 0.15
 """Metres: the ceiling's height and the walls' thickness."""
 
@@ -20,23 +22,19 @@ HIGH, THICK = 2.7, 0.15
 def room(people: bool, seed: int = 0) -> Place:
     """A robot 0.3 m high looks ahead and to the left; its lidar of 16 beams is 0.45 m above the floor."""
     chance = np.random.default_rng(seed)
-    clock = times(1)
+    times = clock(FRAMES + 1, STEP_US)
     ways = ((8.2, 1.2), (4.6, 2.1)), ((9.3, -0.4), (9.3, 2.6))
-    movers = [walker(f"walker_{i}", straight(*way, clock), 20 + 10 * i) for i, way in enumerate(ways)] if people else []
+    movers = [walker(f"walker_{i}", way, math.dist(*way) / LASTS, times, 20 + 10 * i) for i, way in enumerate(ways)] if people else []
     return Place(
         "room",
         joined([*_walls(seed), *_furniture(chance)]),
         tuple(movers),
         Light((-0.35, 0.75, 0.56), (0.9, 0.8, 0.62), (0.75, 0.72, 0.66), 1.6),
-        along([(0.7, 0.6), (2.5, 0.7), (4.0, 1.3), (5.2, 1.6), (6.8, 1.6), (8.0, 1.3), (11.5, 1.0)], SPEED, clock),
-        {name: looking((320, 240), 80.0, yaw, (0.1, 0.0, 0.3), times()) for name, yaw in (("front", 0.0), ("left", 90.0))},
+        along([(0.7, 0.6), (2.5, 0.7), (4.0, 1.3), (5.2, 1.6), (6.8, 1.6), (8.0, 1.3), (11.5, 1.0)], SPEED, times),
+        {name: looking((320, 240), 80.0, yaw, (0.1, 0.0, 0.3), times[:-1]) for name, yaw in (("front", 0.0), ("left", 90.0))},
         (tuple(np.linspace(-15.0, 15.0, 16).tolist()), (0.0, 0.0, 0.45)),
         ((0.0, 0.0), (0.2, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.3)),
     )
-
-
-def times(more: int = 0) -> torch.Tensor:
-    return START_US + STEP_US * torch.arange(FRAMES + more)
 
 
 def _wall(start: tuple[float, float], end: tuple[float, float], texture: np.ndarray, low: float = 0.0, high: float = HIGH) -> Mesh:

@@ -10,11 +10,11 @@ import torch
 
 from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
-from tests.bench.worlds.people import straight, walker
-from tests.bench.worlds.place import Light, Mover, Part, Place, along, looking
+from tests.bench.worlds.people import walker
+from tests.bench.worlds.place import Light, Mover, Part, Place, along, clock, looking
 from tests.bench.worlds.solids import blob, box, facade, grain, joined, moved, panel, plain
 
-START_US, STEP_US, FRAMES = 1_700_000_000_000_000, 100_000, 80
+FRAMES, STEP_US = 80, 100_000
 HALF, KERB, JUNCTION, LENGTH = 6.5, 0.13, (62.0, 72.0), (-20.0, 140.0)
 """Metres: half of the road's width, the pavement's height, where a street crosses, and where houses begin and end."""
 
@@ -35,20 +35,17 @@ def street(meshes: Path, seed: int = 0) -> Place:
     """meshes: the folder with the cars' and the street furniture's GLB files."""
     chance = np.random.default_rng(seed)
     models = {p.stem: read_mesh(p) for p in sorted(meshes.glob("*.glb"))}
+    times = clock(FRAMES + 1, STEP_US)
     return Place(
         "street",
         joined([*_ground(seed), *_houses(chance), *_furniture(chance, models), *_parked(chance, models)]),
-        tuple(_movers(models)),
+        tuple(_movers(models, times)),
         Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0),
-        along([(x, 0.25 * math.sin(x / 12) - 2.2) for x in np.arange(-2.0, 60.0)], SPEED, times(1)),
-        {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times()) for name, yaw in (("front", 0.0), ("left", 75.0))},
+        along([(x, 0.25 * math.sin(x / 12) - 2.2) for x in np.arange(-2.0, 60.0)], SPEED, times),
+        {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times[:-1]) for name, yaw in (("front", 0.0), ("left", 75.0))},
         (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85)),
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (-1.0, 0.0), (-1.5, 0.0)),
     )
-
-
-def times(more: int = 0) -> torch.Tensor:
-    return START_US + STEP_US * torch.arange(FRAMES + more)
 
 
 def _ground(seed: int) -> list[Mesh]:
@@ -130,22 +127,20 @@ def _parked(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
     return out
 
 
-def _movers(models: dict[str, Mesh]) -> list[Mover]:
+def _movers(models: dict[str, Mesh], times: torch.Tensor) -> list[Mover]:
     """A car ahead, two that come, one that crosses, someone who crosses, and two who walk along the houses."""
-    clock = times(1)
-    span = 1e-6 * float(clock[-1] - clock[0])
 
     def car(track: str, model: str, points: list[tuple[float, float]], speed: float) -> Mover:
         mesh = models[model]
         size = tuple((mesh.vertices.max(0) - mesh.vertices.min(0)).tolist())
-        return Mover(track, "car", size, (Part(mesh),), along(points, speed, clock))
+        return Mover(track, "car", size, (Part(mesh),), along(points, speed, times))
 
     return [
         car("ahead", "prius_hybrid", [(14.0, -2.2), (90.0, -2.2)], 6.5),
         car("coming", "hatchback_red", [(70.0, 2.6), (-40.0, 2.6)], 7.0),
         car("second", "pickup", [(118.0, 2.7), (-40.0, 2.7)], 8.0),
         car("crossing", "hatchback_blue", [(69.5, 30.0), (69.5, -40.0)], 5.0),
-        walker("crosses", straight((58.0, -8.0), (58.0, -8.0 + 1.4 * span), clock), 20),
-        walker("along", straight((12.0, -7.2), (12.0 + 1.3 * span, -7.2), clock), 30),
-        walker("towards", straight((45.0, 7.0), (45.0 - 1.5 * span, 7.0), clock), 40),
+        walker("crosses", [(58.0, -8.0), (58.0, 8.0)], 1.4, times, 20),
+        walker("along", [(12.0, -7.2), (30.0, -7.2)], 1.3, times, 30),
+        walker("towards", [(45.0, 7.0), (30.0, 7.0)], 1.5, times, 40),
     ]
