@@ -157,6 +157,10 @@ def _of_part(settings: Settings, part: Part, gradients: Sequence[torch.Tensor]) 
     return planes
 
 
+def _splats(scene: Projected) -> list:
+    return [view(scene.records, lanes), view(scene.tilts, wp.vec3)]
+
+
 def _features(scene: Projected) -> list:
     features = scene.records.new_empty(1, 1) if scene.features is None else scene.features
     return [view(features, float), scene.channels]
@@ -185,7 +189,7 @@ def _by_tile(settings: Settings, w: Window, lists: TileLists, scene: Projected, 
     limits = [settings.alpha_max, settings.termination]
     ends = planes.shape[1:] if settings.gradients else (0, 0)
     last, dark_at = torch.empty(ends[0], ends[1] // TILE, dtype=torch.int32), torch.empty(ends, dtype=torch.float32)
-    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
+    args = [*lists_of, *_splats(scene), *_features(scene), w, BANDS, *limits, *_working(scene.channels), *_batches()]
     out = [lanes_of(planes), lanes_of(picks), view(last, int), lanes_of(dark_at)]
     run(composite(settings.wanted, settings.squarings, settings.gradients), BANDS, [*args, *out], device)
     return last, dark_at
@@ -195,7 +199,7 @@ def _composite_backward(settings: Settings, part: Part, lists: TileLists, scene:
     """Fill the gradient slots of the window's entries; grads are planes as of `_of_part`."""
     w = part.window
     lists_of = [view(lists.starts, int), view(lists.ids, int), view(lists.slot_of, int)]
-    args = [*lists_of, view(scene.records, lanes), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
+    args = [*lists_of, *_splats(scene), *_features(scene), w, BANDS, settings.alpha_max, *_working(scene.channels)]
     terms = torch.empty(BANDS * int(3 * BATCH + SUMS), TILE, dtype=torch.float32)
     args += [
         view(terms, lanes),
@@ -224,4 +228,10 @@ def _batches() -> list:
     """Where forward keeps the entries of the batch at hand for each band."""
     entries = BANDS * int(BATCH)
     terms = torch.empty(2 * entries, TILE, dtype=torch.float32)
-    return [view(torch.empty(entries, TILE, dtype=torch.float32), lanes), view(terms, lanes), view(terms.view(-1), float)]
+    slopes = torch.empty(entries, 3, dtype=torch.float32)
+    return [
+        view(torch.empty(entries, TILE, dtype=torch.float32), lanes),
+        view(slopes, wp.vec3),
+        view(terms, lanes),
+        view(terms.view(-1), float),
+    ]

@@ -64,7 +64,7 @@ def project_ewa(points: torch.Tensor, covariance: torch.Tensor, lens: torch.Tens
     zero = torch.zeros_like(z)
     jacobian = torch.stack([torch.stack([fx / z, zero, -fx * jx / z], -1), torch.stack([zero, fy / z, -fy * jy / z], -1)], -2)
     mean = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
-    return mean, jacobian @ covariance @ jacobian.transpose(-1, -2)
+    return mean, jacobian @ covariance @ jacobian.transpose(-1, -2), (jacobian @ covariance)[..., 2]
 
 
 def project_ut(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, width: int, height: int):
@@ -85,7 +85,9 @@ def project_ut(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, wid
     covariance_weights = torch.tensor([2.0] + [1 / 6] * 6, dtype=torch.float64)
     mean = (mean_weights[:, None] * pixels).sum(1)
     d = pixels - mean[:, None]
-    return mean, torch.einsum("k,nki,nkj->nij", covariance_weights, d, d)
+    farther = torch.cat([torch.zeros_like(points[:, :1]), root * axes[:, 2], -root * axes[:, 2]], 1)  # [N, 7]
+    covariance = torch.einsum("k,nki,nkj->nij", covariance_weights, d, d)
+    return mean, covariance, torch.einsum("k,nki,nk->ni", covariance_weights, d, farther)
 
 
 def render(
@@ -120,18 +122,22 @@ def render(
         if isinstance(optics, Pinhole) and not moving:
             part = _pinhole(g, inverse(world_from_cam) @ world_from_local, camera, model, lens)
         else:
-            rows, points, axes, sight, mean, covariance = oracle_lens.project(optics, camera, model, pose, g, moving)
-            part = points, axes, _shown(g, rows, sight), torch.sigmoid(g["logit_opacities"])[rows], mean, covariance
+            rows, points, axes, sight, *moments = oracle_lens.project(optics, camera, model, pose, g, moving)
+            part = points, axes, _shown(g, rows, sight), torch.sigmoid(g["logit_opacities"])[rows], *moments
             if moving:
                 ways.append((pose, g["means"][rows], matrix_from_quat(g["quats"][rows]) * g["log_scales"][rows].exp()[:, None, :]))
         parts.append((*part, torch.full((len(part[0]),), instance)))
-    points, axes, colour, opacity, mean, covariance, instances = (torch.cat(p) for p in zip(*parts, strict=True))
+    points, axes, colour, opacity, mean, covariance, with_depth, instances = (torch.cat(p) for p in zip(*parts, strict=True))
     less = covariance + (0.0 if model.antialias else model.dilation) * torch.eye(2, dtype=torch.float64)
     dilated = covariance + (model.dilation + model.smoothing) * torch.eye(2, dtype=torch.float64)
     if model.antialias or model.smoothing:
         opacity = opacity * (torch.linalg.det(less) / torch.linalg.det(dilated)).clamp_min(0).sqrt()
     conic = torch.linalg.inv(dilated)
-    drawn = (optics.depth(points), mean, conic, opacity, colour, instances)
+    depths = optics.depth(points)
+    spread = oracle_lens.depth_offsets(optics, points, axes).norm(dim=-1)
+    # the regression of depth on the pixel; half of a depth may be lost over the reach of a splat, which else would reach behind the eye
+    slopes = (conic @ with_depth[..., None])[..., 0] * (depths / (2 * REACH * spread)).clamp_max(1)[:, None]
+    drawn = (depths, slopes, mean, conic, opacity, colour, instances)
     reach = BEYOND * torch.diagonal(dilated.detach(), dim1=-2, dim2=-1).sqrt()
     rows = []
     for strip in _parts(camera.pixel_centres(), len(points)):
@@ -148,17 +154,17 @@ def render(
 
 
 def _pinhole(g, cam_from_local: torch.Tensor, camera: Camera, model: SplatModel, lens: torch.Tensor):
-    """Points, axes, colours, opacities, means and covariances of the splats that a pinhole shows."""
+    """Points, axes, colours, opacities, and means and covariances, also with depth, of the splats that a pinhole shows."""
     points = g["means"] @ cam_from_local[:3, :3].T + cam_from_local[:3, 3]
     axes = cam_from_local[:3, :3] @ matrix_from_quat(g["quats"]) * g["log_scales"].exp()[:, None, :]
     keep = in_view(points, axes, lens, camera.width, camera.height, model.widening)
     colour = _shown(g, keep, g["means"][keep] - inverse(cam_from_local)[:3, 3])
     points, axes = points[keep], axes[keep]
     if model.projection == "ewa":
-        mean, covariance = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
+        moments = project_ewa(points, axes @ axes.transpose(1, 2), lens, camera.width, camera.height)
     else:
-        mean, covariance = project_ut(points, axes, lens, camera.width, camera.height)
-    return points, axes, colour, torch.sigmoid(g["logit_opacities"][keep]), mean, covariance
+        moments = project_ut(points, axes, lens, camera.width, camera.height)
+    return points, axes, colour, torch.sigmoid(g["logit_opacities"][keep]), *moments
 
 
 def _shown(g: dict[str, torch.Tensor], rows: torch.Tensor, sight: torch.Tensor) -> torch.Tensor:
@@ -227,7 +233,7 @@ def _parts(pixels: torch.Tensor, count: int, room: int = 1 << 21) -> list[tuple[
     return [strip.split(PART, 1) for strip in pixels.split(PART, 0)]
 
 
-def _composite(pixels, lens: Lens, there, depths, mean, conic, opacity, colour, instances, response, order, cutoff, alpha_max):
+def _composite(pixels, lens: Lens, there, depths, slopes, mean, conic, opacity, colour, instances, response, order, cutoff, alpha_max):
     """rgb, alpha, depth, instance and jump of some pixels `[h, w, 2]`."""
     shape, pixels = pixels.shape[:2], pixels.reshape(-1, 2)
     d = pixels[:, None] - mean
@@ -259,7 +265,8 @@ def _composite(pixels, lens: Lens, there, depths, mean, conic, opacity, colour, 
     weight = alpha * before.gather(1, first.argsort(dim=1))
     total = 1 - passing[:, -1] if len(depths) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
-    depth = torch.where(drawn, weight @ depths / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
+    far = (weight * (depths + torch.einsum("pni,ni->pn", d, slopes))).sum(1)
+    depth = torch.where(drawn, far / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
     ids = instances.unique()
     of_each = torch.stack([weight.detach()[:, instances == i].sum(1) for i in ids], 1) if len(ids) else None
     who = torch.full((len(pixels),), -1) if of_each is None else ids[of_each.argmax(1)]

@@ -123,6 +123,13 @@ def aimed(lens: Lens, camera: Camera, points: torch.Tensor) -> torch.Tensor:
     return torch.stack([(x / z).clamp(left - out_x, right + out_x) * z, (y / z).clamp(top - out_y, bottom + out_y) * z, z], -1)
 
 
+def depth_offsets(lens: Lens, points: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
+    """`[n, 3]`: how much farther, to first order, the ends of axes `[n, 3, 3]` are than their centres `[n, 3]`."""
+    if isinstance(lens, Pinhole | OpenCV | Orthographic):
+        return axes[:, 2]
+    return ((points / points.norm(dim=-1, keepdim=True))[:, None] @ axes)[:, 0]
+
+
 def shown(lens: Lens, camera: Camera, model: SplatModel, points: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
     """Mask of splats in the lens's domain, beyond the near plane, whose ellipsoid is not wholly beyond one side of the view."""
     seen = lens.valid(points) & (lens.depth(points) > NEAR)
@@ -136,7 +143,7 @@ def shown(lens: Lens, camera: Camera, model: SplatModel, points: torch.Tensor, a
 
 def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict[str, torch.Tensor], moving: bool):
     """Of the splats `g` that show: their rows, points and axes in the camera, directions of sight in the local frame, and mean
-    `[n, 2]` and covariance `[n, 2, 2]` in pixels; those beyond an image's seam twice."""
+    `[n, 2]` and covariance `[n, 2, 2]` in pixels, and `[n, 2]` with depth; those beyond an image's seam twice."""
     still = torch.zeros_like(g["means"])
     s = readout(lens, camera, pose, g["means"], still, moving)
     at = pose(s)
@@ -151,10 +158,12 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
     sight = (at[rows, :3, :3].transpose(1, 2) @ along[..., None])[..., 0]
     mean = lens.project(points)
     aim = aimed(lens, camera, points)
+    farther = depth_offsets(lens, points, axes)
     if model.projection == "ewa":
         jacobian = torch.func.vmap(torch.func.jacrev(lens.project))(aim) if len(aim) else torch.zeros(0, 2, 3, dtype=torch.float64)
         e = jacobian @ axes
         covariance = e @ e.transpose(1, 2)
+        with_depth = (e @ farther[..., None])[..., 0]
     else:
         signs = torch.tensor([1.0, -1.0], dtype=torch.float64)
         offsets = (local.transpose(1, 2)[:, :, None] * signs[:, None]).flatten(1, 2)  # [n, 6, 3], local
@@ -177,11 +186,12 @@ def project(lens: Lens, camera: Camera, model: SplatModel, pose: PoseAt, g: dict
         d = torch.cat([-moved[:, None], d - moved[:, None]], 1)
         weights = torch.tensor([2.0] + [1 / 6] * 6, dtype=torch.float64)
         covariance = torch.einsum("k,nki,nkj->nij", weights, d, d)
+        with_depth = torch.einsum("k,nki,nk->ni", weights[1:], d[:, 1:], ROOT3 * (farther[:, :, None] * signs).flatten(1))
     if isinstance(lens, Equirectangular) and model.response == "conic":  # a ray meets a splat once, on whichever side of the seam
         whole = ((0.5 * camera.width - mean[:, :1]) / lens.period()).detach().round() * lens.period()  # to where the picture is
         mean = mean + torch.cat([whole, torch.zeros_like(whole)], 1)
         other = torch.where(mean[:, :1] < 0.5 * camera.width, lens.period(), -lens.period())
         copies = torch.cat([mean, mean + torch.cat([other, torch.zeros_like(other)], 1)])
-        rows, points, axes, sight, covariance = (torch.cat([t, t]) for t in (rows, points, axes, sight, covariance))
+        rows, points, axes, sight, covariance, with_depth = (torch.cat([t, t]) for t in (rows, points, axes, sight, covariance, with_depth))
         mean = copies
-    return rows, points, axes, sight, mean, covariance
+    return rows, points, axes, sight, mean, covariance, with_depth

@@ -12,7 +12,10 @@ from render.kernels.canonical import CENTRE, GROUP
 from render.kernels.pixel_sight import FRAME_GRADIENTS, Behind, frame_of, from_ridge, pixel_functions, ray_at, warp_of
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
+    G_ALONG,
+    G_AT,
     G_BLUE,
+    G_DOWN,
     G_GREEN,
     G_H,
     G_K,
@@ -21,13 +24,14 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
-    G_Z,
     GRADIENTS,
     OPACITY,
     H,
     K,
     M,
     Wanted,
+    X,
+    Y,
 )
 from render.kernels.warps import SUMS, WARPS, shared_floats, shared_ints, sum_of_warp, vec_record, vec_sums, wait_for_block
 
@@ -70,7 +74,10 @@ def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
         sums[G_GREEN] = b.w * b.g[1]
         sums[G_BLUE] = b.w * b.g[2]
         if wp.static(wanted.depth):
-            sums[G_Z] = b.w * b.g_z
+            g_far = b.w * b.g_z
+            sums[G_AT] = g_far
+            sums[G_ALONG] = g_far * (x - r[X])
+            sums[G_DOWN] = g_far * (y - r[Y])
         if wp.static(ray):
             # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
             u, q = canonical(frames, rays, i, x, y)

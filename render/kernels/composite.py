@@ -19,8 +19,8 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import below, cut, greater, largest, least, lesser, voted
-from render.kernels.rows import ROLLED, corner_of, exp_of, rows_met
-from render.kernels.types import BLUE, GREEN, INSTANCE, MEDIAN, OPACITY, RED, S_MAX, TILE, WHO, K, Wanted, Window, Z, lanes
+from render.kernels.rows import ROLLED, corner_of, depth_along, exp_of, from_corner, rows_met
+from render.kernels.types import BLUE, GREEN, INSTANCE, MEDIAN, OPACITY, RED, S_MAX, TILE, WHO, K, Wanted, Window, lanes
 
 BATCH = wp.constant(24)  # entries between looks for dark lanes: as many as a float's bits
 FAINTEST = wp.constant(1.0e-20)  # times termination, and once more 1 - alpha_max, is a float yet
@@ -36,17 +36,19 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], features: wp.array2d[float], channels: int,
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        features: wp.array2d[float], channels: int,
         window: Window, bands: int, alpha_max: float, termination: float,
-        columns: wp.array[lanes], state: wp.array3d[lanes], held: wp.array[lanes], terms: wp.array[lanes], numbers: wp.array[float],
+        columns: wp.array[lanes], state: wp.array3d[lanes], held: wp.array[lanes], slopes: wp.array[wp.vec3],
+        terms: wp.array[lanes], numbers: wp.array[float],
         planes: wp.array3d[lanes], picks: wp.array3d[lanes], last: wp.array2d[int], dark_at: wp.array2d[lanes],
         first: int,
     ):  # fmt: skip
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
         state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its lead, where in the
         tile's list the lane went dark, its transmittance then, median depth, channels.
-        held `[bands * BATCH]`: the records of the batch's entries; terms `[bands * BATCH * 2]`: their exponents' terms by row, and the same
-        memory as numbers.
+        held, slopes `[bands * BATCH]`: the records of the batch's entries, and their planes from the tile's first pixel on; terms
+        `[bands * BATCH * 2]`: their exponents' terms by row, and the same memory as numbers.
         """
         band = first + wp.tid()
         column = columns[0]
@@ -83,6 +85,8 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
                     ridge, across, met = rows_met(record, x0, y0, column, lanes(bit))
                     meets = meets + met
                     held[band * BATCH + count] = record + lanes(0.0)
+                    if wp.static(wanted.planes):
+                        slopes[band * BATCH + count] = from_corner(tilts[ids[base + count]], record, x0, y0)
                     terms[2 * (band * BATCH + count)] = ridge
                     terms[2 * (band * BATCH + count) + 1] = across
                     bit *= 2.0
@@ -116,15 +120,17 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
                                 red = red + w * record[RED]
                                 green = green + w * record[GREEN]
                                 blue = blue + w * record[BLUE]
+                                if wp.static(wanted.planes):
+                                    far = depth_along(slopes[band * BATCH + n], column, r)
                                 if wp.static(wanted.depth):
-                                    state[band, 4, r] = state[band, 4, r] + w * record[Z]
+                                    state[band, 4, r] = state[band, 4, r] + wp.cw_mul(w, far)
                                     state[band, 5, r] = state[band, 5, r] + w
                                 if wp.static(wanted.channels):
                                     for c in range(channels):
                                         state[band, HELD + c, r] = state[band, HELD + c, r] + w * features[ids[base + n], c]
                                 if wp.static(wanted.median):
                                     here = wp.cw_mul(below(0.5, t - w), lanes(1.0) - below(0.5, t))
-                                    state[band, 10, r] = state[band, 10, r] + here * record[Z]
+                                    state[band, 10, r] = state[band, 10, r] + wp.cw_mul(here, far)
                                 if wp.static(wanted.instance):
                                     who, lead = voted(state[band, 6, r], state[band, 7, r], record[INSTANCE], w)
                                     state[band, 6, r] = who

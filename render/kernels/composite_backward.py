@@ -11,10 +11,13 @@ import warp as wp
 
 from render.kernels.composite import BATCH, HELD, vec_rows
 from render.kernels.lanewise import before, cut, least, total, total_at
-from render.kernels.rows import ROLLED, corner_of, exp_of, rows_met
+from render.kernels.rows import ROLLED, corner_of, depth_along, exp_of, from_corner, rows_met
 from render.kernels.types import (
     BLUE,
+    G_ALONG,
+    G_AT,
     G_BLUE,
+    G_DOWN,
     G_GREEN,
     G_H,
     G_K,
@@ -23,7 +26,6 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
-    G_Z,
     GRADIENTS,
     GREEN,
     OPACITY,
@@ -39,11 +41,10 @@ from render.kernels.types import (
     Window,
     X,
     Y,
-    Z,
     lanes,
 )
 
-SUMS = wp.constant(10)
+SUMS = wp.constant(12)
 """Lane vectors that are added up for an entry."""
 
 
@@ -54,7 +55,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
         features: wp.array2d[float], channels: int, window: Window, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes], terms: wp.array[lanes], numbers: wp.array[float],
         quarters: wp.array[wp.vec4], meets: wp.array[int],
@@ -143,6 +144,8 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     py = (record[Y] - y0) + record[Y_REST]
                     k = record[K]
                     m = record[M]
+                    if wp.static(wanted.depth):
+                        slopes = from_corner(tilts[i], record, x0, y0)
                     s_max = record[S_MAX]
                     opacity = record[OPACITY]
                     red = record[RED]
@@ -152,6 +155,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     sum_g = lanes(0.0)
                     sum_b = lanes(0.0)
                     sum_z = lanes(0.0)
+                    sum_zy = lanes(0.0)
                     sum_e = lanes(0.0)  # of dL/da e = -dL/ds / opacity
                     sum_ey = lanes(0.0)
                     sum_eyy = lanes(0.0)
@@ -180,8 +184,10 @@ def composite_gradient(wanted: Wanted, squarings: int):
                                 sums[band, c] = sums[band, c] + wp.cw_mul(w, gc)
                         if wp.static(wanted.depth):
                             gz = state[band, 5, r]
-                            d = d + gz * record[Z] + state[band, 6, r]
-                            sum_z = sum_z + wp.cw_mul(w, gz)
+                            d = d + wp.cw_mul(gz, depth_along(slopes, column, r)) + state[band, 6, r]
+                            gz = wp.cw_mul(w, gz)
+                            sum_z = sum_z + gz
+                            sum_zy = sum_zy + gz * (float(r) - middle)
                         rest = state[band, 1, r]
                         de = wp.cw_mul(cut(full, alpha_max, wp.cw_mul(t, d) - wp.cw_mul(rest, inverse)), e)
                         y = float(r) - middle
@@ -206,6 +212,8 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     terms[sums_at + 7] = sum_g
                     terms[sums_at + 8] = sum_b
                     terms[sums_at + 9] = sum_z
+                    terms[sums_at + 10] = wp.cw_mul(column - lanes(record[X] - x0), sum_z)
+                    terms[sums_at + 11] = sum_zy
                     e0 = total_at(quarters, sums_at)
                     ey = total_at(quarters, sums_at + 1)
                     eyy = total_at(quarters, sums_at + 2)
@@ -231,7 +239,10 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     slots[slot, G_RED] = total_at(quarters, sums_at + 6)
                     slots[slot, G_GREEN] = total_at(quarters, sums_at + 7)
                     slots[slot, G_BLUE] = total_at(quarters, sums_at + 8)
-                    slots[slot, G_Z] = total_at(quarters, sums_at + 9)
+                    gz_all = total_at(quarters, sums_at + 9)
+                    slots[slot, G_AT] = gz_all
+                    slots[slot, G_ALONG] = total_at(quarters, sums_at + 10)
+                    slots[slot, G_DOWN] = total_at(quarters, sums_at + 11) + (middle - (record[Y] - y0)) * gz_all
                 top -= count
 
     return composite_backward

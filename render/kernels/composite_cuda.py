@@ -49,7 +49,8 @@ def composite_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float], frames: wp.array2d[wp.float64],
-        rays: wp.array4d[wp.float64], features: wp.array2d[float], channels: int, window: Window, alpha_max: float, termination: float,
+        rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        window: Window, alpha_max: float, termination: float,
         planes: wp.array3d[float], picks: wp.array3d[float], last: wp.array2d[int],
     ):  # fmt: skip
         """frames and rays are not read where the response is "conic"; last: one past each pixel's last entry."""
@@ -69,7 +70,7 @@ def composite_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
                     r = record_of(records, i)
                     e = faded(r, frames, rays, i, x, y)
                     if e > 0.0:
-                        p = lay(p, r, i, wp.min(r[OPACITY] * e, alpha_max), features, channels, planes, px, py)
+                        p = lay(p, r, i, wp.min(r[OPACITY] * e, alpha_max), tilts, features, channels, planes, px, py, x, y)
                         end = first + entry + 1
             first += wp.static(lanes)
         write(p, planes, picks, px, py)
@@ -91,8 +92,9 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], features: wp.array2d[float], channels: int, window: Window,
-        alpha_max: float, planes: wp.array3d[float], grads: wp.array3d[float], last: wp.array2d[int],
+        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3],
+        features: wp.array2d[float], channels: int, window: Window, alpha_max: float,
+        planes: wp.array3d[float], grads: wp.array3d[float], last: wp.array2d[int],
         slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array4d[wp.float64],
     ):  # fmt: skip
         """frame_slots and g_rays `[G, C, H, W]` of the image, zeroed before, are not written where the response is "conic"."""
@@ -122,7 +124,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
                     b.w = 0.0
                     b.de = 0.0
                     if e > 0.0:
-                        b = take_off(b, r, i, e, alpha_max, features, channels, grads, px, py)
+                        b = take_off(b, r, i, e, alpha_max, tilts, features, channels, grads, px, py, x, y)
                     seen = seen | bit
                     lay_down(entry, i, r, thread, x, y, b, frames, rays, g_rays)
                     if wp.static(wanted.channels):

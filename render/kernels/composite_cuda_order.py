@@ -102,7 +102,8 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def order_blocks_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float], frames: wp.array2d[wp.float64],
-        rays: wp.array4d[wp.float64], features: wp.array2d[float], channels: int, window: Window, alpha_max: float, termination: float,
+        rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        window: Window, alpha_max: float, termination: float,
         planes: wp.array3d[float], picks: wp.array3d[float], settled: wp.array[int], last: wp.array2d[wp.int64],
     ):  # fmt: skip
         """settled: 1 for tiles whose list's order is every pixel's; last: the key of each pixel's last entry."""
@@ -122,7 +123,7 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
                     break
                 i = ids[start + entry_of(keys[m])]
                 r = record_of(records, i)
-                p = lay(p, r, i, wp.min(r[OPACITY] * fades[m], alpha_max), features, channels, planes, px, py)
+                p = lay(p, r, i, wp.min(r[OPACITY] * fades[m], alpha_max), tilts, features, channels, planes, px, py, x, y)
                 drawn = keys[m]
             if settled[tile] == 0:
                 k = int(0)
@@ -145,8 +146,9 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def order_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], features: wp.array2d[float], channels: int, window: Window,
-        alpha_max: float, planes: wp.array3d[float], grads: wp.array3d[float], settled: wp.array[int], last: wp.array2d[wp.int64],
+        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3],
+        features: wp.array2d[float], channels: int, window: Window, alpha_max: float,
+        planes: wp.array3d[float], grads: wp.array3d[float], settled: wp.array[int], last: wp.array2d[wp.int64],
         blocks: int, pushes: wp.array3d[wp.vec2],
         slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array4d[wp.float64],
     ):  # fmt: skip
@@ -171,7 +173,7 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
                     for m in range(held):
                         n = entry_of(-keys[m])
                         i = ids[start + n]
-                        b = take_off(b, record_of(records, i), i, fades[m], alpha_max, features, channels, grads, px, py)
+                        b = take_off(b, record_of(records, i), i, fades[m], alpha_max, tilts, features, channels, grads, px, py, x, y)
                         if n >= first and n < first + segment:
                             pushes[block, n - first, thread] = wp.vec2(b.w, b.de)
                         beyond = keys[m]

@@ -27,10 +27,13 @@ from render.kernels.ray_rows import (
     reach_of,
     square,
 )
-from render.kernels.rows import ROLLED, corner_of
+from render.kernels.rows import ROLLED, corner_of, depth_along, from_corner
 from render.kernels.types import (
     BLUE,
+    G_ALONG,
+    G_AT,
     G_BLUE,
+    G_DOWN,
     G_GREEN,
     G_H,
     G_K,
@@ -39,7 +42,6 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
-    G_Z,
     GRADIENTS,
     GREEN,
     INSTANCE,
@@ -57,7 +59,6 @@ from render.kernels.types import (
     Window,
     X,
     Y,
-    Z,
     lanes,
 )
 
@@ -88,7 +89,8 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], frames: wp.array2d[wp.float64],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        frames: wp.array2d[wp.float64],
         features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
         window: Window, bands: int, alpha_max: float, termination: float, entries: int,
         columns: wp.array[lanes], lists: wp.array3d[lanes], scattered: wp.array4d[float], keys: wp.array[lanes64],
@@ -157,15 +159,17 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
                         red = red + w * record[RED]
                         green = green + w * record[GREEN]
                         blue = blue + w * record[BLUE]
+                        if wp.static(wanted.planes):
+                            far = depth_along(from_corner(tilts[i], record, x0, y0), column, r)
                         if wp.static(wanted.depth):
-                            z = z + w * record[Z]
+                            z = z + wp.cw_mul(w, far)
                             weights = weights + w
                         if wp.static(wanted.channels):
                             for c in range(channels):
                                 p = wp.static(wanted.first_channel) + c
                                 planes[p, row, tx] = planes[p, row, tx] + w * features[i, c]
                         if wp.static(wanted.median):
-                            median = median + lists[band, PICKED, m] * record[Z]
+                            median = median + wp.cw_mul(lists[band, PICKED, m], far)
                         if wp.static(wanted.instance):
                             who, lead = voted(who, lead, record[INSTANCE], w)
                     planes[0, row, tx] = t
@@ -191,7 +195,8 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], frames: wp.array2d[wp.float64],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        frames: wp.array2d[wp.float64],
         features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
         window: Window, bands: int, alpha_max: float, termination: float, entries: int,
         columns: wp.array[lanes], lists: wp.array3d[lanes], scattered: wp.array4d[float], keys: wp.array[lanes64],
@@ -236,7 +241,8 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         record = records[i]
                         shade = gr * record[RED] + gg * record[GREEN] + gb * record[BLUE]
                         if wp.static(wanted.depth):
-                            shade = shade + grads[4, row, tx] * record[Z] + grads[5, row, tx]
+                            far = depth_along(from_corner(tilts[i], record, x0, y0), column, r)
+                            shade = shade + wp.cw_mul(grads[4, row, tx], far) + grads[5, row, tx]
                         if wp.static(wanted.channels):
                             for c in range(channels):
                                 shade = shade + grads[wp.static(wanted.first_channel) + c, row, tx] * features[i, c]
@@ -292,7 +298,12 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         sums[band, j, G_GREEN] = sums[band, j, G_GREEN] + wp.float64(wp.dot(w, gg))
                         sums[band, j, G_BLUE] = sums[band, j, G_BLUE] + wp.float64(wp.dot(w, gb))
                         if wp.static(wanted.depth):
-                            sums[band, j, G_Z] = sums[band, j, G_Z] + wp.float64(wp.dot(w, grads[4, row, tx]))
+                            gz = wp.cw_mul(w, grads[4, row, tx])
+                            at = wp.float64(wp.dot(gz, one))
+                            sums[band, j, G_AT] = sums[band, j, G_AT] + at
+                            beside = column - lanes(record[X] - x0)
+                            sums[band, j, G_ALONG] = sums[band, j, G_ALONG] + wp.float64(wp.dot(gz, beside))
+                            sums[band, j, G_DOWN] = sums[band, j, G_DOWN] + wp.float64(y - record[Y]) * at
                         if wp.static(wanted.channels):
                             for c in range(channels):
                                 g_c = grads[wp.static(wanted.first_channel) + c, row, tx]

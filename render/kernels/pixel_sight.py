@@ -12,7 +12,10 @@ import warp as wp
 from render.kernels.canonical import GROUP, MOVED
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
+    ALONG,
+    AT,
     BLUE,
+    DOWN,
     GREEN,
     INSTANCE,
     MEDIAN,
@@ -29,7 +32,6 @@ from render.kernels.types import (
     Window,
     X,
     Y,
-    Z,
 )
 from render.kernels.warps import LANES, vec_record
 
@@ -69,6 +71,12 @@ def from_ridge(r: vec_record, x: float, y: float):
     """dx - M dy and dy of the pixel centre x, y."""
     dy = (y - r[Y]) - r[Y_REST]
     return (x - r[X]) - r[X_REST] - r[M] * dy, dy
+
+
+@wp.func
+def depth_at(tilt: wp.vec3, r: vec_record, x: float, y: float):
+    """What depth a splat's plane has at the pixel centre x, y."""
+    return tilt[AT] + tilt[ALONG] * (x - r[X]) + tilt[DOWN] * (y - r[Y])
 
 
 @cache
@@ -189,13 +197,15 @@ def pixel_layers(wanted: Wanted):
 
     @wp.func
     def lay(
-        p: Pixel, r: vec_record, i: int, a: float, features: wp.array2d[float], channels: int,
-        planes: wp.array3d[float], px: int, py: int,
+        p: Pixel, r: vec_record, i: int, a: float, tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        planes: wp.array3d[float], px: int, py: int, x: float, y: float,
     ):  # fmt: skip
         w = p.t * a
+        if wp.static(wanted.planes):
+            far = depth_at(tilts[i], r, x, y)
         p.colour += w * wp.vec3(r[RED], r[GREEN], r[BLUE])
         if wp.static(wanted.depth):
-            p.z += w * r[Z]
+            p.z += w * far
             p.weights += w
         if wp.static(wanted.channels):
             for c in range(channels):
@@ -203,7 +213,7 @@ def pixel_layers(wanted: Wanted):
                 planes[k, py, px] = planes[k, py, px] + w * features[i, c]
         if wp.static(wanted.median):  # noqa: SIM102 - a static branch and a dynamic one
             if p.t >= 0.5 and p.t - w < 0.5:
-                p.median = r[Z]
+                p.median = far
         if wp.static(wanted.instance):
             p.lead += wp.where(p.who == r[INSTANCE], w, -w)
             if p.lead < 0.0:
@@ -260,8 +270,8 @@ def pixel_unlayering(wanted: Wanted):
 
     @wp.func
     def take_off(
-        b: Behind, r: vec_record, i: int, e: float, alpha_max: float, features: wp.array2d[float], channels: int,
-        grads: wp.array3d[float], px: int, py: int,
+        b: Behind, r: vec_record, i: int, e: float, alpha_max: float, tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        grads: wp.array3d[float], px: int, py: int, x: float, y: float,
     ):  # fmt: skip
         """e: its exp(-s). With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j: dL/da_i = T_i d_i - rest_i / (1 - a_i)."""
         full = r[OPACITY] * e
@@ -274,7 +284,7 @@ def pixel_unlayering(wanted: Wanted):
             for c in range(channels):
                 d += grads[wp.static(wanted.first_channel) + c, py, px] * features[i, c]
         if wp.static(wanted.depth):
-            d += b.g_z * r[Z] + b.g_weights
+            d += b.g_z * depth_at(tilts[i], r, x, y) + b.g_weights
         b.de = wp.where(full < alpha_max, (b.t * d - b.rest * inverse) * e, 0.0)
         b.rest += b.w * d
         return b

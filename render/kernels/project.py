@@ -20,7 +20,7 @@ from render.kernels.moments import (
 )
 from render.kernels.ray_bound import pinhole_bound
 from render.kernels.sigma import least_depth_gradient
-from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, write_splat
+from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, tilt_of, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, HALF, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
@@ -51,6 +51,9 @@ def ellipse(t: wp.vec3d, f: Footprint, view: View):
     e.xy = f.xy
     e.yy = f.yy
     e.det0 = f.det0
+    e.xz = f.xz
+    e.yz = f.yz
+    e.zz = f.zz
     return e
 
 
@@ -59,10 +62,10 @@ def project(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
     view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
+    records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """Records, depth keys and tiles at most of a group's splats; `threads` threads share an item."""
+    """Records, planes where they are wanted, depth keys and tiles at most of a group's splats; `threads` threads share an item."""
     part = first + wp.tid()
     item = part // threads
     pose = pose_of(poses, items[item, DRAW])
@@ -79,9 +82,11 @@ def project(
             if in_view(t, wp.mat33(axes), scale, view):
                 e = ellipse(exact, footprint(exact, axes, wp.vec3d(scale), view), view)
                 shows = fade(e, opacity, view)
+                tilt = tilt_of(e, exact[2], view)
                 if view.along_rays != 0 and shows[1] > 0.0:
                     e = pinhole_bound(exact, axes * wp.diag(wp.vec3d(scale)), shows[1], view)
-                write_splat(e, shows, t[2], pose.instance, sh, i, means[i] - pose.eye, view, records, reach, depth_keys, counts, j)
+                sight = means[i] - pose.eye
+                write_splat(e, shows, t[2], tilt, pose.instance, sh, i, sight, view, records, tilts, reach, depth_keys, counts, j)
 
 
 @wp.func
@@ -95,7 +100,7 @@ def project_backward(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
     view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-    counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
+    records: wp.array2d[float], counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
     g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
     g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3], g_uniform: wp.array2d[float],
     first: int,
@@ -116,7 +121,7 @@ def project_backward(
             r_splat = rotation(quats[i])
             scale = wp.vec3d(exp_scale(log_scales[i]))
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            g = gather(ellipse(t, f, view), logit_opacities[i], view, slots, starts[j], counts[j])
+            g = gather(ellipse(t, f, view), z, logit_opacities[i], view, records, j, slots, starts[j], counts[j])
             g_logit_opacities[i] = g.logit
 
             uv = cross2(f.u.e, f.v.e)
@@ -146,9 +151,10 @@ def project_backward(
             rise = wp.vec2d()
             if f.least > HALF:
                 rise = least_depth_gradient(f.n, view)
-            a_u = axis_backward(f.u, g_eu, g_wu, wp.dot(g_mu, f.u.e), f.n, z, f.least, rise, view)
-            a_v = axis_backward(f.v, g_ev, g_wv, wp.dot(g_mu, f.v.e), f.n, z, f.least, rise, view)
-            a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), f.n, z, f.least, rise, view)
+            by_depth = wp.vec3d(g.xz, g.yz, g.zz)
+            a_u = axis_backward(f.u, g_eu, g_wu, wp.dot(g_mu, f.u.e), by_depth, f.n, z, f.least, rise, view)
+            a_v = axis_backward(f.v, g_ev, g_wv, wp.dot(g_mu, f.v.e), by_depth, f.n, z, f.least, rise, view)
+            a_w = axis_backward(f.w, g_ew, g_ww, wp.dot(g_mu, f.w.e), by_depth, f.n, z, f.least, rise, view)
 
             # the centre: pixel = f n + c + mu, with n not clamped; the Jacobian's n is clamped under EWA
             nx = f.along[0]

@@ -14,9 +14,9 @@ from render.kernels.lenses.optics import PARAMS, Optics, params
 from render.kernels.motion import POWERS, motion_of, rotation_at, rotation_rate, translation_rate
 from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
-from render.kernels.sight import column, perspective, sight_functions
+from render.kernels.sight import AXIS, ROOT_HALF, column, perspective, sight_functions
 from render.kernels.sigma import ROOT6, covariance_backward, least_depth_gradient, reach, reach_backward
-from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
+from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, tilt_of, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, ROOT3, View
 
 ROLLED = OPTIONS | {"max_unroll": 0}
@@ -25,8 +25,6 @@ POSE = 12
 
 TURN = wp.constant(wp.float64(6.283185307179586))
 STEP = wp.constant(wp.float64(1.0e-5))
-AXIS = wp.constant(wp.vec3d(0.0, 0.0, 1.0))
-"""The way that all rays go of a lens without an eye."""
 
 
 class LensKernels(NamedTuple):
@@ -68,7 +66,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
     """The kernels of a lens under a global or a moving shutter."""
     pixel, jacobian, params_gradient, depth = lens
     planar, around, parallel = depth == PLANAR, depth == ROUND, depth == PARALLEL
-    readout, placed, pixel_backward, nearest, sighted, least_of, spread, turns, ellipse = sight_functions(lens, rolling)
+    readout, placed, pixel_backward, nearest, outwards, sighted, least_of, spread, turns, ellipse = sight_functions(lens, rolling)
     bound = lens_bound(lens, rolling)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
@@ -76,7 +74,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
         means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
         logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
         view: View, optics: Optics, motions: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-        records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
+        records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
         first: int,
     ):  # fmt: skip
         """As `project`."""
@@ -98,6 +96,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if ahead:
                     e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view))
                     shows = fade(e, opacity, view)
+                    tilt = tilt_of(e, c.depth, view)
                     if view.along_rays != 0 and shows[1] > 0.0:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
                         if motion.copy != 0 and e.seen == ANYWHERE:
@@ -106,14 +105,15 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                     if wp.static(parallel):
                         along = AXIS
                     sight = wp.vec3(wp.transpose(c.rotation) * along)
-                    write_splat(e, shows, float(c.depth), motion.instance, sh, i, sight, view, records, reach, depth_keys, counts, j)
+                    depth = float(c.depth)
+                    write_splat(e, shows, depth, tilt, motion.instance, sh, i, sight, view, records, tilts, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens_backward(
         means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
         logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
         view: View, optics: Optics, motions: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-        counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
+        records: wp.array2d[float], counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
         g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
         g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3], g_uniform: wp.array2d[float],
         first: int,
@@ -148,10 +148,26 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 axes = scaled_axes(quats[i], log_scales[i])
                 q = spread(optics, motion, x, axes, c, view)
                 e = ellipse(optics, motion, q)
-                g = gather(e, logit_opacities[i], view, slots, starts[j], counts[j])
+                g = gather(e, c.depth, logit_opacities[i], view, records, j, slots, starts[j], counts[j])
                 g_logit_opacities[i] = g.logit
                 g_mean_px = wp.vec2d(g.x, g.y)
                 g_v = covariance_backward(q.v, g.xx, g.xy, g.yy, g.det0)
+                g_farther = wp.float64(2.0) * g.zz * q.farther
+                for k in range(3):
+                    across = wp.vec2d(q.v[k, 0], q.v[k, 1])
+                    if view.unscented != 0:
+                        across = ROOT_HALF * wp.vec2d(q.v[2 * k, 0] - q.v[2 * k + 1, 0], q.v[2 * k, 1] - q.v[2 * k + 1, 1])
+                    g_farther[k] = g_farther[k] + g.xz * across[0] + g.yz * across[1]
+                    pushed = q.farther[k] * wp.vec2d(g.xz, g.yz)
+                    if view.unscented == 0:
+                        g_v[k, 0] = g_v[k, 0] + pushed[0]
+                        g_v[k, 1] = g_v[k, 1] + pushed[1]
+                    else:
+                        pushed = ROOT_HALF * pushed
+                        g_v[2 * k, 0] = g_v[2 * k, 0] + pushed[0]
+                        g_v[2 * k, 1] = g_v[2 * k, 1] + pushed[1]
+                        g_v[2 * k + 1, 0] = g_v[2 * k + 1, 0] - pushed[0]
+                        g_v[2 * k + 1, 1] = g_v[2 * k + 1, 1] - pushed[1]
                 shift = c.aim - c.t
 
                 g_x = wp.vec3d()
@@ -160,6 +176,10 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 g_aim = wp.vec3d()  # explicit
                 g_shift = wp.vec3d()
                 g_turns = turns(optics, motion, q.centre[0] + q.v[6, 0]) * g_mean_px[0]
+                out = outwards(c.t)
+                g_ahead = axes * g_farther
+                g_rotation += wp.outer(out, g_ahead)
+                g_axes += wp.outer(wp.transpose(c.rotation) * out, g_farther)
                 if view.unscented == 0:
                     jac = jacobian(optics, c.aim)
                     for k in range(3):
@@ -256,7 +276,8 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if wp.static(planar):
                     g_t = pulled_backward(c.t, c.aim, g_aim) - g_shift
                 if wp.static(around):
-                    g_t += (g.depth / c.depth) * c.t
+                    g_out = c.rotation * g_ahead
+                    g_t += g.depth * out + (g_out - wp.dot(out, g_out) * out) / c.depth
                 else:
                     g_t += wp.vec3d(none, none, g.depth)
                 along = wp.vec3d(c.t)

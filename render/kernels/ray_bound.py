@@ -108,7 +108,7 @@ def beside(y: wp.vec3d, view: View):
 def lens_bound(lens: LensFunctions, rolling: bool):
     """The function that bounds a splat for a lens under a global or a moving shutter."""
     pixel, _, _, depth = lens
-    readout, placed, _, nearest, _, _, _, turns, _ = sight_functions(lens, rolling)
+    readout, placed, _, nearest, _, _, _, _, turns, _ = sight_functions(lens, rolling)
     room = ROOM_MOVING if rolling else ROOM_STILL
 
     @wp.func

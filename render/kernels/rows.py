@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import cut, greater, greatest, lesser
-from render.kernels.types import OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, Window, X, Y, lanes
+from render.kernels.types import ALONG, AT, DOWN, OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, Window, X, Y, lanes
 
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
@@ -49,6 +49,18 @@ def corner_of(window: Window, tile: int):
     tx = tile % window.tiles_x
     ty = tile // window.tiles_x
     return tx, ty * TILE, float((window.left + tx) * TILE) + 0.5, float((window.top + ty) * TILE) + 0.5
+
+
+@wp.func
+def from_corner(tilt: wp.vec3, record: lanes, x0: float, y0: float):
+    """A splat's plane from the tile's first pixel centre x0, y0 on: its depth there instead of at (X, Y)."""
+    return wp.vec3(tilt[AT] + tilt[ALONG] * (x0 - record[X]) + tilt[DOWN] * (y0 - record[Y]), tilt[ALONG], tilt[DOWN])
+
+
+@wp.func
+def depth_along(slopes: wp.vec3, column: lanes, row: int):
+    """The plane's depth at a row's pixels; slopes: as of `from_corner`."""
+    return lanes(slopes[AT] + float(row) * slopes[DOWN]) + column * slopes[ALONG]
 
 
 @wp.func

@@ -28,6 +28,9 @@ STILL = wp.constant(wp.float64(1.0e-7))
 STEPS = wp.constant(50)
 SETTLED = wp.constant(wp.float64(1.0e-13))
 ENDS = wp.constant(wp.float64(1.0e-9))
+ROOT_HALF = wp.constant(wp.float64(0.5**0.5))
+AXIS = wp.constant(wp.vec3d(0.0, 0.0, 1.0))
+"""The way that depth grows, but of lenses that see all around; and that all rays go of a lens without an eye."""
 
 
 class SightFunctions(NamedTuple):
@@ -37,6 +40,7 @@ class SightFunctions(NamedTuple):
     placed: wp.Function
     pixel_backward: wp.Function
     nearest: wp.Function
+    outwards: wp.Function
     sighted: wp.Function
     least_of: wp.Function
     spread: wp.Function
@@ -58,11 +62,14 @@ class Sight:
 
 @wp.struct
 class Pixels:
-    """Where the centre and what it is aimed at fall, and the covariance as seven vectors, the last being the mean's shift."""
+    """Where the centre and what it is aimed at fall, the covariance as seven vectors, the last being the mean's shift, by how much farther
+    the axes' ends are, and the covariance with that."""
 
     centre: wp.vec2d
     aimed: wp.vec2d
     v: mat72d
+    farther: wp.vec3d
+    with_depth: wp.vec2d
 
 
 @wp.func
@@ -151,6 +158,13 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         return y[2]
 
     @wp.func
+    def outwards(t: wp.vec3d):
+        """What a point's depth grows by, as it moves in the camera."""
+        if wp.static(around):
+            return wp.normalize(t)
+        return AXIS
+
+    @wp.func
     def sighted(o: Optics, m: Motion, x: wp.vec3d, view: View):
         c = Sight()
         c.s = readout(o, m, x, wp.vec3d())
@@ -187,12 +201,14 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         out = Pixels()
         out.centre = pixel(o, c.t)
         shift = c.aim - c.t
+        out.farther = wp.transpose(axes) * (wp.transpose(c.rotation) * outwards(c.t))
         if view.unscented == 0:
             j = jacobian(o, c.aim)
             for k in range(3):
                 e = j * (c.rotation * column(axes, k))
                 out.v[k, 0] = e[0]
                 out.v[k, 1] = e[1]
+                out.with_depth += out.farther[k] * e
         else:
             least = least_of(c, view)
             s = readout(o, m, x, shift)
@@ -212,6 +228,10 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
                 out.v[i, 1] = dy / ROOT6
                 out.v[6, 0] = out.v[6, 0] + dx / wp.float64(6.0)
                 out.v[6, 1] = out.v[6, 1] + dy / wp.float64(6.0)
+                sign = ROOT_HALF
+                if i % 2 == 1:
+                    sign = -sign
+                out.with_depth += sign * out.farther[i // 2] * wp.vec2d(out.v[i, 0], out.v[i, 1])
         return out
 
     @wp.func
@@ -241,6 +261,9 @@ def sight_functions(lens: LensFunctions, rolling: bool) -> SightFunctions:
         e.xy = xy
         e.yy = yy
         e.det0 = determinant(q.v)
+        e.xz = q.with_depth[0]
+        e.yz = q.with_depth[1]
+        e.zz = wp.dot(q.farther, q.farther)
         return e
 
-    return SightFunctions(readout, placed, pixel_backward, nearest, sighted, least_of, spread, turns, ellipse)
+    return SightFunctions(readout, placed, pixel_backward, nearest, outwards, sighted, least_of, spread, turns, ellipse)

@@ -11,7 +11,10 @@ from render.kernels.harmonics import harmonics, harmonics_backward
 from render.kernels.types import (
     BLUE,
     CULLED,
+    G_ALONG,
+    G_AT,
     G_BLUE,
+    G_DOWN,
     G_GREEN,
     G_H,
     G_K,
@@ -20,13 +23,14 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
-    G_Z,
     GRADIENTS,
     GREEN,
     HALF,
     INSTANCE,
     LEAST,
+    ONE,
     OPACITY,
+    REACH,
     RED,
     S_MAX,
     SLACK,
@@ -45,6 +49,7 @@ from render.kernels.types import (
 )
 
 LARGEST = wp.constant(wp.float64(1.0e16))  # px^2, of a variance: beyond it floats lose the rest
+STEEPEST = wp.constant(wp.float64(2.0 * REACH))
 
 vec_gradients = wp.types.vector(length=GRADIENTS, dtype=wp.float64)
 
@@ -59,7 +64,20 @@ class Ellipse:
     xy: wp.float64
     yy: wp.float64
     det0: wp.float64
+    xz: wp.float64  # with depth, whose variance is zz
+    yz: wp.float64
+    zz: wp.float64
     seen: float  # along rays, how far from x, in pixels
+
+
+@wp.struct
+class Tilt:
+    """A splat's mean on the image, and what its depth grows by from there, a pixel."""
+
+    x: wp.float64
+    y: wp.float64
+    along: wp.float64
+    down: wp.float64
 
 
 @wp.struct
@@ -72,6 +90,9 @@ class EllipseGradient:
     xy: wp.float64
     yy: wp.float64
     det0: wp.float64
+    xz: wp.float64
+    yz: wp.float64
+    zz: wp.float64
     depth: wp.float64
     logit: float
     rgb: wp.vec3
@@ -103,11 +124,39 @@ def fade(e: Ellipse, opacity: float, view: View):
 
 
 @wp.func
+def regressed(e: Ellipse, view: View):
+    """What depth grows by, a pixel: its regression on where the splat, dilated, is seen."""
+    wide = dilated(e, view)
+    return wp.vec2d((wide[1] * e.xz - e.xy * e.yz) / wide[2], (wide[0] * e.yz - e.xy * e.xz) / wide[2])
+
+
+@wp.func
+def calmed(e: Ellipse, depth: wp.float64):
+    """Of that what is kept, so that a splat is nowhere nearer than half its depth: to first order it would reach behind the eye."""
+    room = depth / STEEPEST
+    if e.zz > room * room:
+        return room / wp.sqrt(e.zz)
+    return ONE
+
+
+@wp.func
+def tilt_of(e: Ellipse, depth: wp.float64, view: View):
+    slopes = calmed(e, depth) * regressed(e, view)
+    tilt = Tilt()
+    tilt.x = e.x
+    tilt.y = e.y
+    tilt.along = slopes[0]
+    tilt.down = slopes[1]
+    return tilt
+
+
+@wp.func
 def write_splat(
-    e: Ellipse, shows: wp.vec2, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
-    records: wp.array2d[float], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
+    e: Ellipse, shows: wp.vec2, depth: float, tilt: Tilt, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
+    records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
 ):  # fmt: skip
-    """Record j, its reach, its depth key (the bits of a positive float sort as an int) and tiles at most; left culled where nothing shows.
+    """Record j, its plane where planes are wanted, its reach, its depth key (the bits of a positive float sort as an int) and tiles at
+    most; left culled where nothing shows.
 
     shows: as of `fade`. sight: the way it is seen, from the eye to the splat, in its local frame, of any length.
     """
@@ -134,6 +183,9 @@ def write_splat(
         records[j, OPACITY] = shows[0]
         records[j, S_MAX] = s_max
         records[j, Z] = depth
+        if tilts.shape[0] > 0:
+            at = wp.float64(depth) + tilt.along * (wp.float64(x) - tilt.x) + tilt.down * (wp.float64(y) - tilt.y)
+            tilts[j] = wp.vec3(wp.vec3d(at, tilt.along, tilt.down))
         records[j, INSTANCE] = instance
         records[j, Y_EXT] = y_ext
         records[j, Y_AT_EXT] = float(e.xy / xx) * x_ext
@@ -161,8 +213,11 @@ def cull(depth_keys: wp.array[int], counts: wp.array[int], j: int):
 
 
 @wp.func
-def gather(e: Ellipse, logit: float, view: View, slots: wp.array2d[float], start: int, count: int):
-    """Sum a splat's slots in fixed order and carry them from its record to its ellipse; logit is its opacity's."""
+def gather(
+    e: Ellipse, depth: wp.float64, logit: float, view: View, records: wp.array2d[float], j: int, slots: wp.array2d[float], start: int,
+    count: int,
+):  # fmt: skip
+    """Sum a splat's slots in fixed order and carry them from its record j to its ellipse; logit is its opacity's."""
     o = sigmoid(logit)
     g = vec_gradients()
     for slot in range(start, start + count):
@@ -197,9 +252,23 @@ def gather(e: Ellipse, logit: float, view: View, slots: wp.array2d[float], start
     out.logit = float(g_o) * o * sigmoid(-logit)  # 1 - o, which loses its digits where o is nearly 1
     out.xx = g_trace * dilation + by_rest
     out.yy = (HALF * g[G_K] * k - g[G_M] * m - g[G_H] * h) / yy + g_trace * dilation + by_rest
-    out.x = g[G_X]
-    out.y = g[G_Y]
-    out.depth = g[G_Z]
+    # depth at a pixel is that of the mean, and slopes times the way from there
+    slopes = regressed(e, view)
+    kept = calmed(e, depth)
+    g_along = g[G_ALONG] + (wp.float64(records[j, X]) - e.x) * g[G_AT]
+    g_down = g[G_DOWN] + (wp.float64(records[j, Y]) - e.y) * g[G_AT]
+    g_kept = g_along * slopes[0] + g_down * slopes[1]
+    out.x = g[G_X] - kept * slopes[0] * g[G_AT]
+    out.y = g[G_Y] - kept * slopes[1] * g[G_AT]
+    out.depth = g[G_AT]
+    if kept < ONE:
+        out.depth += g_kept * kept / depth
+        out.zz = -HALF * g_kept * kept / e.zz
+    out.xz = kept * (yy * g_along - e.xy * g_down) / det
+    out.yz = kept * (wide[0] * g_down - e.xy * g_along) / det
+    out.xx -= out.xz * slopes[0]
+    out.xy -= out.xz * slopes[1] + out.yz * slopes[0]
+    out.yy -= out.yz * slopes[1]
     out.rgb = wp.vec3(wp.vec3d(g[G_RED], g[G_GREEN], g[G_BLUE]))
     return out
 

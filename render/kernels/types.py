@@ -22,9 +22,13 @@ bounds a splat, and X_REST is how far from X it may be seen: half a turn, of a l
 X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, Y_AT_EXT, X_REST, Y_REST = (wp.constant(i) for i in range(RECORD))
 # Y_EXT: the ellipse's reach in y; Y_AT_EXT: dy of its rightmost point
 
-GRADIENTS = 10
-"""Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z)."""
-G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z = (wp.constant(i) for i in range(GRADIENTS))
+AT, ALONG, DOWN = (wp.constant(i) for i in range(3))
+"""A projected splat's plane, beside its record: its depth at (X, Y), and what that grows by from pixel to pixel. It is where a ray meets
+the splat, to first order (Zhang et al. 2024, "RaDe-GS"): the mean of depth that the projected 3D Gaussian has at the pixel."""
+
+GRADIENTS = 12
+"""Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE), then of the plane's three."""
+G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_AT, G_ALONG, G_DOWN = (wp.constant(i) for i in range(GRADIENTS))
 
 
 class Wanted(NamedTuple):
@@ -41,6 +45,10 @@ class Wanted(NamedTuple):
     @property
     def first_channel(self) -> int:
         return 6 if self.depth else 4
+
+    @property
+    def planes(self) -> bool:
+        return self.depth or self.median
 
     @property
     def picks(self) -> bool:

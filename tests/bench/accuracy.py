@@ -116,7 +116,8 @@ def _or_none(work, like: torch.Tensor):
 
 
 def monte_carlo(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, width: int, height: int, samples: int = 4000):
-    """Pixel means and covariances of samples of each Gaussian, those behind the camera left out: what UT and EWA approximate.
+    """Pixel means and covariances, also with depth, of samples of each Gaussian, those behind the camera left out: what UT and EWA
+    approximate.
 
     The moments of a perspective Gaussian diverge near the camera plane, so this is a comparison and not the truth.
     """
@@ -124,7 +125,7 @@ def monte_carlo(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, wi
     fx, fy, cx, cy = lens
     normal = torch.randn(samples // 2, 3, generator=dice, dtype=torch.float64)
     normal = torch.cat([normal, -normal])
-    means, covariances = [], []
+    means, covariances, with_depth = [], [], []
     for point, axis in zip(points.split(2000), axes.split(2000), strict=True):
         there = point[:, None] + torch.einsum("nij,sj->nsi", axis, normal)
         z = torch.where(there[..., 2] > 0.1 * point[:, None, 2], there[..., 2], torch.nan)
@@ -134,7 +135,8 @@ def monte_carlo(points: torch.Tensor, axes: torch.Tensor, lens: torch.Tensor, wi
         seen = z.isfinite().sum(1)
         means.append(mean)
         covariances.append(torch.einsum("nsi,nsj->nij", d, d) / seen[:, None, None])
-    return torch.cat(means), torch.cat(covariances)
+        with_depth.append(torch.einsum("nsi,ns->ni", d, z.nan_to_num(0.0)) / seen[:, None])
+    return torch.cat(means), torch.cat(covariances), torch.cat(with_depth)
 
 
 def ut_in_pixels(count: int = 20_000) -> dict[str, float]:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from enhance.clip import enhance_frames
 from enhance.enhancer import Enhancer
 from enhance.metrics import sharpness
 from recon import open_log
@@ -38,7 +39,9 @@ def pictures(references: References, enhancer: Enhancer, frame: Frame) -> dict[s
     assert given.reference is not None and given.trust is not None
     rendered = frame.rgb.clamp(0, 1)
     referred = torch.lerp(rendered, given.reference, given.trust[..., None])
-    return {"rendered": rendered, "+ references": referred, "enhanced": enhancer.step(replace(given, flow_prev=None))[0]}
+    (enhanced,) = enhance_frames([replace(given, flow_prev=None)], enhancer, references.shown)
+    assert enhanced.rgb is not None
+    return {"rendered": rendered, "+ references": referred, "enhanced": enhanced.rgb}
 
 
 def measured(scene: Scene, references: References, drive: Path, size: tuple[int, int], every: int) -> Iterator[tuple[str, Row]]:

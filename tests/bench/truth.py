@@ -17,26 +17,36 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 from PIL import Image
 
+from enhance.enhancer import Enhancer
+from enhance.metrics import sharpness
+from recon.album import keep_album
 from recon.defaults import HELD_OUT, fit_config
 from recon.log import Log
 from recon.ready import fitted as without_held_out
 from render import render_frame
+from render.album import shots_in
 from render.compare import psnr
 from render.rays import world_directions
+from render.references import READS, References
+from scenes.camera import Camera
 from scenes.scene import Scene
 from tests.bench.recon import fitted
+from tests.bench.references import pictures
 from tests.bench.worlds.place import Place
 from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
 
 PLACES: dict[str, Callable[[Path], Place]] = {"street": street, "room": lambda _: room(False), "room with people": lambda _: room(True)}
-HEADS = ("dB", "ground", "movers", "depth off", "in the way", "beyond", "open")
+DECIBELS = ("dB", "enhanced", "ground", "movers")
+RATIOS = ("sharp", "enhanced")
+SHARES = ("depth off", "in the way", "beyond", "open")
 OPEN = 0.5
 """Alpha under which a pixel counts as sky."""
 
@@ -49,21 +59,25 @@ def without(log: Log, what: list[str]) -> Log:
     return replace(log, sweeps=() if "lidar" in what else log.sweeps, tracks=() if "boxes" in what else log.tracks)
 
 
-def figures(scene: Scene, name: str, index: int, aside: tuple[float, float], truth: Truth) -> tuple[list[float], torch.Tensor]:
-    """A row of `HEADS`, and the picture that is rendered `[H, W, 3]`."""
-    path = scene.ego.shifted(lateral=aside[0], vertical=aside[1])
-    camera = scene.camera(name, int(scene.frame_times(name)[index]), path)
+def figures(
+    scene: Scene, references: References, enhancer: Enhancer, camera: Camera, truth: Truth
+) -> tuple[list[float], list[torch.Tensor]]:
+    """A row of `DECIBELS`, `RATIOS` and `SHARES` in one, and what is rendered, and that enhanced, `[H, W, 3]`."""
     with torch.no_grad():
-        frame = render_frame(scene, camera, ("rgb", "alpha", "depth"))
-    assert frame.rgb is not None and frame.alpha is not None and frame.depth is not None
+        frame = render_frame(scene, camera, READS)
+        shown = pictures(references, enhancer, frame)
+    assert frame.alpha is not None and frame.depth is not None
+    rgb, enhanced = shown["rendered"], shown["enhanced"]
     solid, moving = truth.who >= 0, truth.who > 0
     drawn = (frame.depth / truth.depth)[solid]
     shares = [float(((drawn - 1).abs()).median()), *(float(part.float().mean()) for part in (drawn < 0.8, drawn > 1.25))]
     open_ = float((frame.alpha[solid] < OPEN).float().mean())
     heights = camera.world_from_cam[2, 3] + world_directions(camera)[..., 2] * truth.depth
     ground = (truth.who == 0) & (heights < LOW)
-    parts = [psnr(frame.rgb, truth.rgb, part) if part.any() else float("nan") for part in (ground, moving)]
-    return [psnr(frame.rgb, truth.rgb), *parts, *(100 * s for s in (*shares, open_))], frame.rgb.clamp(0, 1)
+    parts = [psnr(rgb, truth.rgb, part) if part.any() else float("nan") for part in (ground, moving)]
+    everywhere = torch.ones_like(solid)
+    ratios = [sharpness(picture, everywhere) / sharpness(truth.rgb, everywhere) for picture in (rgb, enhanced)]
+    return [psnr(rgb, truth.rgb), psnr(enhanced, truth.rgb), *parts, *ratios, *(100 * s for s in (*shares, open_))], [rgb, enhanced]
 
 
 def main() -> None:
@@ -85,22 +99,30 @@ def main() -> None:
     log = without(without_held_out(recorded(place, [asked.camera], folder), HELD_OUT), asked.without)
     camera, began = place.rig[asked.camera], time.time()
     config = replace(fit_config(log, [asked.camera]), steps=asked.steps, budget=asked.splats, seed=asked.seed)
-    scene, frames, *_ = fitted(log, config, [asked.camera], (camera.width, camera.height))
+    scene, frames, rig, *_ = fitted(log, config, [asked.camera], (camera.width, camera.height))
     print(f"fitted in {time.time() - began:.0f} s, {len(scene.background.gaussians)} splats, {len(scene.actors)} movers")
     held_out = [v.index for v in frames.of(0, held_out=True)]
     rows: dict[tuple[float, float], list[list[float]]] = {}
-    for aside, index, truth in looks(place, asked.camera, folder, held_out):
-        row, picture = figures(scene, asked.camera, index, aside, truth)
-        rows.setdefault(aside, []).append(row)
-        if asked.look:
-            asked.look.mkdir(parents=True, exist_ok=True)
-            both = (torch.cat([picture, truth.rgb], 0) * 255).round().to(torch.uint8).numpy()
-            Image.fromarray(both).save(asked.look / f"{asked.camera}_{aside[0]:+g}_{aside[1]:+g}_{index:03d}.png")
-    print(f"| m to the left, up | {' | '.join(HEADS)} |\n|---|{'---|' * len(HEADS)}")
+    with TemporaryDirectory() as album:
+        keep_album(scene, frames, rig, Path(album))
+        enhancer = Enhancer.load()
+        assert isinstance(enhancer, Enhancer)
+        references = References(shots_in(Path(album), scene), scene)
+        for aside, index, truth in looks(place, asked.camera, folder, held_out):
+            path = scene.ego.shifted(lateral=aside[0], vertical=aside[1])
+            view = scene.camera(asked.camera, int(scene.frame_times(asked.camera)[index]), path)
+            row, shown = figures(scene, references, enhancer, view, truth)
+            rows.setdefault(aside, []).append(row)
+            if asked.look:
+                asked.look.mkdir(parents=True, exist_ok=True)
+                stack = (torch.cat([*shown, truth.rgb], 0) * 255).round().to(torch.uint8).numpy()
+                Image.fromarray(stack).save(asked.look / f"{asked.camera}_{aside[0]:+g}_{aside[1]:+g}_{index:03d}.png")
+    print(f"| m to the left, up | {' | '.join((*DECIBELS, *RATIOS, *SHARES))} |\n|---|{'---|' * len((*DECIBELS, *RATIOS, *SHARES))}")
+    forms = ["{:.2f}"] * len(DECIBELS + RATIOS) + ["{:.2f} %"] * len(SHARES)
     for (left, up), found in rows.items():
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where nobody moves there is no mean of movers
             mean = np.nanmean(np.array(found), 0)
-        print(f"| {left:+g}, {up:+g} | {' | '.join(f'{v:.2f}' for v in mean[:3])} | {' | '.join(f'{v:.2f} %' for v in mean[3:])} |")
+        print(f"| {left:+g}, {up:+g} | {' | '.join(form.format(v) for form, v in zip(forms, mean, strict=True))} |")
 
 
 if __name__ == "__main__":

@@ -133,10 +133,11 @@ def test_median_depth_is_where_less_than_half_the_light_is_left():
     z = (placed[0].gaussians.means.double() @ cam_from_local[:3, :3].T + cam_from_local[:3, 3])[:, 2]
     expected = torch.full((25, 35), torch.inf, dtype=torch.float64)
     unsure = torch.zeros(25, 35, dtype=torch.bool)
-    for count, depth in enumerate(z.sort().values, 1):
-        nearest = placed[0].gaussians.select(z.argsort()[:count])
+    for count in range(1, len(z) + 1):
+        nearest, last = (placed[0].gaussians.select(some) for some in (z.argsort()[:count], z.argsort()[count - 1 : count]))
         with torch.no_grad():
             _, alpha, *_ = oracle.render(oracle.as_oracle([replace(placed[0], gaussians=nearest)]), camera, MODEL, alpha_max=0.999)
+            _, _, depth, *_ = oracle.render(oracle.as_oracle([replace(placed[0], gaussians=last)]), camera, MODEL)
         expected = torch.where(expected.isinf() & (alpha > 0.5), depth, expected)
         unsure |= (alpha - 0.5).abs() < 1e-4
     assert expected.isfinite().float().mean() > 0.2 and unsure.float().mean() < 0.02
