@@ -149,7 +149,7 @@ def ut_in_pixels(count: int = 20_000) -> dict[str, float]:
     field = {k: t.detach() for k, t in oracle.to_float64(g).items()}
     points = field["means"] @ pose[:3, :3].T + pose[:3, 3]
     axes = oracle.matrix_from_quat(field["quats"]) * field["log_scales"].exp()[:, None, :]
-    mean, _ = oracle.project_ut(points, axes, camera.lens.params(), camera.width, camera.height)
+    mean, *_ = oracle.project_ut(points, axes, camera.lens.params(), camera.width, camera.height)
     drawn = kept.scene.counts > 0
     centres = sum(kept.scene.records[drawn][:, [int(i) for i in part]].double() for part in ((X, Y), (X_REST, Y_REST)))
     off = (centres - mean[drawn]).norm(dim=1).sort().values

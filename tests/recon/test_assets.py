@@ -312,11 +312,11 @@ def test_assets_are_cut_from_what_was_recorded_whatever_was_edited_since(parked_
 
 
 def test_what_no_photo_shows_is_no_asset(parked_street, tmp_path, capsys):
-    """Of the drive's photos one is left, of the camera that looks away from it."""
+    """Of the drive's photos one is left, of the camera that has passed it by then."""
     scene = replace(parked_street, rig=rig(384, 216))
     save(scene, tmp_path / "s1")
-    (shot,) = _shots(scene)[-1:]
-    keep_photos(tmp_path / "s1", [("left_camera", shot.camera.time_us, from_bytes(shot.read(384, 216)))])
+    shot = _shots(scene)[len(scene.frame_times("front_camera")) - 1]
+    keep_photos(tmp_path / "s1", [("front_camera", shot.camera.time_us, from_bytes(shot.read(384, 216)))])
     with pytest.raises(ValueError, match="good enough"):
         extract_assets(tmp_path / "s1", tmp_path / "bank")
     assert "left out veh_7 (car): no photo shows most of it" in capsys.readouterr().err
@@ -339,7 +339,7 @@ def test_what_stands_behind_a_wall_was_not_seen(parked_street):
     hidden = sight(beside(parked_street, box((9.0, 0.3, 3.0), (0.6, 0.6, 0.6)), (8.0, 2.3, 0.0)))
     assert free.views >= 10 and free.left > 0 and hidden.views == 0 and hidden.left < 0.05 * free.left
     assert free.nearest == hidden.nearest and not any(hidden.sectors.values())
-    assert free.views == sum(free.sectors.values()) and free.sectors["front left"] >= 10
+    assert free.views == sum(free.sectors.values()) and free.sectors["front left"] >= 8
     # a car parked before its nose hides that, and not its flank: from the corner only the flank is seen, and the nose from nowhere
     parked = sight(beside(parked_street, box((4.2, 1.8, 1.5), (0.2, 0.2, 0.8)), (4.4, 3.5, 0.0)))
     assert 0 < parked.views <= free.views and parked.left > 0.95 * free.left and parked.nearest == free.nearest
