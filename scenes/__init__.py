@@ -12,8 +12,8 @@ time         int64 microseconds; seconds only in text for people
 activation   the name carries it: `log_scales`, `logit_opacities`
 colour       SH to display-referred sRGB; linear only where a name says `linear`
 asset        origin at the base centre of its box, x forward, z up, size `[3]` in metres
-depth        z in metres where a ray meets the splats, divided by alpha, inf where alpha is 0; distance from the eye for lenses that see past
-             90 degrees
+depth        z in metres where a ray meets the splats, divided by alpha, inf where alpha is 0; for lenses that see past 90 degrees the
+             distance from the eye
 flow         position in the other frame minus position in this one, pixels, x right y down
 instance     id whose splats weigh most together, -1 (sky) where alpha < 0.5; background 0, actors from 1
 """

@@ -211,9 +211,10 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     terms[sums_at + 6] = sum_r
                     terms[sums_at + 7] = sum_g
                     terms[sums_at + 8] = sum_b
-                    terms[sums_at + 9] = sum_z
-                    terms[sums_at + 10] = wp.cw_mul(column - lanes(record[X] - x0), sum_z)
-                    terms[sums_at + 11] = sum_zy
+                    if wp.static(wanted.depth):
+                        terms[sums_at + 9] = sum_z
+                        terms[sums_at + 10] = wp.cw_mul(column - lanes(record[X] - x0), sum_z)
+                        terms[sums_at + 11] = sum_zy
                     e0 = total_at(quarters, sums_at)
                     ey = total_at(quarters, sums_at + 1)
                     eyy = total_at(quarters, sums_at + 2)
@@ -239,10 +240,15 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     slots[slot, G_RED] = total_at(quarters, sums_at + 6)
                     slots[slot, G_GREEN] = total_at(quarters, sums_at + 7)
                     slots[slot, G_BLUE] = total_at(quarters, sums_at + 8)
-                    gz_all = total_at(quarters, sums_at + 9)
-                    slots[slot, G_AT] = gz_all
-                    slots[slot, G_ALONG] = total_at(quarters, sums_at + 10)
-                    slots[slot, G_DOWN] = total_at(quarters, sums_at + 11) + (middle - (record[Y] - y0)) * gz_all
+                    if wp.static(wanted.depth):
+                        gz_all = total_at(quarters, sums_at + 9)
+                        slots[slot, G_AT] = gz_all
+                        slots[slot, G_ALONG] = total_at(quarters, sums_at + 10)
+                        slots[slot, G_DOWN] = total_at(quarters, sums_at + 11) + (middle - (record[Y] - y0)) * gz_all
+                    else:
+                        slots[slot, G_AT] = 0.0
+                        slots[slot, G_ALONG] = 0.0
+                        slots[slot, G_DOWN] = 0.0
                 top -= count
 
     return composite_backward
