@@ -79,7 +79,7 @@ def _ends(planes: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
 def _scene(scene: Projected) -> list:
     features = scene.records.new_empty(1, 1) if scene.features is None else scene.features
     frames, rays = _or_none(scene.frames, 2), _or_none(scene.rays, 4)
-    seen = [view(scene.records, float), view(frames, wp.float64), view(rays, wp.float64), view(scene.tilts, wp.vec3)]
+    seen = [view(scene.records, float), view(frames, wp.float64), view(rays, wp.float64), view(scene.slopes, wp.vec2)]
     return [*seen, view(features, float), scene.channels]
 
 

@@ -68,10 +68,11 @@ def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, featur
     """Project and composite. With a room and without gradients nothing in here waits for the device, so a graph can record it."""
     ways, device = projection(settings.lens, settings.rolling), rows.device
     records = torch.empty(todo.records, RECORD, dtype=torch.float32, device=device)
-    tilts = torch.empty(todo.records if settings.wanted.planes else 0, 3, dtype=torch.float32, device=device)
+    sloping = settings.wanted.depths and settings.model.response == "conic"
+    slopes = torch.empty(todo.records if sloping else 0, 2, dtype=torch.float32, device=device)
     reach = torch.empty(todo.records, REACH_INTS, dtype=torch.int32, device=device)
     keys, counts = (torch.empty(todo.records, dtype=torch.int32, device=device) for _ in range(2))
-    out = [view(records, float), view(tilts, wp.vec3), view(reach, int), view(keys, int), view(counts, int)]
+    out = [view(records, float), view(slopes, wp.vec2), view(reach, int), view(keys, int), view(counts, int)]
     jobs = [(len(g.items) * _threads(device), [*_arrays(g.fields), *_told(told, rows, g.items), *out]) for g in todo.groups]
     run_each(ways.forward, jobs, device)
     per_record, frames = (None if t is None else _copied(t, ways.copies) for t in (features, frames))
@@ -83,7 +84,7 @@ def paint(settings: Settings, todo: Work, told: list, rows: torch.Tensor, featur
             (n, [*_arrays(g.fields)[:3], *_told([], rows, g.items), *told_of_frames]) for (n, _), g in zip(jobs, todo.groups, strict=True)
         ]
         run_each(make_frames, jobs, device)
-    scene = Projected(records, tilts, reach, counts, depth_order(keys), per_record, frames, rays)
+    scene = Projected(records, slopes, reach, counts, depth_order(keys), per_record, frames, rays)
     return scene, draw(settings, scene)
 
 
@@ -144,7 +145,7 @@ class Rasterize(torch.autograd.Function):
             for g in groups:
                 outs.append([torch.empty_like(f) for f in g.fields])
                 shared.append(torch.empty(len(g.items) * threads, ways.uniforms, dtype=torch.float32, device=device))
-                summed = [view(ctx.scene.records, float), view(slots.counts, int), view(slots.starts, int), view(slots.values, float)]
+                summed = [view(slots.counts, int), view(slots.starts, int), view(slots.values, float)]
                 args = [*_arrays(g.fields), *_told(ctx.told, ctx.rows, g.items), *summed, *_arrays(outs[-1]), view(shared[-1], float)]
                 jobs.append((len(shared[-1]), args))
             run_each(ways.backward, jobs, device)

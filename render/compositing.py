@@ -158,7 +158,7 @@ def _of_part(settings: Settings, part: Part, gradients: Sequence[torch.Tensor]) 
 
 
 def _splats(scene: Projected) -> list:
-    return [view(scene.records, lanes), view(scene.tilts, wp.vec3)]
+    return [view(scene.records, lanes), view(scene.slopes, wp.vec2)]
 
 
 def _features(scene: Projected) -> list:
@@ -228,10 +228,10 @@ def _batches() -> list:
     """Where forward keeps the entries of the batch at hand for each band."""
     entries = BANDS * int(BATCH)
     terms = torch.empty(2 * entries, TILE, dtype=torch.float32)
-    slopes = torch.empty(entries, 3, dtype=torch.float32)
+    corners = torch.empty(entries, 3, dtype=torch.float32)
     return [
         view(torch.empty(entries, TILE, dtype=torch.float32), lanes),
-        view(slopes, wp.vec3),
+        view(corners, wp.vec3),
         view(terms, lanes),
         view(terms.view(-1), float),
     ]

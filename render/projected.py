@@ -12,12 +12,12 @@ from render.order import TileLists
 
 @dataclass(frozen=True)
 class Projected:
-    """All splats on the image: records `[N, RECORD]`, their planes `[N, 3]` (`kernels.types.AT`; none where no depth is wanted), reach
+    """All splats on the image: records `[N, RECORD]`, their slopes `[N, 2]` (`kernels.types.ALONG`; none where no depth is wanted), reach
     int32 `[N, REACH_INTS]` (`kernels.bin`), counts int32 `[N]` of tiles at most, the visible ones' order, features `[N, C]`; where pixels
     look along their own rays, float64 canonical frames `[N, FRAME]` (`ray_rows.py`) and rays `[G, C, H, W]` (`rays.py`)."""
 
     records: torch.Tensor
-    tilts: torch.Tensor
+    slopes: torch.Tensor
     reach: torch.Tensor
     counts: torch.Tensor
     order: torch.Tensor

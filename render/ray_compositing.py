@@ -96,7 +96,7 @@ def _scene(w: Window, scene: Projected, planes: torch.Tensor) -> list:
     rays[:, 2] = 1  # beyond the image's edge
     inside = scene.rays[..., w.top * TILE : (w.top + w.tiles_y) * TILE, w.left * TILE : (w.left + w.tiles_x) * TILE]
     rays[..., : inside.shape[-2], : inside.shape[-1]] = inside
-    splats = [view(scene.records, lanes), view(scene.tilts, wp.vec3), view(scene.frames, wp.float64), view(features, float)]
+    splats = [view(scene.records, lanes), view(scene.slopes, wp.vec2), view(scene.frames, wp.float64), view(features, float)]
     return [*splats, scene.channels, lanes_of(rays)]
 
 

@@ -265,7 +265,11 @@ def _composite(pixels, lens: Lens, there, depths, slopes, mean, conic, opacity, 
     weight = alpha * before.gather(1, first.argsort(dim=1))
     total = 1 - passing[:, -1] if len(depths) else torch.zeros(len(pixels), dtype=torch.float64)
     drawn = total > 0
-    far = (weight * (depths + torch.einsum("pni,ni->pn", d, slopes))).sum(1)
+    far = depths + torch.einsum("pni,ni->pn", d, slopes)
+    if response == "ray":
+        far = ray_depths(*there, lens.unproject(pixels), lens.origins(pixels))
+        far = torch.where(weight > 0, far, torch.zeros_like(far))
+    far = (weight * far).sum(1)
     depth = torch.where(drawn, far / torch.where(drawn, total, torch.ones_like(total)), torch.inf)
     ids = instances.unique()
     of_each = torch.stack([weight.detach()[:, instances == i].sum(1) for i in ids], 1) if len(ids) else None

@@ -13,7 +13,6 @@ from render.kernels.pixel_sight import FRAME_GRADIENTS, Behind, frame_of, from_r
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     G_ALONG,
-    G_AT,
     G_BLUE,
     G_DOWN,
     G_GREEN,
@@ -24,6 +23,7 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
+    G_Z,
     GRADIENTS,
     OPACITY,
     H,
@@ -40,7 +40,7 @@ from render.kernels.warps import SUMS, WARPS, shared_floats, shared_ints, sum_of
 def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     """`lay_down`, which all threads of a warp call for an entry that at least one of them sees, and `write`, which all threads of a block
     call after every group of entries, with those of the group that their warp laid down as bits."""
-    canonical, _ = pixel_functions(ray, eyes)
+    canonical, _, _ = pixel_functions(ray, eyes)
     lanes, _, _ = warp_of(tile_size)
     warps = WARPS if tile_size > 1 else 1
     kinds = 2 if ray else 1
@@ -73,32 +73,40 @@ def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
         sums[G_RED] = b.w * b.g[0]
         sums[G_GREEN] = b.w * b.g[1]
         sums[G_BLUE] = b.w * b.g[2]
-        if wp.static(wanted.depth):
-            g_far = b.w * b.g_z
-            sums[G_AT] = g_far
-            sums[G_ALONG] = g_far * (x - r[X])
-            sums[G_DOWN] = g_far * (y - r[Y])
         if wp.static(ray):
             # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
             u, q = canonical(frames, rays, i, x, y)
-            t = wp.dot(u, q) / wp.max(wp.dot(u, u), LEAST)
+            inverse = wp.float64(1.0) / wp.max(wp.dot(u, u), LEAST)
+            t = wp.dot(u, q) * inverse
             m = wp.float64(ds) * (q - t * u)
-            pushed = wp.transpose(frame_of(frames, i)) * m
+            turned = wp.transpose(frame_of(frames, i))
+            pushed = turned * m
             group = int(0)
             missed = wp.vec3d(frames[i, CENTRE], frames[i, CENTRE + 1], frames[i, CENTRE + 2])
             if wp.static(eyes):
                 group = int(frames[i, GROUP])
                 missed = missed - ray_at(rays, group, 3, x, y)
-            missed = missed - t * ray_at(rays, group, 0, x, y)
+            d = ray_at(rays, group, 0, x, y)
+            # depth is t itself: dt/dq = u / |u|^2, dt/du = (q - 2 t u) / |u|^2
+            by_q = wp.vec3d()
+            by_u = wp.vec3d()
+            if wp.static(wanted.depth):
+                g_far = wp.float64(b.w * b.g_z) * inverse
+                by_q = g_far * u
+                by_u = g_far * (q - wp.float64(2.0) * t * u)
+            of_frame_by_depth = wp.outer(by_q, missed) + wp.outer(by_u, d)
+            missed = missed - t * d
+            along = turned * by_u - t * pushed
+            pushed = pushed + turned * by_q
             row = int(y)
             column = int(x)
             of_frame = vec_sums()
             for c in range(3):
                 for k in range(3):
-                    of_frame[3 * k + c] = float(m[k] * missed[c])
+                    of_frame[3 * k + c] = float(m[k] * missed[c] + of_frame_by_depth[k, c])
                 of_frame[CENTRE + c] = float(pushed[c])
-                if ds != 0.0 and row < rays.shape[2] and column < rays.shape[3]:  # a pixel's rays are its thread's alone
-                    g_rays[group, c, row, column] = g_rays[group, c, row, column] - t * pushed[c]
+                if b.w != 0.0 and row < rays.shape[2] and column < rays.shape[3]:  # a pixel's rays are its thread's alone
+                    g_rays[group, c, row, column] = g_rays[group, c, row, column] + along[c]
                     if wp.static(eyes):
                         g_rays[group, 3 + c, row, column] = g_rays[group, 3 + c, row, column] - pushed[c]
             keep(1, thread, entry, of_frame)
@@ -110,6 +118,11 @@ def gradient_sums(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
             sums[G_K] = 2.0 * r[K] * offset * offset * ds
             sums[G_M] = -2.0 * k2 * offset * dy * ds
             sums[G_H] = dy * dy * ds
+            if wp.static(wanted.depth):
+                g_far = b.w * b.g_z
+                sums[G_Z] = g_far
+                sums[G_ALONG] = g_far * (x - r[X])
+                sums[G_DOWN] = g_far * (y - r[Y])
         keep(0, thread, entry, sums)
 
     @wp.func

@@ -36,10 +36,10 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], slopes: wp.array[wp.vec2],
         features: wp.array2d[float], channels: int,
         window: Window, bands: int, alpha_max: float, termination: float,
-        columns: wp.array[lanes], state: wp.array3d[lanes], held: wp.array[lanes], slopes: wp.array[wp.vec3],
+        columns: wp.array[lanes], state: wp.array3d[lanes], held: wp.array[lanes], corners: wp.array[wp.vec3],
         terms: wp.array[lanes], numbers: wp.array[float],
         planes: wp.array3d[lanes], picks: wp.array3d[lanes], last: wp.array2d[int], dark_at: wp.array2d[lanes],
         first: int,
@@ -47,7 +47,7 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
         """columns: 0 to 15, from memory, since the compiler takes a constant ramp apart.
         state `[bands, HELD + channels, 16]`: transmittance, red, green, blue, sum of w z, sum of w, instance, its lead, where in the
         tile's list the lane went dark, its transmittance then, median depth, channels.
-        held, slopes `[bands * BATCH]`: the records of the batch's entries, and their planes from the tile's first pixel on; terms
+        held, corners `[bands * BATCH]`: the records of the batch's entries, and their slopes as of `rows.from_corner`; terms
         `[bands * BATCH * 2]`: their exponents' terms by row, and the same memory as numbers.
         """
         band = first + wp.tid()
@@ -85,8 +85,8 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
                     ridge, across, met = rows_met(record, x0, y0, column, lanes(bit))
                     meets = meets + met
                     held[band * BATCH + count] = record + lanes(0.0)
-                    if wp.static(wanted.planes):
-                        slopes[band * BATCH + count] = from_corner(tilts[ids[base + count]], record, x0, y0)
+                    if wp.static(wanted.depths):
+                        corners[band * BATCH + count] = from_corner(slopes[ids[base + count]], record, x0, y0)
                     terms[2 * (band * BATCH + count)] = ridge
                     terms[2 * (band * BATCH + count) + 1] = across
                     bit *= 2.0
@@ -120,8 +120,8 @@ def composite(wanted: Wanted, squarings: int, gradients: bool):
                                 red = red + w * record[RED]
                                 green = green + w * record[GREEN]
                                 blue = blue + w * record[BLUE]
-                                if wp.static(wanted.planes):
-                                    far = depth_along(slopes[band * BATCH + n], column, r)
+                                if wp.static(wanted.depths):
+                                    far = depth_along(corners[band * BATCH + n], column, r)
                                 if wp.static(wanted.depth):
                                     state[band, 4, r] = state[band, 4, r] + wp.cw_mul(w, far)
                                     state[band, 5, r] = state[band, 5, r] + w

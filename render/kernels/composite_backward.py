@@ -15,7 +15,6 @@ from render.kernels.rows import ROLLED, corner_of, depth_along, exp_of, from_cor
 from render.kernels.types import (
     BLUE,
     G_ALONG,
-    G_AT,
     G_BLUE,
     G_DOWN,
     G_GREEN,
@@ -26,6 +25,7 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
+    G_Z,
     GRADIENTS,
     GREEN,
     OPACITY,
@@ -55,7 +55,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], slopes: wp.array[wp.vec2],
         features: wp.array2d[float], channels: int, window: Window, bands: int, alpha_max: float,
         columns: wp.array[lanes], state: wp.array3d[lanes], terms: wp.array[lanes], numbers: wp.array[float],
         quarters: wp.array[wp.vec4], meets: wp.array[int],
@@ -145,7 +145,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     k = record[K]
                     m = record[M]
                     if wp.static(wanted.depth):
-                        slopes = from_corner(tilts[i], record, x0, y0)
+                        corner = from_corner(slopes[i], record, x0, y0)
                     s_max = record[S_MAX]
                     opacity = record[OPACITY]
                     red = record[RED]
@@ -184,7 +184,7 @@ def composite_gradient(wanted: Wanted, squarings: int):
                                 sums[band, c] = sums[band, c] + wp.cw_mul(w, gc)
                         if wp.static(wanted.depth):
                             gz = state[band, 5, r]
-                            d = d + wp.cw_mul(gz, depth_along(slopes, column, r)) + state[band, 6, r]
+                            d = d + wp.cw_mul(gz, depth_along(corner, column, r)) + state[band, 6, r]
                             gz = wp.cw_mul(w, gz)
                             sum_z = sum_z + gz
                             sum_zy = sum_zy + gz * (float(r) - middle)
@@ -242,11 +242,11 @@ def composite_gradient(wanted: Wanted, squarings: int):
                     slots[slot, G_BLUE] = total_at(quarters, sums_at + 8)
                     if wp.static(wanted.depth):
                         gz_all = total_at(quarters, sums_at + 9)
-                        slots[slot, G_AT] = gz_all
+                        slots[slot, G_Z] = gz_all
                         slots[slot, G_ALONG] = total_at(quarters, sums_at + 10)
                         slots[slot, G_DOWN] = total_at(quarters, sums_at + 11) + (middle - (record[Y] - y0)) * gz_all
                     else:
-                        slots[slot, G_AT] = 0.0
+                        slots[slot, G_Z] = 0.0
                         slots[slot, G_ALONG] = 0.0
                         slots[slot, G_DOWN] = 0.0
                 top -= count

@@ -43,13 +43,13 @@ def composite_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     """The forward kernel for response "ray" or "conic" and tiles of `tile_size` pixels square. eyes: as of `ray_functions`."""
     lanes, _, _ = warp_of(tile_size)
     pixel, reached = pixel_of(tile_size), reached_of(tile_size)
-    _, faded = pixel_functions(ray, eyes)
+    _, faded, depth = pixel_functions(ray, eyes)
     begin, lay, write = pixel_layers(wanted)
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float], frames: wp.array2d[wp.float64],
-        rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        rays: wp.array4d[wp.float64], slopes: wp.array[wp.vec2], features: wp.array2d[float], channels: int,
         window: Window, alpha_max: float, termination: float,
         planes: wp.array3d[float], picks: wp.array3d[float], last: wp.array2d[int],
     ):  # fmt: skip
@@ -70,7 +70,10 @@ def composite_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
                     r = record_of(records, i)
                     e = faded(r, frames, rays, i, x, y)
                     if e > 0.0:
-                        p = lay(p, r, i, wp.min(r[OPACITY] * e, alpha_max), tilts, features, channels, planes, px, py, x, y)
+                        far = float(0.0)
+                        if wp.static(wanted.depths):
+                            far = depth(r, slopes, frames, rays, i, x, y)
+                        p = lay(p, r, i, wp.min(r[OPACITY] * e, alpha_max), far, features, channels, planes, px, py)
                         end = first + entry + 1
             first += wp.static(lanes)
         write(p, planes, picks, px, py)
@@ -84,7 +87,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
     """The backward kernel; planes and grads as of `composite_gradient`, per pixel instead of per row."""
     lanes, _, _ = warp_of(tile_size)
     pixel, reached = pixel_of(tile_size), reached_of(tile_size)
-    _, faded = pixel_functions(ray, eyes)
+    _, faded, depth = pixel_functions(ray, eyes)
     behind, take_off = pixel_unlayering(wanted)
     lay_down, write = gradient_sums(wanted, ray, eyes, tile_size)
     write_channels = channel_sums(wanted)
@@ -92,7 +95,7 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def composite_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3],
+        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], slopes: wp.array[wp.vec2],
         features: wp.array2d[float], channels: int, window: Window, alpha_max: float,
         planes: wp.array3d[float], grads: wp.array3d[float], last: wp.array2d[int],
         slots: wp.array2d[float], channel_slots: wp.array2d[float], frame_slots: wp.array2d[float], g_rays: wp.array4d[wp.float64],
@@ -124,7 +127,10 @@ def composite_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: 
                     b.w = 0.0
                     b.de = 0.0
                     if e > 0.0:
-                        b = take_off(b, r, i, e, alpha_max, tilts, features, channels, grads, px, py, x, y)
+                        far = float(0.0)
+                        if wp.static(wanted.depth):
+                            far = depth(r, slopes, frames, rays, i, x, y)
+                        b = take_off(b, r, i, e, alpha_max, far, features, channels, grads, px, py)
                     seen = seen | bit
                     lay_down(entry, i, r, thread, x, y, b, frames, rays, g_rays)
                     if wp.static(wanted.channels):

@@ -38,7 +38,7 @@ def entry_of(key: wp.int64):
 @cache
 def next_entries(ray: bool, eyes: bool):
     """The function that finds a pixel's next HELD entries, front to back or (way = -1) back to front."""
-    canonical, faded = pixel_functions(ray, eyes)
+    canonical, faded, _ = pixel_functions(ray, eyes)
 
     @wp.func
     def find(
@@ -97,12 +97,13 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
     """The forward kernel; arguments as of `composite_blocks`."""
     pixel = pixel_of(tile_size)
     begin, lay, write = pixel_layers(wanted)
+    _, _, depth = pixel_functions(ray, eyes)
     find = next_entries(ray, eyes)
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def order_blocks_forward(
         tile_starts: wp.array[int], ids: wp.array[int], records: wp.array2d[float], frames: wp.array2d[wp.float64],
-        rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
+        rays: wp.array4d[wp.float64], slopes: wp.array[wp.vec2], features: wp.array2d[float], channels: int,
         window: Window, alpha_max: float, termination: float,
         planes: wp.array3d[float], picks: wp.array3d[float], settled: wp.array[int], last: wp.array2d[wp.int64],
     ):  # fmt: skip
@@ -123,7 +124,10 @@ def order_blocks(wanted: Wanted, ray: bool, eyes: bool, tile_size: int):
                     break
                 i = ids[start + entry_of(keys[m])]
                 r = record_of(records, i)
-                p = lay(p, r, i, wp.min(r[OPACITY] * fades[m], alpha_max), tilts, features, channels, planes, px, py, x, y)
+                far_off = float(0.0)
+                if wp.static(wanted.depths):
+                    far_off = depth(r, slopes, frames, rays, i, x, y)
+                p = lay(p, r, i, wp.min(r[OPACITY] * fades[m], alpha_max), far_off, features, channels, planes, px, py)
                 drawn = keys[m]
             if settled[tile] == 0:
                 k = int(0)
@@ -138,6 +142,7 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
     """The backward kernel; arguments as of `composite_blocks_gradient`, `blocks` blocks in all."""
     pixel = pixel_of(tile_size)
     behind, take_off = pixel_unlayering(wanted)
+    _, _, depth = pixel_functions(ray, eyes)
     lanes, _, _ = warp_of(tile_size)
     lay_down, write = gradient_sums(wanted, ray, eyes, tile_size)
     write_channels = channel_sums(wanted)
@@ -146,7 +151,7 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def order_blocks_backward(
         tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array2d[float],
-        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], tilts: wp.array[wp.vec3],
+        frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], slopes: wp.array[wp.vec2],
         features: wp.array2d[float], channels: int, window: Window, alpha_max: float,
         planes: wp.array3d[float], grads: wp.array3d[float], settled: wp.array[int], last: wp.array2d[wp.int64],
         blocks: int, pushes: wp.array3d[wp.vec2],
@@ -173,7 +178,11 @@ def order_blocks_gradient(wanted: Wanted, ray: bool, eyes: bool, tile_size: int)
                     for m in range(held):
                         n = entry_of(-keys[m])
                         i = ids[start + n]
-                        b = take_off(b, record_of(records, i), i, fades[m], alpha_max, tilts, features, channels, grads, px, py, x, y)
+                        r = record_of(records, i)
+                        far_off = float(0.0)
+                        if wp.static(wanted.depth):
+                            far_off = depth(r, slopes, frames, rays, i, x, y)
+                        b = take_off(b, r, i, fades[m], alpha_max, far_off, features, channels, grads, px, py)
                         if n >= first and n < first + segment:
                             pushes[block, n - first, thread] = wp.vec2(b.w, b.de)
                         beyond = keys[m]

@@ -27,11 +27,10 @@ from render.kernels.ray_rows import (
     reach_of,
     square,
 )
-from render.kernels.rows import ROLLED, corner_of, depth_along, from_corner
+from render.kernels.rows import ROLLED, corner_of
 from render.kernels.types import (
     BLUE,
     G_ALONG,
-    G_AT,
     G_BLUE,
     G_DOWN,
     G_GREEN,
@@ -42,6 +41,7 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
+    G_Z,
     GRADIENTS,
     GREEN,
     INSTANCE,
@@ -86,10 +86,11 @@ def scatter(scattered: wp.array4d[float], band: int, field: int, keys: wp.array[
 def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarings: int):
     """The forward kernel, for response "ray" or "conic", in each pixel's own order or the tiles'. eyes: as of `ray_functions`."""
     make = list_row(ray, eyes, ordered, squarings)
+    _, _, _, depth = ray_functions(ray, eyes, squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_forward(
-        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        tile_starts: wp.array[int], ids: wp.array[int], records: wp.array[lanes], slopes: wp.array[wp.vec2],
         frames: wp.array2d[wp.float64],
         features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
         window: Window, bands: int, alpha_max: float, termination: float, entries: int,
@@ -159,8 +160,8 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
                         red = red + w * record[RED]
                         green = green + w * record[GREEN]
                         blue = blue + w * record[BLUE]
-                        if wp.static(wanted.planes):
-                            far = depth_along(from_corner(tilts[i], record, x0, y0), column, r)
+                        if wp.static(wanted.depths):
+                            far = depth(record, slopes, frames, i, rays, column, x0, y0, row, tx, r)
                         if wp.static(wanted.depth):
                             z = z + wp.cw_mul(w, far)
                             weights = weights + w
@@ -191,11 +192,11 @@ def composite_rays(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarin
 def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool, squarings: int):
     """The backward kernel: writes every entry's gradient slot, those of its channels and of its canonical frame, and the rays' gradient."""
     make = list_row(ray, eyes, ordered, squarings)
-    canonical, faded_conic, faded_along = ray_functions(ray, eyes, squarings)
+    canonical, faded_conic, faded_along, depth = ray_functions(ray, eyes, squarings)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def composite_rays_backward(
-        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], tilts: wp.array[wp.vec3],
+        tile_starts: wp.array[int], ids: wp.array[int], slot_of: wp.array[int], records: wp.array[lanes], slopes: wp.array[wp.vec2],
         frames: wp.array2d[wp.float64],
         features: wp.array2d[float], channels: int, rays: wp.array4d[lanes64], elsewhere: wp.array[int],
         window: Window, bands: int, alpha_max: float, termination: float, entries: int,
@@ -241,7 +242,7 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         record = records[i]
                         shade = gr * record[RED] + gg * record[GREEN] + gb * record[BLUE]
                         if wp.static(wanted.depth):
-                            far = depth_along(from_corner(tilts[i], record, x0, y0), column, r)
+                            far = depth(record, slopes, frames, i, rays, column, x0, y0, row, tx, r)
                             shade = shade + wp.cw_mul(grads[4, row, tx], far) + grads[5, row, tx]
                         if wp.static(wanted.channels):
                             for c in range(channels):
@@ -297,13 +298,6 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         sums[band, j, G_RED] = sums[band, j, G_RED] + wp.float64(wp.dot(w, gr))
                         sums[band, j, G_GREEN] = sums[band, j, G_GREEN] + wp.float64(wp.dot(w, gg))
                         sums[band, j, G_BLUE] = sums[band, j, G_BLUE] + wp.float64(wp.dot(w, gb))
-                        if wp.static(wanted.depth):
-                            gz = wp.cw_mul(w, grads[4, row, tx])
-                            at = wp.float64(wp.dot(gz, one))
-                            sums[band, j, G_AT] = sums[band, j, G_AT] + at
-                            beside = column - lanes(record[X] - x0)
-                            sums[band, j, G_ALONG] = sums[band, j, G_ALONG] + wp.float64(wp.dot(gz, beside))
-                            sums[band, j, G_DOWN] = sums[band, j, G_DOWN] + wp.float64(y - record[Y]) * at
                         if wp.static(wanted.channels):
                             for c in range(channels):
                                 g_c = grads[wp.static(wanted.first_channel) + c, row, tx]
@@ -311,23 +305,45 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                         ds = de * (-opacity)
                         if wp.static(ray):
                             # s is least at t, so dt changes nothing: ds/dq = m, ds/du = -t m, with q = A (p - o), u = A d
-                            t64 = wp.cw_div(dot(ux, uy, uz, qx, qy, qz), square(ux, uy, uz))
+                            inverse = wp.cw_div(one64, square(ux, uy, uz))
+                            t64 = wp.cw_mul(dot(ux, uy, uz, qx, qy, qz), inverse)
                             mx = wp.cw_mul(lanes64(ds), qx - wp.cw_mul(t64, ux))
                             my = wp.cw_mul(lanes64(ds), qy - wp.cw_mul(t64, uy))
                             mz = wp.cw_mul(lanes64(ds), qz - wp.cw_mul(t64, uz))
                             group = int(0)
                             if wp.static(eyes):
                                 group = int(frames[i, GROUP])
+                            # depth is t itself: dt/dq = u / |u|^2, dt/du = (q - 2 t u) / |u|^2
+                            g_far = lanes64(NONE)
+                            if wp.static(wanted.depth):
+                                g_far = wp.cw_mul(lanes64(wp.cw_mul(w, grads[4, row, tx])), inverse)
+                            twice = t64 * TWO
+                            vx = wp.cw_mul(g_far, qx - wp.cw_mul(twice, ux))
+                            vy = wp.cw_mul(g_far, qy - wp.cw_mul(twice, uy))
+                            vz = wp.cw_mul(g_far, qz - wp.cw_mul(twice, uz))
+                            wx = wp.cw_mul(g_far, ux)
+                            wy = wp.cw_mul(g_far, uy)
+                            wz = wp.cw_mul(g_far, uz)
                             for c in range(3):
-                                missed = lanes64(frames[i, CENTRE + c]) - wp.cw_mul(t64, rays[group, c, row, tx])
+                                ahead = rays[group, c, row, tx]
+                                away = lanes64(frames[i, CENTRE + c])
+                                if wp.static(eyes):
+                                    away = away - rays[group, 3 + c, row, tx]
+                                missed = away - wp.cw_mul(t64, ahead)
                                 pushed = mx * frames[i, c] + my * frames[i, 3 + c] + mz * frames[i, 6 + c]
                                 g_rays[group, c, row, tx] = g_rays[group, c, row, tx] - wp.cw_mul(t64, pushed)
+                                if wp.static(wanted.depth):
+                                    by_u = vx * frames[i, c] + vy * frames[i, 3 + c] + vz * frames[i, 6 + c]
+                                    g_rays[group, c, row, tx] = g_rays[group, c, row, tx] + by_u
+                                    pushed = pushed + wx * frames[i, c] + wy * frames[i, 3 + c] + wz * frames[i, 6 + c]
                                 if wp.static(eyes):
-                                    missed = missed - rays[group, 3 + c, row, tx]
                                     g_rays[group, 3 + c, row, tx] = g_rays[group, 3 + c, row, tx] - pushed
-                                sums[band, j, GRADIENTS + c] = sums[band, j, GRADIENTS + c] + wp.dot(mx, missed)
-                                sums[band, j, GRADIENTS + 3 + c] = sums[band, j, GRADIENTS + 3 + c] + wp.dot(my, missed)
-                                sums[band, j, GRADIENTS + 6 + c] = sums[band, j, GRADIENTS + 6 + c] + wp.dot(mz, missed)
+                                of_x = wp.dot(mx, missed) + wp.dot(wx, away) + wp.dot(vx, ahead)
+                                of_y = wp.dot(my, missed) + wp.dot(wy, away) + wp.dot(vy, ahead)
+                                of_z = wp.dot(mz, missed) + wp.dot(wz, away) + wp.dot(vz, ahead)
+                                sums[band, j, GRADIENTS + c] = sums[band, j, GRADIENTS + c] + of_x
+                                sums[band, j, GRADIENTS + 3 + c] = sums[band, j, GRADIENTS + 3 + c] + of_y
+                                sums[band, j, GRADIENTS + 6 + c] = sums[band, j, GRADIENTS + 6 + c] + of_z
                                 sums[band, j, GRADIENTS + CENTRE + c] = sums[band, j, GRADIENTS + CENTRE + c] + wp.dot(pushed, one64)
                         else:
                             k1 = wp.float64(record[K])
@@ -343,6 +359,13 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                             sums[band, j, G_K] = sums[band, j, G_K] + TWO * k1 * wp.dot(wp.cw_mul(ds64, x), x)
                             sums[band, j, G_M] = sums[band, j, G_M] - dy * slope
                             sums[band, j, G_H] = sums[band, j, G_H] + dy * per_y
+                            if wp.static(wanted.depth):
+                                gz = wp.cw_mul(w, grads[4, row, tx])
+                                at = wp.float64(wp.dot(gz, one))
+                                beside = column - lanes(record[X] - x0)
+                                sums[band, j, G_Z] = sums[band, j, G_Z] + at
+                                sums[band, j, G_ALONG] = sums[band, j, G_ALONG] + wp.float64(wp.dot(gz, beside))
+                                sums[band, j, G_DOWN] = sums[band, j, G_DOWN] + wp.float64(y - record[Y]) * at
                 for j in range(stop - start):
                     slot = slot_of[start + j]
                     for c in range(GRADIENTS):

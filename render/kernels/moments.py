@@ -7,7 +7,7 @@ r = sqrt(3) / (z +- sqrt(3) o_z): exact for a pinhole and free of cancellation, 
     covariance = sum_k w_k e_k e_k' + mu mu',   mu = sum_k b_k e_k,   w = (r+^2 + r-^2) / 6,  b = (r+ - r-) / 6
 
 and its determinant is a sum of squares (Cauchy-Binet), so that needles keep all their digits. Its covariance with depth is
-sum_k c_k o_z e_k, c = 1 / z or (r+ + r-) / sqrt(12): how a splat's depth grows along the image (`splat.tilt_of`). Near the camera plane the
+sum_k c_k o_z e_k, c = 1 / z or (r+ + r-) / sqrt(12): by it depth grows along the image (`splat.slopes_of`). Near the camera plane the
 moments of a perspective Gaussian diverge and a splat beside the car would flood the image, so: a sigma point nearer than a share of the
 centre's depth (sigma.py), or behind the camera, is projected as if it lay at that share, and n is taken no further out than 1.3 times half
 the view. All continuous where it can be seen.

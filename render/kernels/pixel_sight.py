@@ -13,7 +13,6 @@ from render.kernels.canonical import GROUP, MOVED
 from render.kernels.ray_rows import LEAST
 from render.kernels.types import (
     ALONG,
-    AT,
     BLUE,
     DOWN,
     GREEN,
@@ -32,6 +31,7 @@ from render.kernels.types import (
     Window,
     X,
     Y,
+    Z,
 )
 from render.kernels.warps import LANES, vec_record
 
@@ -71,12 +71,6 @@ def from_ridge(r: vec_record, x: float, y: float):
     """dx - M dy and dy of the pixel centre x, y."""
     dy = (y - r[Y]) - r[Y_REST]
     return (x - r[X]) - r[X_REST] - r[M] * dy, dy
-
-
-@wp.func
-def depth_at(tilt: wp.vec3, r: vec_record, x: float, y: float):
-    """What depth a splat's plane has at the pixel centre x, y."""
-    return tilt[AT] + tilt[ALONG] * (x - r[X]) + tilt[DOWN] * (y - r[Y])
 
 
 @cache
@@ -132,8 +126,8 @@ def frame_of(frames: wp.array2d[wp.float64], i: int):
 
 @cache
 def pixel_functions(ray: bool, eyes: bool):
-    """How a pixel looks at splat i: `canonical`, its ray in the splat's frame, u and q, and `faded`, exp(-s) within the cutoff and 0 beyond
-    it, by the conic or along the ray. eyes: as of `ray_functions`."""
+    """How a pixel looks at splat i: `canonical`, its ray in the splat's frame, u and q, `faded`, exp(-s) within the cutoff and 0 beyond it,
+    by the conic or along the ray, and `depth`. eyes: as of `ray_functions`."""
 
     @wp.func
     def canonical(frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], i: int, x: float, y: float):
@@ -165,7 +159,17 @@ def pixel_functions(ray: bool, eyes: bool):
             e = wp.exp(-s)
         return e
 
-    return canonical, faded
+    @wp.func
+    def depth(
+        r: vec_record, slopes: wp.array[wp.vec2], frames: wp.array2d[wp.float64], rays: wp.array4d[wp.float64], i: int, x: float, y: float
+    ):
+        """Where the pixel meets the splat."""
+        if wp.static(ray):
+            u, q = canonical(frames, rays, i, x, y)
+            return float(wp.dot(u, q) / wp.max(wp.dot(u, u), LEAST))
+        return r[Z] + slopes[i][ALONG] * (x - r[X]) + slopes[i][DOWN] * (y - r[Y])
+
+    return canonical, faded, depth
 
 
 @wp.struct
@@ -197,12 +201,11 @@ def pixel_layers(wanted: Wanted):
 
     @wp.func
     def lay(
-        p: Pixel, r: vec_record, i: int, a: float, tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
-        planes: wp.array3d[float], px: int, py: int, x: float, y: float,
+        p: Pixel, r: vec_record, i: int, a: float, far: float, features: wp.array2d[float], channels: int,
+        planes: wp.array3d[float], px: int, py: int,
     ):  # fmt: skip
+        """far: its depth, where that is wanted."""
         w = p.t * a
-        if wp.static(wanted.planes):
-            far = depth_at(tilts[i], r, x, y)
         p.colour += w * wp.vec3(r[RED], r[GREEN], r[BLUE])
         if wp.static(wanted.depth):
             p.z += w * far
@@ -270,10 +273,11 @@ def pixel_unlayering(wanted: Wanted):
 
     @wp.func
     def take_off(
-        b: Behind, r: vec_record, i: int, e: float, alpha_max: float, tilts: wp.array[wp.vec3], features: wp.array2d[float], channels: int,
-        grads: wp.array3d[float], px: int, py: int, x: float, y: float,
+        b: Behind, r: vec_record, i: int, e: float, alpha_max: float, far: float, features: wp.array2d[float], channels: int,
+        grads: wp.array3d[float], px: int, py: int,
     ):  # fmt: skip
-        """e: its exp(-s). With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j: dL/da_i = T_i d_i - rest_i / (1 - a_i)."""
+        """e: its exp(-s); far: its depth, where that is wanted. With d_i = c_i . g and rest_i the sum over j behind i of w_j d_j:
+        dL/da_i = T_i d_i - rest_i / (1 - a_i)."""
         full = r[OPACITY] * e
         a = wp.min(full, alpha_max)
         inverse = 1.0 / (1.0 - a)
@@ -284,7 +288,7 @@ def pixel_unlayering(wanted: Wanted):
             for c in range(channels):
                 d += grads[wp.static(wanted.first_channel) + c, py, px] * features[i, c]
         if wp.static(wanted.depth):
-            d += b.g_z * depth_at(tilts[i], r, x, y) + b.g_weights
+            d += b.g_z * far + b.g_weights
         b.de = wp.where(full < alpha_max, (b.t * d - b.rest * inverse) * e, 0.0)
         b.rest += b.w * d
         return b

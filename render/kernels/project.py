@@ -20,7 +20,7 @@ from render.kernels.moments import (
 )
 from render.kernels.ray_bound import pinhole_bound
 from render.kernels.sigma import least_depth_gradient
-from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, tilt_of, write_splat
+from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, slopes_of, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, HALF, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
@@ -62,10 +62,10 @@ def project(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
     view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-    records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
+    records: wp.array2d[float], slopes: wp.array[wp.vec2], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
     first: int,
 ):  # fmt: skip
-    """Records, planes where they are wanted, depth keys and tiles at most of a group's splats; `threads` threads share an item."""
+    """Records, slopes where they are wanted, depth keys and tiles at most of a group's splats; `threads` threads share an item."""
     part = first + wp.tid()
     item = part // threads
     pose = pose_of(poses, items[item, DRAW])
@@ -82,11 +82,11 @@ def project(
             if in_view(t, wp.mat33(axes), scale, view):
                 e = ellipse(exact, footprint(exact, axes, wp.vec3d(scale), view), view)
                 shows = fade(e, opacity, view)
-                tilt = tilt_of(e, exact[2], view)
+                slope = slopes_of(e, exact[2], view)
                 if view.along_rays != 0 and shows[1] > 0.0:
                     e = pinhole_bound(exact, axes * wp.diag(wp.vec3d(scale)), shows[1], view)
                 sight = means[i] - pose.eye
-                write_splat(e, shows, t[2], tilt, pose.instance, sh, i, sight, view, records, tilts, reach, depth_keys, counts, j)
+                write_splat(e, shows, t[2], slope, pose.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
 
 
 @wp.func
@@ -100,7 +100,7 @@ def project_backward(
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
     view: View, poses: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-    records: wp.array2d[float], counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
+    counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
     g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
     g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3], g_uniform: wp.array2d[float],
     first: int,
@@ -121,7 +121,7 @@ def project_backward(
             r_splat = rotation(quats[i])
             scale = wp.vec3d(exp_scale(log_scales[i]))
             f = footprint(t, pose.rotation * r_splat, scale, view)
-            g = gather(ellipse(t, f, view), z, logit_opacities[i], view, records, j, slots, starts[j], counts[j])
+            g = gather(ellipse(t, f, view), z, logit_opacities[i], view, slots, starts[j], counts[j])
             g_logit_opacities[i] = g.logit
 
             uv = cross2(f.u.e, f.v.e)

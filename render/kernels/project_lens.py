@@ -16,7 +16,7 @@ from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
 from render.kernels.sight import AXIS, ROOT_HALF, column, perspective, sight_functions
 from render.kernels.sigma import ROOT6, covariance_backward, least_depth_gradient, reach, reach_backward
-from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, tilt_of, write_splat
+from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, slopes_of, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, ROOT3, View
 
 ROLLED = OPTIONS | {"max_unroll": 0}
@@ -74,7 +74,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
         means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
         logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
         view: View, optics: Optics, motions: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-        records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
+        records: wp.array2d[float], slopes: wp.array[wp.vec2], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int],
         first: int,
     ):  # fmt: skip
         """As `project`."""
@@ -96,7 +96,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if ahead:
                     e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view))
                     shows = fade(e, opacity, view)
-                    tilt = tilt_of(e, c.depth, view)
+                    slope = slopes_of(e, c.depth, view)
                     if view.along_rays != 0 and shows[1] > 0.0:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
                         if motion.copy != 0 and e.seen == ANYWHERE:
@@ -106,14 +106,14 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         along = AXIS
                     sight = wp.vec3(wp.transpose(c.rotation) * along)
                     depth = float(c.depth)
-                    write_splat(e, shows, depth, tilt, motion.instance, sh, i, sight, view, records, tilts, reach, depth_keys, counts, j)
+                    write_splat(e, shows, depth, slope, motion.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens_backward(
         means: wp.array[wp.vec3], quats: wp.array[wp.vec4], log_scales: wp.array[wp.vec3],
         logit_opacities: wp.array[float], sh: wp.array2d[wp.vec3],
         view: View, optics: Optics, motions: wp.array2d[wp.float64], items: wp.array2d[int], threads: int,
-        records: wp.array2d[float], counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
+        counts: wp.array[int], starts: wp.array[int], slots: wp.array2d[float],
         g_means: wp.array[wp.vec3], g_quats: wp.array[wp.vec4], g_log_scales: wp.array[wp.vec3],
         g_logit_opacities: wp.array[float], g_sh: wp.array2d[wp.vec3], g_uniform: wp.array2d[float],
         first: int,
@@ -148,7 +148,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 axes = scaled_axes(quats[i], log_scales[i])
                 q = spread(optics, motion, x, axes, c, view)
                 e = ellipse(optics, motion, q)
-                g = gather(e, c.depth, logit_opacities[i], view, records, j, slots, starts[j], counts[j])
+                g = gather(e, c.depth, logit_opacities[i], view, slots, starts[j], counts[j])
                 g_logit_opacities[i] = g.logit
                 g_mean_px = wp.vec2d(g.x, g.y)
                 g_v = covariance_backward(q.v, g.xx, g.xy, g.yy, g.det0)

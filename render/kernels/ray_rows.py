@@ -16,8 +16,8 @@ import warp as wp
 
 from render.kernels.canonical import GROUP, MOVED
 from render.kernels.lanewise import below, cut
-from render.kernels.rows import exp_of, row_range
-from render.kernels.types import OPACITY, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
+from render.kernels.rows import depth_along, exp_of, from_corner, row_range
+from render.kernels.types import FARTHEST, OPACITY, S_MAX, TILE, X_REST, Y_REST, H, K, M, X, Y, Z, lanes
 
 lanes64 = wp.types.vector(length=TILE, dtype=wp.float64)
 
@@ -129,8 +129,9 @@ def reach_of(records: wp.array[lanes], ids: wp.array[int], start: int, stop: int
 
 @cache
 def ray_functions(ray: bool, eyes: bool, squarings: int):
-    """How a row of pixels looks at a splat: `canonical`, its rays in the splat's frame, u and q, and `faded`, exp(-s) within the cutoff and
-    0 beyond it, by the conic or along the rays. eyes: rays begin in places of their own, and each instance may have rays of its own."""
+    """How a row of pixels looks at a splat: `canonical`, its rays in the splat's frame, u and q, `faded`, exp(-s) within the cutoff and 0
+    beyond it, by the conic or along the rays, and `depth`. eyes: rays begin in places of their own, and each instance may have rays of its
+    own."""
     exp_minus = exp_of(squarings)
 
     @wp.func
@@ -176,14 +177,26 @@ def ray_functions(ray: bool, eyes: bool, squarings: int):
         s = s + (lanes(1.0) - below(0.0, wp.cw_mul(beside, beside) - lanes(record[X_REST] * record[X_REST]))) * (2.0 * s_max)
         return cut(s, s_max, exp_minus(s))
 
-    return canonical, faded_conic, faded_along
+    @wp.func
+    def depth(
+        record: lanes, slopes: wp.array[wp.vec2], frames: wp.array2d[wp.float64], i: int, rays: wp.array4d[lanes64],
+        column: lanes, x0: float, y0: float, row: int, tx: int, r: int,
+    ):  # fmt: skip
+        """Where a row's pixels meet the splat; of no meaning where they do not."""
+        if wp.static(ray):
+            ux, uy, uz, qx, qy, qz = canonical(frames, i, rays, row, tx)
+            t = wp.cw_div(dot(ux, uy, uz, qx, qy, qz), square(ux, uy, uz))
+            return lanes(wp.min(wp.max(t, lanes64(NONE)), lanes64(wp.float64(FARTHEST))))
+        return depth_along(from_corner(slopes[i], record, x0, y0), column, r)
+
+    return canonical, faded_conic, faded_along, depth
 
 
 @cache
 def list_row(ray: bool, eyes: bool, ordered: bool, squarings: int):
     """Makes a row's list: which of the tile's entries, their alphas, and, where pixels want another order than the tile's, their sorted
     keys. Returns how many entries, and whether they are sorted by key."""
-    canonical, faded_conic, faded_along = ray_functions(ray, eyes, squarings)
+    canonical, faded_conic, faded_along, _ = ray_functions(ray, eyes, squarings)
 
     @wp.func
     def make(

@@ -5,7 +5,7 @@ from functools import cache
 import warp as wp
 
 from render.kernels.lanewise import cut, greater, greatest, lesser
-from render.kernels.types import ALONG, AT, DOWN, OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, Window, X, Y, lanes
+from render.kernels.types import ALONG, DOWN, OPTIONS, S_MAX, SLACK, TILE, X_REST, Y_EXT, Y_REST, H, K, M, Window, X, Y, Z, lanes
 
 LAST = wp.constant(TILE - 1)
 WIDTH = wp.constant(float(TILE - 1))
@@ -52,15 +52,15 @@ def corner_of(window: Window, tile: int):
 
 
 @wp.func
-def from_corner(tilt: wp.vec3, record: lanes, x0: float, y0: float):
-    """A splat's plane from the tile's first pixel centre x0, y0 on: its depth there instead of at (X, Y)."""
-    return wp.vec3(tilt[AT] + tilt[ALONG] * (x0 - record[X]) + tilt[DOWN] * (y0 - record[Y]), tilt[ALONG], tilt[DOWN])
+def from_corner(slope: wp.vec2, record: lanes, x0: float, y0: float):
+    """A splat's slopes, and its depth at the tile's first pixel centre x0, y0."""
+    return wp.vec3(slope[ALONG], slope[DOWN], record[Z] + slope[ALONG] * (x0 - record[X]) + slope[DOWN] * (y0 - record[Y]))
 
 
 @wp.func
-def depth_along(slopes: wp.vec3, column: lanes, row: int):
-    """The plane's depth at a row's pixels; slopes: as of `from_corner`."""
-    return lanes(slopes[AT] + float(row) * slopes[DOWN]) + column * slopes[ALONG]
+def depth_along(corner: wp.vec3, column: lanes, row: int):
+    """A splat's depth at a row's pixels; corner: as of `from_corner`."""
+    return lanes(corner[2] + float(row) * corner[DOWN]) + column * corner[ALONG]
 
 
 @wp.func

@@ -12,7 +12,6 @@ from render.kernels.types import (
     BLUE,
     CULLED,
     G_ALONG,
-    G_AT,
     G_BLUE,
     G_DOWN,
     G_GREEN,
@@ -23,6 +22,7 @@ from render.kernels.types import (
     G_RED,
     G_X,
     G_Y,
+    G_Z,
     GRADIENTS,
     GREEN,
     HALF,
@@ -68,16 +68,6 @@ class Ellipse:
     yz: wp.float64
     zz: wp.float64
     seen: float  # along rays, how far from x, in pixels
-
-
-@wp.struct
-class Tilt:
-    """A splat's mean on the image, and what its depth grows by from there, a pixel."""
-
-    x: wp.float64
-    y: wp.float64
-    along: wp.float64
-    down: wp.float64
 
 
 @wp.struct
@@ -140,22 +130,17 @@ def calmed(e: Ellipse, depth: wp.float64):
 
 
 @wp.func
-def tilt_of(e: Ellipse, depth: wp.float64, view: View):
-    slopes = calmed(e, depth) * regressed(e, view)
-    tilt = Tilt()
-    tilt.x = e.x
-    tilt.y = e.y
-    tilt.along = slopes[0]
-    tilt.down = slopes[1]
-    return tilt
+def slopes_of(e: Ellipse, depth: wp.float64, view: View):
+    """What a splat's depth grows by, a pixel to the right and down."""
+    return wp.vec2(calmed(e, depth) * regressed(e, view))
 
 
 @wp.func
 def write_splat(
-    e: Ellipse, shows: wp.vec2, depth: float, tilt: Tilt, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
-    records: wp.array2d[float], tilts: wp.array[wp.vec3], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
+    e: Ellipse, shows: wp.vec2, depth: float, slope: wp.vec2, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
+    records: wp.array2d[float], slopes: wp.array[wp.vec2], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
 ):  # fmt: skip
-    """Record j, its plane where planes are wanted, its reach, its depth key (the bits of a positive float sort as an int) and tiles at
+    """Record j, its slopes where they are wanted, its reach, its depth key (the bits of a positive float sort as an int) and tiles at
     most; left culled where nothing shows.
 
     shows: as of `fade`. sight: the way it is seen, from the eye to the splat, in its local frame, of any length.
@@ -183,9 +168,8 @@ def write_splat(
         records[j, OPACITY] = shows[0]
         records[j, S_MAX] = s_max
         records[j, Z] = depth
-        if tilts.shape[0] > 0:
-            at = wp.float64(depth) + tilt.along * (wp.float64(x) - tilt.x) + tilt.down * (wp.float64(y) - tilt.y)
-            tilts[j] = wp.vec3(wp.vec3d(at, tilt.along, tilt.down))
+        if slopes.shape[0] > 0:
+            slopes[j] = slope
         records[j, INSTANCE] = instance
         records[j, Y_EXT] = y_ext
         records[j, Y_AT_EXT] = float(e.xy / xx) * x_ext
@@ -213,11 +197,8 @@ def cull(depth_keys: wp.array[int], counts: wp.array[int], j: int):
 
 
 @wp.func
-def gather(
-    e: Ellipse, depth: wp.float64, logit: float, view: View, records: wp.array2d[float], j: int, slots: wp.array2d[float], start: int,
-    count: int,
-):  # fmt: skip
-    """Sum a splat's slots in fixed order and carry them from its record j to its ellipse; logit is its opacity's."""
+def gather(e: Ellipse, depth: wp.float64, logit: float, view: View, slots: wp.array2d[float], start: int, count: int):
+    """Sum a splat's slots in fixed order and carry them from its record to its ellipse; logit is its opacity's."""
     o = sigmoid(logit)
     g = vec_gradients()
     for slot in range(start, start + count):
@@ -255,17 +236,15 @@ def gather(
     # depth at a pixel is that of the mean, and slopes times the way from there
     slopes = regressed(e, view)
     kept = calmed(e, depth)
-    g_along = g[G_ALONG] + (wp.float64(records[j, X]) - e.x) * g[G_AT]
-    g_down = g[G_DOWN] + (wp.float64(records[j, Y]) - e.y) * g[G_AT]
-    g_kept = g_along * slopes[0] + g_down * slopes[1]
-    out.x = g[G_X] - kept * slopes[0] * g[G_AT]
-    out.y = g[G_Y] - kept * slopes[1] * g[G_AT]
-    out.depth = g[G_AT]
+    g_kept = g[G_ALONG] * slopes[0] + g[G_DOWN] * slopes[1]
+    out.x = g[G_X] - kept * slopes[0] * g[G_Z]
+    out.y = g[G_Y] - kept * slopes[1] * g[G_Z]
+    out.depth = g[G_Z]
     if kept < ONE:
         out.depth += g_kept * kept / depth
         out.zz = -HALF * g_kept * kept / e.zz
-    out.xz = kept * (yy * g_along - e.xy * g_down) / det
-    out.yz = kept * (wide[0] * g_down - e.xy * g_along) / det
+    out.xz = kept * (yy * g[G_ALONG] - e.xy * g[G_DOWN]) / det
+    out.yz = kept * (wide[0] * g[G_DOWN] - e.xy * g[G_ALONG]) / det
     out.xx -= out.xz * slopes[0]
     out.xy -= out.xz * slopes[1] + out.yz * slopes[0]
     out.yy -= out.yz * slopes[1]

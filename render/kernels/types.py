@@ -22,13 +22,15 @@ bounds a splat, and X_REST is how far from X it may be seen: half a turn, of a l
 X, Y, K, M, H, OPACITY, S_MAX, RED, GREEN, BLUE, Z, INSTANCE, Y_EXT, Y_AT_EXT, X_REST, Y_REST = (wp.constant(i) for i in range(RECORD))
 # Y_EXT: the ellipse's reach in y; Y_AT_EXT: dy of its rightmost point
 
-AT, ALONG, DOWN = (wp.constant(i) for i in range(3))
-"""A projected splat's plane, beside its record: its depth at (X, Y), and what that grows by from pixel to pixel. It is where a ray meets
-the splat, to first order (Zhang et al. 2024, "RaDe-GS"): the mean of depth that the projected 3D Gaussian has at the pixel."""
+ALONG, DOWN = wp.constant(0), wp.constant(1)
+"""A projected splat's slopes, beside its record: what its depth grows by from Z at (X, Y) on, a pixel to the right and down. So it is, to
+first order, where a ray meets the splat (Zhang et al. 2024, "RaDe-GS"): the mean of depth that the projected 3D Gaussian has at the pixel.
+With response "ray" it is where the ray itself does, and there are none."""
 
 GRADIENTS = 12
-"""Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE), then of the plane's three."""
-G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_AT, G_ALONG, G_DOWN = (wp.constant(i) for i in range(GRADIENTS))
+"""Floats of a gradient slot, one slot an intersection: d loss / d (X, Y, K, M, H, OPACITY, RED, GREEN, BLUE, Z), then of the
+slopes."""
+G_X, G_Y, G_K, G_M, G_H, G_OPACITY, G_RED, G_GREEN, G_BLUE, G_Z, G_ALONG, G_DOWN = (wp.constant(i) for i in range(GRADIENTS))
 
 
 class Wanted(NamedTuple):
@@ -47,7 +49,7 @@ class Wanted(NamedTuple):
         return 6 if self.depth else 4
 
     @property
-    def planes(self) -> bool:
+    def depths(self) -> bool:
         return self.depth or self.median
 
     @property
