@@ -55,9 +55,10 @@ class Frame:
 
     rgb `[H, W, 3]` display-referred, premultiplied over black where no background was given, not clamped above 1;
     alpha `[H, W]`; depth `[H, W]` in metres, inf where alpha is 0: z, and for fisheye and equirectangular lenses the distance, at which the
-    pixel's ray meets the splats, the mean by their weights, each, to first order, where it is densest along the ray (Zhang et al. 2024,
-    "RaDe-GS"), no nearer than about half its centre's; median_depth `[H, W]` that of the splat behind which less than half of the light
-    passes, inf where alpha is below 0.5; normal `[H, W, 3]` unit vectors in the camera, towards it, 0 where alpha is 0;
+    pixel's ray meets the splats, the mean by their weights; it meets each where that is densest along it, to first order with response
+    "conic" (Zhang et al. 2024, "RaDe-GS"), and there no nearer than half as far as its centre; median_depth `[H, W]` that of the splat
+    behind which less than half of the light passes, inf where alpha is below 0.5; normal `[H, W, 3]` unit vectors in the camera, towards
+    it, 0 where alpha is 0;
     features `[H, W, C]` summed as colours are; flow_prev, flow_next `[H, W, 2]` pixels to the same point in the other frame, and
     visible_prev, visible_next `[H, W]` bool, whether that frame shows it; instance `[H, W]` int32, the id whose splats weigh most together
     of what is drawn there (of two always the heavier, of more surely one that is more than half), -1 where alpha is below 0.5;
