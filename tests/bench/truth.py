@@ -4,9 +4,10 @@
         [--splats 80000] [--look OUT]
 
 FOLDER keeps what was traced of each place, for the next run. Of frames that no fit saw, at the recorded place and beside it: PSNR of all,
-of the ground, and of what moves; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times
-("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was rendered over the
-truth.
+of all with the fit's photos (as `render --enhance` makes each frame by itself), of the ground, and of what moves; how sharp both are, in
+parts of the truth's variance of the Laplacian; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more
+than 1.25 times ("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was
+rendered, that enhanced, and the truth.
 """
 
 from __future__ import annotations
