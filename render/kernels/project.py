@@ -20,7 +20,7 @@ from render.kernels.moments import (
 )
 from render.kernels.ray_bound import pinhole_bound
 from render.kernels.sigma import least_depth_gradient
-from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, slopes_of, write_splat
+from render.kernels.splat import Ellipse, colour_backward, cull, fade, gather, no_gradient, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FARTHEST, FIRST, HALF, OPTIONS, REACH, TWO, UNIFORM_GRADIENTS, View, pose_of
 
 wp.set_module_options(OPTIONS)
@@ -82,11 +82,10 @@ def project(
             if in_view(t, wp.mat33(axes), scale, view):
                 e = ellipse(exact, footprint(exact, axes, wp.vec3d(scale), view), view)
                 shows = fade(e, opacity, view)
-                slope = slopes_of(e, exact[2], view)
                 if view.along_rays != 0 and shows[1] > 0.0:
                     e = pinhole_bound(exact, axes * wp.diag(wp.vec3d(scale)), shows[1], view)
                 sight = means[i] - pose.eye
-                write_splat(e, shows, t[2], slope, pose.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
+                write_splat(e, shows, t[2], pose.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
 
 
 @wp.func

@@ -16,7 +16,7 @@ from render.kernels.project import in_view
 from render.kernels.ray_bound import ANYWHERE, lens_bound
 from render.kernels.sight import AXIS, ROOT_HALF, column, perspective, sight_functions
 from render.kernels.sigma import ROOT6, covariance_backward, least_depth_gradient, reach, reach_backward
-from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, slopes_of, write_splat
+from render.kernels.splat import colour_backward, cull, fade, gather, no_gradient, write_splat
 from render.kernels.types import BASE, COUNT, DRAW, FIRST, OPTIONS, ROOT3, View
 
 ROLLED = OPTIONS | {"max_unroll": 0}
@@ -96,7 +96,6 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                 if ahead:
                     e = ellipse(optics, motion, spread(optics, motion, x, axes, c, view))
                     shows = fade(e, opacity, view)
-                    slope = slopes_of(e, c.depth, view)
                     if view.along_rays != 0 and shows[1] > 0.0:
                         e = bound(optics, motion, x, axes, c, shows[1], view)
                         if motion.copy != 0 and e.seen == ANYWHERE:
@@ -106,7 +105,7 @@ def lens_kernels(lens: LensFunctions, rolling: bool) -> LensKernels:
                         along = AXIS
                     sight = wp.vec3(wp.transpose(c.rotation) * along)
                     depth = float(c.depth)
-                    write_splat(e, shows, depth, slope, motion.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
+                    write_splat(e, shows, depth, motion.instance, sh, i, sight, view, records, slopes, reach, depth_keys, counts, j)
 
     @wp.kernel(module="unique", module_options=ROLLED, enable_backward=False)
     def project_lens_backward(

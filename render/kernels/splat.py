@@ -137,7 +137,7 @@ def slopes_of(e: Ellipse, depth: wp.float64, view: View):
 
 @wp.func
 def write_splat(
-    e: Ellipse, shows: wp.vec2, depth: float, slope: wp.vec2, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
+    e: Ellipse, shows: wp.vec2, depth: float, instance: float, sh: wp.array2d[wp.vec3], i: int, sight: wp.vec3, view: View,
     records: wp.array2d[float], slopes: wp.array[wp.vec2], reach: wp.array2d[int], depth_keys: wp.array[int], counts: wp.array[int], j: int,
 ):  # fmt: skip
     """Record j, its slopes where they are wanted, its reach, its depth key (the bits of a positive float sort as an int) and tiles at
@@ -169,7 +169,7 @@ def write_splat(
         records[j, S_MAX] = s_max
         records[j, Z] = depth
         if slopes.shape[0] > 0:
-            slopes[j] = slope
+            slopes[j] = slopes_of(e, wp.float64(depth), view)
         records[j, INSTANCE] = instance
         records[j, Y_EXT] = y_ext
         records[j, Y_AT_EXT] = float(e.xy / xx) * x_ext
