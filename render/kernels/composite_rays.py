@@ -313,17 +313,16 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                             group = int(0)
                             if wp.static(eyes):
                                 group = int(frames[i, GROUP])
-                            # depth is t itself: dt/dq = u / |u|^2, dt/du = (q - 2 t u) / |u|^2
-                            g_far = lanes64(NONE)
                             if wp.static(wanted.depth):
+                                # depth is t itself: dt/dq = u / |u|^2, dt/du = (q - 2 t u) / |u|^2
                                 g_far = wp.cw_mul(lanes64(wp.cw_mul(w, grads[4, row, tx])), inverse)
-                            twice = t64 * TWO
-                            vx = wp.cw_mul(g_far, qx - wp.cw_mul(twice, ux))
-                            vy = wp.cw_mul(g_far, qy - wp.cw_mul(twice, uy))
-                            vz = wp.cw_mul(g_far, qz - wp.cw_mul(twice, uz))
-                            wx = wp.cw_mul(g_far, ux)
-                            wy = wp.cw_mul(g_far, uy)
-                            wz = wp.cw_mul(g_far, uz)
+                                twice = t64 * TWO
+                                vx = wp.cw_mul(g_far, qx - wp.cw_mul(twice, ux))
+                                vy = wp.cw_mul(g_far, qy - wp.cw_mul(twice, uy))
+                                vz = wp.cw_mul(g_far, qz - wp.cw_mul(twice, uz))
+                                wx = wp.cw_mul(g_far, ux)
+                                wy = wp.cw_mul(g_far, uy)
+                                wz = wp.cw_mul(g_far, uz)
                             for c in range(3):
                                 ahead = rays[group, c, row, tx]
                                 away = lanes64(frames[i, CENTRE + c])
@@ -332,15 +331,18 @@ def composite_rays_gradient(wanted: Wanted, ray: bool, eyes: bool, ordered: bool
                                 missed = away - wp.cw_mul(t64, ahead)
                                 pushed = mx * frames[i, c] + my * frames[i, 3 + c] + mz * frames[i, 6 + c]
                                 g_rays[group, c, row, tx] = g_rays[group, c, row, tx] - wp.cw_mul(t64, pushed)
+                                of_x = wp.dot(mx, missed)
+                                of_y = wp.dot(my, missed)
+                                of_z = wp.dot(mz, missed)
                                 if wp.static(wanted.depth):
+                                    of_x += wp.dot(wx, away) + wp.dot(vx, ahead)
+                                    of_y += wp.dot(wy, away) + wp.dot(vy, ahead)
+                                    of_z += wp.dot(wz, away) + wp.dot(vz, ahead)
                                     by_u = vx * frames[i, c] + vy * frames[i, 3 + c] + vz * frames[i, 6 + c]
                                     g_rays[group, c, row, tx] = g_rays[group, c, row, tx] + by_u
                                     pushed = pushed + wx * frames[i, c] + wy * frames[i, 3 + c] + wz * frames[i, 6 + c]
                                 if wp.static(eyes):
                                     g_rays[group, 3 + c, row, tx] = g_rays[group, 3 + c, row, tx] - pushed
-                                of_x = wp.dot(mx, missed) + wp.dot(wx, away) + wp.dot(vx, ahead)
-                                of_y = wp.dot(my, missed) + wp.dot(wy, away) + wp.dot(vy, ahead)
-                                of_z = wp.dot(mz, missed) + wp.dot(wz, away) + wp.dot(vz, ahead)
                                 sums[band, j, GRADIENTS + c] = sums[band, j, GRADIENTS + c] + of_x
                                 sums[band, j, GRADIENTS + 3 + c] = sums[band, j, GRADIENTS + 3 + c] + of_y
                                 sums[band, j, GRADIENTS + 6 + c] = sums[band, j, GRADIENTS + 6 + c] + of_z
