@@ -8,6 +8,7 @@ from functools import partial
 
 import torch
 
+from recon.fit.agreement import Agreement
 from recon.fit.densify import hold_shade, shade_of
 from recon.fit.descent import rates_at
 from recon.fit.develop import developed
@@ -30,6 +31,7 @@ from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
 from recon.views.frames import Frames
 from recon.views.view import View
+from render.flat_field import evened
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -56,14 +58,19 @@ rest is fitted on around them."""
 CLIPPED = 0.99
 """Colour of a picture from which on it may be clipped."""
 
+COMPARED_FROM, AGREEMENT, APART = 0.15, 2.0, 2
+"""Part of the fit from which photos are compared with one another (before, pictures are too coarse to tell); what their difference weighs
+beside the picture's loss, less as steps settle, so that the last word is the picture's; and every how many rows and columns they are
+compared."""
+
 FADE = 0.003
 """Logit that a splat loses each time it is in sight, unless pictures hold it up: what nothing needs fades. It decays as the step sizes do,
 which could not resist it at the end."""
 
-RATES = {"means": 3e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 1e-2, "harmonics": 1e-3}
+RATES = {"means": 6e-4, "quats": 2e-3, "log_scales": 3.2e-2, "logits": 4e-2, "colours": 1e-2, "harmonics": 1e-3}
 """Adam's step sizes by field; of means as a part of each splat's reach, which is 0.3 pixels. A splat is in sight for a few hundred steps,
-which must take it from its seed to what pictures show: with a third of the rate of means and a quarter of that of scales, fits ended half
-way. Twice the rate of colours puts into colours what belongs into depth."""
+which must take it from its seed to what pictures show: with a sixth of the rate of means and a quarter of that of scales, fits ended half
+way. Twice the rate of colours puts into colours what belongs into depth; of means, too, but that photos are compared."""
 
 
 class Fit:
@@ -95,6 +102,7 @@ class Fit:
         self.recent_loss = 0.0
         self.targets = Targets()
         self.turns = Turns(self._weights(), self.generator)
+        self.agreement = Agreement(self.training, self.motion, aside_of(measured))
         self.openings = Openings(frames, self.motion, self.device, aside_of(measured))
         gains = {v.time_us: frames.followed(v.time_us) for v in frames.views}
         self._followed = {time: None if gain is None else gain.to(self.device) for time, gain in gains.items()}
@@ -151,7 +159,8 @@ class Fit:
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
         sky = self.openings.backdrop(self.sky, self.generator)
-        outputs = ["rgb", "alpha", *["depth"] * bool(known), *["features"] * (blank is not None)]
+        other = self._other(view) if known else None
+        outputs = ["rgb", "alpha", *["depth"] * bool(known), *["instance"] * (other is not None), *["features"] * (blank is not None)]
         drawn = self._render(by_lot, shot, sky, shift, outputs, blank)
         rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
         if view.camera in self.evened:
@@ -170,6 +179,8 @@ class Fit:
             weights, depths = zip(*known, strict=True)
             mistakes = mistake(drawn["depth"], alpha, torch.stack(depths)).unbind()
             haze = haze + sum(self.config.depth_weight * weight * each for weight, each in zip(weights, mistakes, strict=True))
+        if other is not None:
+            haze = haze + self._disagreement(shot, drawn, target, other)
         unrest = self.limbs.unrest(shot.near, camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
@@ -185,6 +196,17 @@ class Fit:
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
+
+    def _other(self, view: View) -> View | None:
+        """The view whose photo a step compares a view's with."""
+        return self.agreement.other(view, self.generator) if self.progress >= COMPARED_FROM else None
+
+    def _disagreement(self, shot: Shot, drawn: dict[str, torch.Tensor], target: torch.Tensor, other: View) -> torch.Tensor:
+        """What a shot's photo and another view's cost that differ, each as a camera would show it that shows all of its picture alike."""
+        field = self.flat_fields[other.camera].gains
+        target, photo = (evened(picture, field) for picture in (target, self.targets.picture(other, self.shrink())))
+        lattice = (APART, *torch.randint(0, APART, (2,), generator=self.generator).tolist())
+        return AGREEMENT * self._settled() * self.agreement.cost(shot, drawn, target, other, photo, lattice)
 
     def _judged(self, rgb: torch.Tensor, target: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
         """The rendered picture of a view, as recorded where the record says nothing of the scene."""

@@ -16,6 +16,7 @@ from recon.kernels import press as press_kernels
 from recon.kernels import scanlines as scanlines_kernels
 from recon.kernels import shutter as shutter_kernels
 from recon.kernels import sight as sight_kernels
+from recon.kernels.agreement import look_kernel
 from recon.kernels.similarity import similar_kernel
 from render import block_compositing, rasterize
 from render.block_compositing import draw_blocks, draw_blocks_backward
@@ -66,6 +67,7 @@ KERNELS = {
     "sight": lambda: sight_kernels.mark,
     "similarity": lambda: similar_kernel(wp.float32),
     "shutter": lambda: shutter_kernels.carry,
+    "agreement": lambda: look_kernel(LENS_FUNCTIONS["opencv"]),
     "march": lambda: ground_kernels.march,
     "look": lambda: planes_kernels.look,
     "compare": lambda: planes_kernels.compare_kernel(3),
