@@ -43,12 +43,10 @@ class Agreement:
         """metres: how far aside of the path the scene is to be seen."""
         self.motion = motion
         eyes = torch.stack([motion.camera(v).world_from_cam[:3, 3].detach() for v in training])
-        self.others: dict[tuple[int, int], list[View]] = {}
-        for mine, eye in zip(training, eyes, strict=True):
-            way = (eyes - eye).norm(dim=1)
-            near = ((way >= NEAREST * metres) & (way <= FARTHEST * metres)).tolist()
-            some = [v for v, is_near in zip(training, near, strict=True) if is_near and v.camera == mine.camera]
-            self.others[mine.camera, mine.index] = some
+        way, camera = torch.cdist(eyes, eyes), torch.tensor([v.camera for v in training])
+        near = (way >= NEAREST * metres) & (way <= FARTHEST * metres) & (camera[:, None] == camera)
+        some = [[training[k] for k in row.nonzero()[:, 0].tolist()] for row in near]
+        self.others = {(v.camera, v.index): views for v, views in zip(training, some, strict=True)}
 
     def other(self, mine: View, generator: torch.Generator) -> View | None:
         """A view to compare a view with, another one each time; None where there is none."""
@@ -92,10 +90,8 @@ class Agreement:
         found, slopes = torch.empty(3, *size, device=device), torch.empty(size, device=device)
         instance = drawn["instance"].to(torch.int32)
         with stage(device):
-            readouts.ways, readouts.by_columns = (
-                wp.from_torch(ways.contiguous(), wp.mat44d),
-                int(self.motion.rig[other.camera].shutter == "columns"),
-            )
+            readouts.ways = wp.from_torch(ways.contiguous(), wp.mat44d)
+            readouts.by_columns = int(self.motion.rig[other.camera].shutter == "columns")
             picture.rays, picture.photo = wp.from_torch(rays, wp.vec3), wp.from_torch(target.contiguous(), wp.vec3)
             picture.depth, picture.alpha = (wp.from_torch(drawn[name].contiguous()) for name in ("depth", "alpha"))
             picture.instance = wp.from_torch(instance.contiguous())
