@@ -19,6 +19,7 @@ from recon.fit.motion import Motion, Shot
 from recon.fit.targets import ego_at
 from recon.kernels.agreement import Picture, Readouts, look_kernel
 from recon.views.view import View
+from render.flat_field import evened
 from render.kernels.lenses import LENS_FUNCTIONS
 from render.launch import run_pixels, stage, upload, view
 from render.projection import optics_of
@@ -27,6 +28,13 @@ from scenes.poses import inverse
 
 NEAREST, FARTHEST = 1 / 3, 2.0
 """Way between two photos that are compared, in parts of how far aside of the path a scene is to be seen."""
+
+BEGINS = 0.15
+"""Part of the fit from which photos are compared: before, pictures are too coarse to tell."""
+
+WEIGHT, STEP = 2.0, 2
+"""What the photos' difference weighs beside the picture's loss; less as steps settle, so that the last word is the picture's. And at every
+how many rows and columns they are compared."""
 
 SOLID = 0.9
 """Alpha from which on a pixel's depth is one surface's."""
@@ -52,6 +60,15 @@ class Agreement:
         """A view to compare a view with, another one each time; None where there is none."""
         some = self.others[mine.camera, mine.index]
         return some[int(torch.randint(0, len(some), (), generator=generator))] if some else None
+
+    def sampled(
+        self, shot: Shot, drawn: dict[str, torch.Tensor], photos: tuple[torch.Tensor, torch.Tensor], other: View, field: torch.Tensor,
+        generator: torch.Generator,
+    ) -> torch.Tensor:  # fmt: skip
+        """What a shot's photo and another view's cost that differ, compared at some of their pixels; field: their camera's flat field."""
+        target, photo = (evened(picture, field) for picture in photos)
+        lattice = (STEP, *torch.randint(0, STEP, (2,), generator=generator).tolist())
+        return WEIGHT * self.cost(shot, drawn, target, other, photo, lattice)
 
     def cost(
         self, shot: Shot, drawn: dict[str, torch.Tensor], target: torch.Tensor, other: View, photo: torch.Tensor, lattice: Lattice

@@ -8,7 +8,7 @@ from functools import partial
 
 import torch
 
-from recon.fit.agreement import Agreement
+from recon.fit.agreement import BEGINS, Agreement
 from recon.fit.densify import hold_shade, shade_of
 from recon.fit.descent import rates_at
 from recon.fit.develop import developed
@@ -16,7 +16,7 @@ from recon.fit.flat_field import FEWEST, FlatField, due
 from recon.fit.limbs import Limbs
 from recon.fit.lines import LOOKS, STRAIGHTENED_AT, StreetLines
 from recon.fit.losses import STEP, PictureLoss
-from recon.fit.model import Splats, dimmed_actors, draw
+from recon.fit.model import Splats, dimmed_actors, draw, street_alone
 from recon.fit.motion import Shot
 from recon.fit.openings import Openings, aside_of
 from recon.fit.population import Population
@@ -31,7 +31,6 @@ from recon.seeds.fill import Search
 from recon.seeds.measured import Measured, mistake
 from recon.views.frames import Frames
 from recon.views.view import View
-from render.flat_field import evened
 from render.launch import upload
 from scenes.camera import Camera
 from scenes.gaussians import Placed
@@ -57,11 +56,6 @@ rest is fitted on around them."""
 
 CLIPPED = 0.99
 """Colour of a picture from which on it may be clipped."""
-
-COMPARED_FROM, AGREEMENT, APART = 0.15, 2.0, 2
-"""Part of the fit from which photos are compared with one another (before, pictures are too coarse to tell); what their difference weighs
-beside the picture's loss, less as steps settle, so that the last word is the picture's; and every how many rows and columns they are
-compared."""
 
 FADE = 0.003
 """Logit that a splat loses each time it is in sight, unless pictures hold it up: what nothing needs fades. It decays as the step sizes do,
@@ -159,7 +153,7 @@ class Fit:
         shift = torch.randint(0, SKY_STEP, (2,), generator=self.generator).tolist()
         blank = torch.zeros(len(shown), 1, device=self.device, requires_grad=True) if self._blaming() else None
         sky = self.openings.backdrop(self.sky, self.generator)
-        other = self._other(view) if known else None
+        other = self.agreement.other(view, self.generator) if known and self.progress >= BEGINS else None
         outputs = ["rgb", "alpha", *["depth"] * bool(known), *["instance"] * (other is not None), *["features"] * (blank is not None)]
         drawn = self._render(by_lot, shot, sky, shift, outputs, blank)
         rgb, alpha = self._judged(drawn["rgb"], target, view, camera), drawn["alpha"]
@@ -180,7 +174,8 @@ class Fit:
             mistakes = mistake(drawn["depth"], alpha, torch.stack(depths)).unbind()
             haze = haze + sum(self.config.depth_weight * weight * each for weight, each in zip(weights, mistakes, strict=True))
         if other is not None:
-            haze = haze + self._disagreement(shot, drawn, target, other)
+            photos, field = (target, self.targets.picture(other, self.shrink())), self.flat_fields[view.camera].gains
+            haze = haze + self._settled() * self.agreement.sampled(shot, drawn, photos, other, field, self.generator)
         unrest = self.limbs.unrest(shot.near, camera)
         whole = loss + haze + unrest + 1e-3 * (self.exposures[:, :, 3].square().sum())
         # beside one another, not added up: the poses' unrest is on the host
@@ -196,17 +191,6 @@ class Fit:
         self.step_count += 1
         self.recent_loss = value if self.recent_loss == 0 else 0.98 * self.recent_loss + 0.02 * value
         return value
-
-    def _other(self, view: View) -> View | None:
-        """The view whose photo a step compares a view's with."""
-        return self.agreement.other(view, self.generator) if self.progress >= COMPARED_FROM else None
-
-    def _disagreement(self, shot: Shot, drawn: dict[str, torch.Tensor], target: torch.Tensor, other: View) -> torch.Tensor:
-        """What a shot's photo and another view's cost that differ, each as a camera would show it that shows all of its picture alike."""
-        field = self.flat_fields[other.camera].gains
-        target, photo = (evened(picture, field) for picture in (target, self.targets.picture(other, self.shrink())))
-        lattice = (APART, *torch.randint(0, APART, (2,), generator=self.generator).tolist())
-        return AGREEMENT * self._settled() * self.agreement.cost(shot, drawn, target, other, photo, lattice)
 
     def _judged(self, rgb: torch.Tensor, target: torch.Tensor, view: View, camera: Camera) -> torch.Tensor:
         """The rendered picture of a view, as recorded where the record says nothing of the scene."""
@@ -406,12 +390,6 @@ class Fit:
         self.turns.due = state["due"]
         self.generator.set_state(state["generator"])
         self.step_count, self.recent_loss = state["step"], state["loss"]
-
-
-def street_alone(placed: Sequence[Placed]) -> list[Placed]:
-    """The same, but only the background is differentiated: what another car hides of a mover is held by nothing else, and asked to close
-    gaps it would stretch into streaks."""
-    return [p if p.instance == 0 else p.detach() for p in placed]
 
 
 def adam(groups: list[dict], eps: float) -> torch.optim.Adam:

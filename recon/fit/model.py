@@ -87,6 +87,12 @@ def dimmed_actors(splats: Splats, gain: torch.Tensor | None) -> Splats:
     return splats.changed(sh=torch.cat([sh[:still], brighter(sh[still:], 1 / gain.to(sh))]))
 
 
+def street_alone(placed: Sequence[Placed]) -> list[Placed]:
+    """The same, but only the background is differentiated: what another car hides of a mover is held by nothing else, and asked to close
+    gaps it would stretch into streaks."""
+    return [p if p.instance == 0 else p.detach() for p in placed]
+
+
 MODEL = SplatModel(projection="ewa")
 """What is trained: EWA costs less than UT, and splats this small look the same under both."""
 

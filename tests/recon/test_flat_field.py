@@ -118,7 +118,7 @@ def made(darkened, tmp_path_factory):
     both = []
     with pytest.MonkeyPatch.context() as patch:
         # photos as small as these tell less of depth than lidar does: comparing them costs as much as the field gains
-        patch.setattr("recon.fit.fit.AGREEMENT", 0.0)
+        patch.setattr("recon.fit.agreement.WEIGHT", 0.0)
         for name, config in (("s", CONFIG), ("even", CONFIG.without("flat fields"))):
             path = tmp_path_factory.mktemp("scenes") / name
             reconstruct(open_log(darkened), path, size=SIZE, held_out=4, config=config)
