@@ -11,6 +11,7 @@ from recon.evaluation.offpath import held_out_sweeps
 from recon.fit.config import FitConfig
 from recon.log import Log, Sweep, Track
 from recon.movers.search import with_movers
+from recon.movers.stamped import as_drawn
 from recon.movers.steadying import steadied
 from recon.objects.leaning import leaning
 from recon.registration.adjust import adjusted
@@ -76,7 +77,9 @@ def same_sweeps(log: Log, sweeps: Sequence[Sweep]) -> list[Sweep]:
 def annotated(log: Log, sweeps: Sequence[Sweep]) -> Log:
     """The log, with the movers that `sweeps` show where it has no boxes of its own; boxes lie where their points meet, and on a hill
     lean as the road does."""
-    if not log.tracks and sweeps:
+    if log.tracks:
+        log = as_drawn(log, sweeps)
+    elif sweeps:
         with Progress("movers", total=len(sweeps)) as steps:
             found = with_movers(log, sweeps, steps.step)
         print(f"{log.path} has no boxes: its lidar shows {moving_things(len(found.tracks))}", file=sys.stderr)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from recon.body_path import body_path
 from recon.fit.model import Splats, draw
 from recon.fit.openings import ASIDE, aside_of
-from recon.fit.reach import nearest_of, reach_at, reach_of, spanned
+from recon.fit.reach import held_back, nearest_of, reach_at, reach_of, spanned
 from recon.fit.swept import Swept
 from recon.ground import STRAY_IN_PICTURES, estimate_ground, shown_ground
 from recon.log import Log, SparsePoints, Sweep, Track
@@ -151,7 +151,8 @@ def prepare(
     share = FILLED_PART * budget / max(1, sum(map(len, (filled, *groups))))
     filled, *groups = (fewer(group, max(1, share * len(group))) for group in (filled, *groups))
     of_groups = [torch.full((len(group),), reach) for group, reach in zip(groups, reaches, strict=True)]
-    splats = Splats.of([filled, *groups], [reach_of(filled, ego, rig.values(), nearest), *of_groups])
+    reach = held_back(reach_of(filled, ego, rig.values(), nearest), filled, street.aside.xyz)
+    splats = Splats.of([filled, *groups], [reach, *of_groups])
     of_views = tuple(v.gain for v in frames.views), tuple(v.sky for v in frames.views)
     ground_shown = shown_ground(split.static, ground) if sparse is None else shown_ground(shown, ground, STRAY_IN_PICTURES)
     return Start(splats, tracks, sky, exposures, ego, ground, ground_shown, rig, tuple(street.measured), swept, *of_views)

@@ -19,6 +19,10 @@ NEAREST, NEAR = 3.0, 0.1
 Where a robot's pictures show more than this part of what they show from nearer, that near."""
 
 
+WIDER, THERE = 1.5, 0.01
+"""Times as wide as it is seeded that a splat may become which no picture shows, and metres from such a seed's point that are there."""
+
+
 def nearest_of(measured: Sequence[Measured]) -> float:
     """Metres from the path within which nothing is seen sharper, by the depths in pictures."""
     return min(NEAREST, nearer(measured, NEAR))
@@ -40,3 +44,14 @@ def reach_of(splats: Gaussians, ego: Trajectory, rig: Iterable[RigCamera], neare
     none of them saw must not be cut down to leave gaps."""
     reach = torch.from_numpy(reach_at(splats.means.numpy(), ego, rig, nearest)).float()
     return torch.maximum(reach, splats.log_scales.exp().amax(1) / LARGEST)
+
+
+def held_back(reach: torch.Tensor, splats: Gaussians, hidden: np.ndarray) -> torch.Tensor:
+    """The reach `[N]` of splats, less of those that stand at `hidden` points `[M, 3]`, which no picture shows: they are as wide as lidar's
+    points there are apart. Views from aside, which ask that gaps be closed, are all that pulls at them, and Adam's steps are as long
+    however small a gap is: they swelled until a few blurs stood for a parked car."""
+    if not len(hidden):
+        return reach
+    away, _ = cKDTree(hidden).query(splats.means.numpy())
+    narrow = WIDER * splats.log_scales.exp().amax(1) / LARGEST
+    return torch.where(torch.from_numpy(away < THERE), torch.minimum(reach, narrow), reach)

@@ -1,1 +1,1 @@
-"""What moves in a drive that has no boxes, found in its lidar, or in its pictures where it has none."""
+"""What moves in a drive: where it has no boxes, found in its lidar, or in its pictures; where it has some, these as they are needed."""

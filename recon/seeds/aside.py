@@ -41,12 +41,11 @@ VIEWS = 24
 
 def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, ground: Ground, part: float = 1.0) -> Cloud:
     """Those of world points `[N, 3]` that stand off the ground and the path and lie in no training view's frustum, but in that of one moved
-    aside, with the colours of what is `known` around them; at most one a cell. part: of `SIDES` and `CLEAR`, where gaps are closed less far
-    aside."""
+    aside, with the colours of what is `known` around them and off the ground; at most one a cell. part: of `SIDES` and `CLEAR`, where gaps
+    are closed less far aside."""
     points = points[one_a_voxel(points, CELL)]
     path = cKDTree(log.ego.world_from_body[:, :2, 3].numpy())
-    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy() > NEAR_GROUND
-    points = points[off & (path.query(points[:, :2], workers=2)[0] > part * CLEAR)]
+    points = points[_off(points, ground) & (path.query(points[:, :2], workers=2)[0] > part * CLEAR)]
     wanted = np.zeros(len(points), dtype=bool)
     for c in range(len(frames.names)):
         for view in spread(frames.of(c), VIEWS):
@@ -59,7 +58,15 @@ def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, 
         points = points[~_in_view(points, frames.camera(log, view), np.inf)]
     if not len(points):
         return Cloud.cat([])
-    return Cloud(points, middle_colours(known.xyz, known.rgb, points))
+    # the road is nearer to a car's sill than what pictures show of the car
+    upright = _off(known.xyz, ground)
+    like = upright if upright.any() else ~upright
+    return Cloud(points, middle_colours(known.xyz[like], known.rgb[like], points))
+
+
+def _off(points: np.ndarray, ground: Ground) -> np.ndarray:
+    """Which of world points `[N, 3]` stand off the ground, bool `[N]`."""
+    return points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy() > NEAR_GROUND
 
 
 def _moved(camera: Camera, by: torch.Tensor) -> Camera:

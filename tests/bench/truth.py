@@ -39,12 +39,20 @@ from scenes.camera import Camera
 from scenes.scene import Scene
 from tests.bench.recon import fitted
 from tests.bench.references import pictures
+from tests.bench.worlds.corner import corner
+from tests.bench.worlds.highway import highway
 from tests.bench.worlds.place import Place
 from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
 
-PLACES: dict[str, Callable[[Path], Place]] = {"street": street, "room": lambda _: room(False), "room with people": lambda _: room(True)}
+PLACES: dict[str, Callable[[Path], Place]] = {
+    "street": street,
+    "corner": corner,
+    "highway": highway,
+    "room": lambda _: room(False),
+    "room with people": lambda _: room(True),
+}
 DECIBELS = ("dB", "enhanced", "ground", "movers")
 RATIOS = ("sharp", "enhanced")
 SHARES = ("depth off", "in the way", "beyond", "open")

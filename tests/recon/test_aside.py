@@ -44,6 +44,17 @@ def test_a_wall_past_the_border_is_taken_in_the_colours_beside_it():
     np.testing.assert_allclose(got[:, 3:], [RED, GREY])
 
 
+def test_a_car_takes_no_colour_of_the_road_beside_it():
+    """The road is nearer to its sill than what pictures show of it."""
+    log, frames = ahead()
+    level = Ground(torch.zeros(2, 2), (-50.0, -50.0), 100.0)
+    known = Cloud(np.array([[5.0, 5.9, 0.02]] * 9 + [[7.0, 6.0, 0.8]] * 9), np.array([GREY] * 9 + [RED] * 9))
+    cloud = seen_from_aside(log, frames, np.array([[5.0, 6.2, 0.4]]), known, level)
+    np.testing.assert_allclose(cloud.rgb, [RED])
+    road = Cloud(known.xyz[:9], known.rgb[:9])
+    np.testing.assert_allclose(seen_from_aside(log, frames, np.array([[5.0, 6.2, 0.4]]), road, level).rgb, [GREY])
+
+
 def test_cameras_are_moved_aside_not_ahead():
     left, right = [38.0, 40.0, 1.5], [38.0, -40.0, 1.5]  # in view from 3 m aside of the first; 3 m behind it they are too far off
     assert len(found(left, right)) == 2

@@ -6,7 +6,7 @@ import torch
 
 from recon.fit.densify import LARGEST
 from recon.fit.openings import ASIDE, aside_of
-from recon.fit.reach import NEAREST, nearest_of, reach_at, reach_of
+from recon.fit.reach import NEAREST, WIDER, held_back, nearest_of, reach_at, reach_of
 from recon.seeds.measured import Measured
 from scenes.camera import RigCamera
 from scenes.gaussians import Gaussians
@@ -38,3 +38,12 @@ def test_indoors_things_are_seen_from_nearer_and_walls_stand_closer(depths, near
     shown = torch.linspace(*depths, 4001)[None].repeat_interleave(4, 0) if depths else torch.full((4, 8), torch.nan)
     measured = [Measured({(0, 0): shown.half()}, 1.0)]
     assert nearest_of(measured) == pytest.approx(nearest, rel=0.01) and aside_of(measured) == pytest.approx(aside, rel=0.01)
+
+
+def test_what_no_picture_shows_may_hardly_grow_wider_than_it_is_seeded():
+    places, wide = torch.tensor([[20.0, 8.0, 0.0], [20.0, 9.0, 0.0]]), 0.05
+    splats = Gaussians(places, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), wide).log(), torch.zeros(2), torch.zeros(2, 1, 3))
+    reach = reach_of(splats, PATH, RIG, NEAREST)
+    shown, hidden = held_back(reach, splats, places[1:].double().numpy()).tolist()
+    assert shown == reach[0] and hidden * LARGEST == pytest.approx(WIDER * wide) and hidden < reach[1]
+    assert held_back(reach, splats, np.zeros((0, 3))) is reach

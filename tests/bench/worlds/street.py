@@ -38,7 +38,7 @@ def street(meshes: Path, seed: int = 0) -> Place:
     times = clock(FRAMES + 1, STEP_US)
     return Place(
         "street",
-        joined([*_ground(seed), *_houses(chance), *_furniture(chance, models), *_parked(chance, models)]),
+        joined([*ground(seed), *houses(chance), *furniture(chance, models), *parked(chance, models)]),
         tuple(_movers(models, times)),
         Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0),
         along([(x, 0.25 * math.sin(x / 12) - 2.2) for x in np.arange(-2.0, 60.0)], SPEED, times),
@@ -48,7 +48,7 @@ def street(meshes: Path, seed: int = 0) -> Place:
     )
 
 
-def _ground(seed: int) -> list[Mesh]:
+def ground(seed: int) -> list[Mesh]:
     """Road, side street, pavements with kerbs, dashes, a crossing, patches of newer asphalt, and the country beyond."""
     asphalt, patch = grain(seed, (0.34, 0.34, 0.36), 0.12), grain(seed + 1, (0.25, 0.25, 0.27), 0.12)
     flags, white = grain(seed + 2, (0.6, 0.57, 0.53)), grain(seed + 3, (0.85, 0.85, 0.82), 0.06)
@@ -69,7 +69,7 @@ def _ground(seed: int) -> list[Mesh]:
     return out
 
 
-def _houses(chance: np.random.Generator) -> list[Mesh]:
+def houses(chance: np.random.Generator) -> list[Mesh]:
     """Rows of houses to both sides, of several widths, heights and setbacks, and one row that closes the street; bays repeat every 3 m."""
     out, roof = [], grain(77, (0.4, 0.25, 0.2), 0.2)
     for side in (-1, 1):
@@ -91,7 +91,7 @@ def _houses(chance: np.random.Generator) -> list[Mesh]:
     return [*out, box((LENGTH[1] + 10, 0, 0), (10, 40, 15), far, 3.0, roof)]
 
 
-def _furniture(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
+def furniture(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
     """Trees, lamp posts, and what else stands on pavements."""
     leaves, bark, steel = grain(8, (0.2, 0.36, 0.13), 0.5, 128), grain(9, (0.35, 0.27, 0.2), 0.3, 64), plain((0.35, 0.37, 0.38))
     out = []
@@ -114,7 +114,7 @@ def _furniture(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mes
     return out
 
 
-def _parked(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
+def parked(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
     """Cars along both kerbs, with gaps."""
     out = []
     for side in (-1, 1):
@@ -127,19 +127,19 @@ def _parked(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh]:
     return out
 
 
+def car(track: str, mesh: Mesh, points: list[tuple[float, float]], speed: float, times: torch.Tensor) -> Mover:
+    """A car that goes through points `[x, y]` at a speed in m/s."""
+    size = tuple((mesh.vertices.max(0) - mesh.vertices.min(0)).tolist())
+    return Mover(track, "car", size, (Part(mesh),), along(points, speed, times))
+
+
 def _movers(models: dict[str, Mesh], times: torch.Tensor) -> list[Mover]:
     """A car ahead, two that come, one that crosses, someone who crosses, and two who walk along the houses."""
-
-    def car(track: str, model: str, points: list[tuple[float, float]], speed: float) -> Mover:
-        mesh = models[model]
-        size = tuple((mesh.vertices.max(0) - mesh.vertices.min(0)).tolist())
-        return Mover(track, "car", size, (Part(mesh),), along(points, speed, times))
-
     return [
-        car("ahead", "prius_hybrid", [(14.0, -2.2), (90.0, -2.2)], 6.5),
-        car("coming", "hatchback_red", [(70.0, 2.6), (-40.0, 2.6)], 7.0),
-        car("second", "pickup", [(118.0, 2.7), (-40.0, 2.7)], 8.0),
-        car("crossing", "hatchback_blue", [(69.5, 30.0), (69.5, -40.0)], 5.0),
+        car("ahead", models["prius_hybrid"], [(14.0, -2.2), (90.0, -2.2)], 6.5, times),
+        car("coming", models["hatchback_red"], [(70.0, 2.6), (-40.0, 2.6)], 7.0, times),
+        car("second", models["pickup"], [(118.0, 2.7), (-40.0, 2.7)], 8.0, times),
+        car("crossing", models["hatchback_blue"], [(69.5, 30.0), (69.5, -40.0)], 5.0, times),
         walker("crosses", [(58.0, -8.0), (58.0, 8.0)], 1.4, times, 20),
         walker("along", [(12.0, -7.2), (30.0, -7.2)], 1.3, times, 30),
         walker("towards", [(45.0, 7.0), (30.0, 7.0)], 1.5, times, 40),
