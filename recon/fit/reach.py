@@ -18,7 +18,6 @@ NEAREST, NEAR = 3.0, 0.1
 """Metres from the path within which nothing is seen sharper: the long lens looks ahead, and only wide ones see what is beside the car.
 Where a robot's pictures show more than this part of what they show from nearer, that near."""
 
-
 WIDER, THERE = 1.5, 0.01
 """Times as wide as it is seeded that a splat may become which no picture shows, and metres from such a seed's point that are there."""
 
