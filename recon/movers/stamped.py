@@ -13,14 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from recon.log import LidarPoints, Log, Sweep, Track
-from recon.objects.actors import inside
+from recon.log import Log, Sweep, Track
+from recon.movers.steadying import ABOVE
+from recon.objects.actors import MARGIN, Near, in_box, inside
 from recon.objects.curves import curved
-from scenes.poses import inverse
 from scenes.spread import spread
-
-AROUND, ABOVE = 0.15, 0.2
-"""Metres around a box within which points are its object's, and above its floor from which on: lower ones are the road's."""
 
 FEWEST = 8
 """Points of a sweep by which it is known when the lidar passed."""
@@ -46,8 +43,9 @@ def as_drawn(log: Log, sweeps: Sequence[Sweep]) -> Log:
     def count(sweeps: Sequence[Sweep]) -> None:
         for sweep in sweeps:
             read = sweep.read()
+            near = Near(read.xyz)
             for boxes in tracks.values():
-                boxes.count(sweep.time_us, read)
+                boxes.count(sweep.time_us, near, read.times_us)
 
     count(some)
     drawn, stamped = (sum(boxes.points[k] for boxes in tracks.values()) for k in (0, 1))
@@ -72,27 +70,26 @@ class _Boxes:
         self.path = curved(self.track).trajectory()
         self.row = {int(time): k for k, time in enumerate(self.track.times_us)}
 
-    def count(self, stamp_us: int, read: LidarPoints) -> None:
-        """Look at what a sweep has in and around the box of its stamp, if there is one."""
+    def count(self, stamp_us: int, near: Near, times_us: np.ndarray) -> None:
+        """Look at what a sweep, its points and their times, has in and around the box of its stamp, if there is one."""
         k = self.row.get(stamp_us)
         if k is None:
             return
-        pose, size = self.track.world_from_box[k], self.track.size
-        near = np.flatnonzero((np.abs(read.xyz[:, :2] - pose[:2, 3].numpy()) < 2 * size.max()).all(1))
-        if not len(near):
+        pose = self.track.world_from_box[k]
+        which = near.of(self.track, pose, self.track.size.max())
+        if not len(which):
             return
-        times, of = np.unique(read.times_us[near], return_inverse=True)
-        own = [self._own(read.xyz[near], poses) for poses in (pose[None], self.path.near_each(torch.from_numpy(times))[of])]
+        times, of = np.unique(times_us[which], return_inverse=True)
+        own = [self._own(near.xyz[which], poses) for poses in (pose, self.path.near_each(torch.from_numpy(times))[of])]
         if own[1].sum() >= FEWEST:
-            self.late[k] = float(np.median(read.times_us[near[own[1]]])) - stamp_us
+            self.late[k] = float(np.median(times_us[which[own[1]]])) - stamp_us
             if float((self.path.near(round(stamp_us + self.late[k])) - pose)[:3, 3].norm()) >= MOVED:
                 self.points = [count + int(o.sum()) for count, o in zip(self.points, own, strict=True)]
 
     def _own(self, xyz: np.ndarray, poses: torch.Tensor) -> np.ndarray:
         """Mask of world points `[N, 3]` that are the object's where it is at `poses`, one or `[N, 4, 4]`."""
-        back = inverse(poses).numpy()
-        local = (back[:, :3, :3] @ xyz[:, :, None])[..., 0] + back[:, :3, 3]
-        return inside(local, self.track.size, AROUND) & (local[:, 2] > ABOVE)
+        local = in_box(xyz, poses)
+        return inside(local, self.track.size, MARGIN) & (local[:, 2] > ABOVE)
 
     def drawn(self, usual_us: float) -> Track:
         """The track with its boxes where they were when the lidar passed: as late as over those beside it of which that is known, or as

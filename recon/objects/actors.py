@@ -86,13 +86,13 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     offsets: list[float] = []
     for sweep in sweeps:
         read = sweep.read()
-        near = _Near(read.xyz)
+        near = Near(read.xyz)
         for track in tracks:
             at = stamps[track.name].get(sweep.time_us)
             if at is None:
                 continue
             which = near.of(track, track.world_from_box[at])
-            own = which[_own(_local(near.xyz[which], track.world_from_box[at]), track)]
+            own = which[_own(in_box(near.xyz[which], track.world_from_box[at]), track)]
             sensor = own[read.sensor[own] == track.sensor[at]]
             timed = sensor if len(sensor) >= FEW else own
             if len(timed) >= FEW:
@@ -110,7 +110,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {t.name: [] for t in tracks}
     for sweep in sweeps:
         xyz, times = points.popleft()
-        keep, near = np.ones(len(times), dtype=bool), _Near(xyz)
+        keep, near = np.ones(len(times), dtype=bool), Near(xyz)
         # some stamp a sweep as it begins, others as it ends
         middle = (int(times.min()) + int(times.max())) // 2 if len(times) else sweep.time_us
         there = [(t, smooth, at) for t, smooth in retimed if (at := stamps[t.name].get(sweep.time_us)) is not None or _placed(t, middle)]
@@ -124,7 +124,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
                 # the path has this box at a smoother date than that of its points, which it was drawn around
                 taken = taken + round(smooth[at] - scanned[track.name][at])
             moments = torch.from_numpy(taken)
-            local = _local(xyz[which], path.near_each(moments)[of])
+            local = in_box(xyz[which], path.near_each(moments)[of])
             keep[which[inside(local, track.size, SWEPT_MARGIN, below=-0.05)]] = False
             if (own := _own(local, track) & path.covers_each(moments).numpy()[of]).any():
                 found[track.name].append((local[own], np.full(own.sum(), sweep.index)))
@@ -139,7 +139,7 @@ def split_points(log: Log, sweeps: Sequence[Sweep], tracks: list[Track]) -> Spli
     )
 
 
-class _Near:
+class Near:
     """Points `[N, 3]`, asked for those near a box: x and y on their own, which are looked through for every box."""
 
     def __init__(self, xyz: np.ndarray):
@@ -151,7 +151,7 @@ class _Near:
         return np.flatnonzero((np.abs(self.x - float(pose[0, 3])) < reach) & (np.abs(self.y - float(pose[1, 3])) < reach))
 
 
-def _local(xyz: np.ndarray, world_from_box: torch.Tensor) -> np.ndarray:
+def in_box(xyz: np.ndarray, world_from_box: torch.Tensor) -> np.ndarray:
     """World points `[N, 3]` in the frame of a box at one pose, or each at its own `[N, 4, 4]`."""
     back = inverse(world_from_box).numpy()
     return (back[..., :3, :3] @ xyz[:, :, None])[..., 0] + back[..., :3, 3]

@@ -7,12 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
 from tests.bench.worlds.people import walker
-from tests.bench.worlds.place import Light, Place, along, clock, looking
+from tests.bench.worlds.place import Place, along, clock
 from tests.bench.worlds.solids import box, facade, grain, joined
-from tests.bench.worlds.street import FRAMES, HALF, JUNCTION, KERB, STEP_US, car, furniture, ground, houses, parked
+from tests.bench.worlds.street import (
+    FRAMES,
+    HALF,
+    JUNCTION,
+    KERB,
+    LIDAR,
+    LIGHT,
+    STEP_US,
+    car,
+    furniture,
+    ground,
+    houses,
+    models_in,
+    parked,
+    plaster,
+    rig,
+)
 
 SPEED, RADIUS = 5.5, 9.0
 """Metres a second, and of the turn."""
@@ -21,7 +36,7 @@ SPEED, RADIUS = 5.5, 9.0
 def corner(meshes: Path, seed: int = 1) -> Place:
     """meshes: the folder with the cars' and the street furniture's GLB files."""
     chance = np.random.default_rng(seed)
-    models = {p.stem: read_mesh(p) for p in sorted(meshes.glob("*.glb"))}
+    models = models_in(meshes)
     times = clock(FRAMES + 1, STEP_US)
     lane = JUNCTION[1] - 2.6
     turns = np.linspace(0, math.pi / 2, 30)
@@ -36,10 +51,10 @@ def corner(meshes: Path, seed: int = 1) -> Place:
             walker("crosses", [(58.0, -8.0), (58.0, 8.0)], 1.4, times, 20),
             walker("along", [(JUNCTION[1] + 1.5, 14.0), (JUNCTION[1] + 1.5, 40.0)], 1.3, times, 30),
         ),
-        Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0),
+        LIGHT,
         along([(40.0, -2.2), *arc, (lane, 60.0)], SPEED, times),
-        {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times[:-1]) for name, yaw in (("front", 0.0), ("left", 75.0))},
-        (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85)),
+        rig(times),
+        LIDAR,
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (-1.0, 0.0), (-2.0, 0.0)),
     )
 
@@ -52,7 +67,7 @@ def _side_street(chance: np.random.Generator) -> list[Mesh]:
         y = HALF + 17.0
         while y < 66.0:
             width, height = 3.0 * chance.integers(3, 6), 3.0 * chance.integers(2, 5)
-            wall = facade(int(chance.integers(1 << 20)), tuple(chance.uniform(0.4, 0.8) * (1 + chance.uniform(-0.12, 0.12, 3))))
+            wall = plaster(chance)
             out.append(box((x + side * (4 + chance.uniform(0, 1.5) + 5), y + width / 2, 0), (10.0, width, height), wall, 3.0, roof))
             y += width + chance.choice([0.0, 0.0, 1.5])
     return [*out, box(((JUNCTION[0] + JUNCTION[1]) / 2, 80.0, 0), (40, 10, 12), facade(6, (0.62, 0.55, 0.42)), 3.0, roof)]

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
-from tests.bench.worlds.place import Light, Place, along, clock, looking
-from tests.bench.worlds.solids import blob, box, grain, joined, painted, panel, plain
-from tests.bench.worlds.street import FRAMES, STEP_US, car
+from tests.bench.worlds.place import Light, Place, along, clock
+from tests.bench.worlds.solids import box, crown, grain, joined, painted, panel, plain
+from tests.bench.worlds.street import FRAMES, LIDAR, STEP_US, car, models_in, rig
 
 SPEED = 24.0
 LANE, LOW, HIGH = 3.7, -60.0, 420.0
@@ -24,7 +23,7 @@ EDGE = 3 * LANE + 1.0
 def highway(meshes: Path, seed: int = 2) -> Place:
     """meshes: the folder with the cars' GLB files."""
     chance = np.random.default_rng(seed)
-    models = {p.stem: read_mesh(p) for p in sorted(meshes.glob("*.glb"))}
+    models = models_in(meshes)
     times = clock(FRAMES + 1, STEP_US)
     lanes = [-(1.0 + LANE * (k + 0.5)) for k in range(3)]
     return Place(
@@ -39,8 +38,8 @@ def highway(meshes: Path, seed: int = 2) -> Place:
         ),
         Light((-0.5, -0.35, 0.79), (1.0, 0.95, 0.86), (0.24, 0.28, 0.34), 25.0),
         along([(x, lanes[1] + 0.2 * math.sin(x / 60)) for x in np.arange(-2.0, 260.0, 2.0)], SPEED, times),
-        {"front": looking((480, 270), 64.0, 0.0, (1.5, 0.0, 1.55), times[:-1])},
-        (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85)),
+        {"front": rig(times)["front"]},
+        LIDAR,
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (LANE, 0.0), (-2.0, 0.0), (-LANE, 0.0)),
     )
 
@@ -84,9 +83,7 @@ def _beside(chance: np.random.Generator) -> list[Mesh]:
             y, size = side * chance.uniform(near, far), chance.uniform(0.8, 1.8)
             at = x + chance.uniform(-2, 2)
             out.append(box((at, y, -0.1), (0.3, 0.3, 2.4 * size), bark, 1.0))
-            for _ in range(4):
-                off = chance.uniform(-0.9, 0.9, 3) * size + [at, y, 3.2 * size]
-                out.append(blob(off, chance.uniform(0.8, 1.3, 3) * size, leaves, 6))
+            out += crown(chance, (at, y, 3.2 * size), size, 4, (0.8, 1.3), leaves)
     return out
 
 

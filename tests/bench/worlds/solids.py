@@ -70,6 +70,13 @@ def blob(at: Sequence[float], radii: Sequence[float], texture: np.ndarray, rings
     )
 
 
+def crown(
+    chance: np.random.Generator, middle: Sequence[float], size: float, blobs: int, radii: tuple[float, float], leaves: np.ndarray
+) -> list[Mesh]:
+    """A tree's blobs within 0.9 m of its middle along each axis, of radii between two; all `size` times as large."""
+    return [blob(chance.uniform(-0.9, 0.9, 3) * size + middle, chance.uniform(*radii, 3) * size, leaves, 6) for _ in range(blobs)]
+
+
 def moved(mesh: Mesh, at: Sequence[float], yaw: float = 0.0) -> Mesh:
     """Turned about z by `yaw` radians, then moved."""
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])

@@ -10,9 +10,10 @@ import torch
 
 from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
+from scenes.camera import RigCamera
 from tests.bench.worlds.people import walker
 from tests.bench.worlds.place import Light, Mover, Part, Place, along, clock, looking
-from tests.bench.worlds.solids import blob, box, facade, grain, joined, moved, panel, plain
+from tests.bench.worlds.solids import box, crown, facade, grain, joined, moved, panel, plain
 
 FRAMES, STEP_US = 80, 100_000
 HALF, KERB, JUNCTION, LENGTH = 6.5, 0.13, (62.0, 72.0), (-20.0, 140.0)
@@ -30,22 +31,42 @@ STANDING = (
 )
 """Models, and where they stand, metres along and to the left."""
 
+LIGHT = Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0)
+LIDAR = (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85))
+"""As of `Place`."""
+
 
 def street(meshes: Path, seed: int = 0) -> Place:
     """meshes: the folder with the cars' and the street furniture's GLB files."""
     chance = np.random.default_rng(seed)
-    models = {p.stem: read_mesh(p) for p in sorted(meshes.glob("*.glb"))}
+    models = models_in(meshes)
     times = clock(FRAMES + 1, STEP_US)
     return Place(
         "street",
         joined([*ground(seed), *houses(chance), *furniture(chance, models), *parked(chance, models)]),
         tuple(_movers(models, times)),
-        Light((0.45, -0.5, 0.74), (1.0, 0.92, 0.8), (0.22, 0.27, 0.34), 25.0),
+        LIGHT,
         along([(x, 0.25 * math.sin(x / 12) - 2.2) for x in np.arange(-2.0, 60.0)], SPEED, times),
-        {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times[:-1]) for name, yaw in (("front", 0.0), ("left", 75.0))},
-        (tuple(np.linspace(-24.0, 12.0, 48).tolist()), (1.2, 0.0, 1.85)),
+        rig(times),
+        LIDAR,
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (-1.0, 0.0), (-1.5, 0.0)),
     )
+
+
+def models_in(meshes: Path) -> dict[str, Mesh]:
+    """The GLB files of a folder, by their names."""
+    return {p.stem: read_mesh(p) for p in sorted(meshes.glob("*.glb"))}
+
+
+def rig(times_us: torch.Tensor) -> dict[str, RigCamera]:
+    """A car's cameras, ahead and to the left, that take a picture at all but the last of these times."""
+    yaws = {"front": 0.0, "left": 75.0}
+    return {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times_us[:-1]) for name, yaw in yaws.items()}
+
+
+def plaster(chance: np.random.Generator) -> np.ndarray:
+    """A house's wall in a light colour of its own."""
+    return facade(int(chance.integers(1 << 20)), tuple(chance.uniform(0.4, 0.8) * (1 + chance.uniform(-0.12, 0.12, 3))))
 
 
 def ground(seed: int) -> list[Mesh]:
@@ -80,7 +101,7 @@ def houses(chance: np.random.Generator) -> list[Mesh]:
                 x = JUNCTION[1] + 4
                 continue
             y = side * (HALF + 4 + chance.uniform(0, 2.5) + 5)
-            wall = facade(int(chance.integers(1 << 20)), tuple(chance.uniform(0.4, 0.8) * (1 + chance.uniform(-0.12, 0.12, 3))))
+            wall = plaster(chance)
             out.append(box((x + width / 2, y, 0), (width, 10.0, height), wall, 3.0, roof))
             door = grain(int(chance.integers(1 << 20)), tuple(chance.uniform(0.1, 0.5, 3)), 0.1, 64)
             out.append(box((x + chance.uniform(1, width - 1), y - side * 5.05, 0), (1.1, 0.2, 2.2), door))
@@ -103,9 +124,7 @@ def furniture(chance: np.random.Generator, models: dict[str, Mesh]) -> list[Mesh
             y, size = side * (HALF + 0.9), chance.uniform(0.8, 1.2)
             if chance.random() < 0.6:
                 out.append(box((at, y, KERB), (0.25, 0.25, 2.6 * size), bark, 1.0))
-                for _ in range(7):
-                    off = chance.uniform(-0.9, 0.9, 3) * size + [at, y, 3.6 * size]
-                    out.append(blob(off, chance.uniform(0.5, 0.9, 3) * size, leaves, 6))
+                out += crown(chance, (at, y, 3.6 * size), size, 7, (0.5, 0.9), leaves)
             else:
                 out.append(box((at, y, KERB), (0.14, 0.14, 6.5), steel))
                 out.append(box((at, y - side * 0.8, 6.5), (0.2, 1.8, 0.12), steel))
