@@ -7,7 +7,7 @@ first, curves and gains in one, then sharpening is undone in linear light, and t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,9 +15,10 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from enhance.correcting.grain import Grain, of_object, sharpening, unsharpened
 from enhance.correcting.noise import denoised, variances
-from enhance.correcting.objects import Box, Evidence, ObjectNet, along, boxes, changed, evidence, reaching_over, spots, whole_of
+from enhance.correcting.objects import ObjectNet, changed, evidence, spots, whole_of
+from enhance.correcting.outlines import Box, Boxes, Outline, Outlines, Pixels, along, boxes, reaching_over
 from enhance.correcting.seam import fitted
-from enhance.correcting.shade import NONE, optical_depths, read_ground, shaded
+from enhance.correcting.shade import NONE, SEEN, optical_depths, read_ground, shaded
 
 STEADY = 8
 """Frames over which an object's correction is averaged, at most; one that has been seen in as many is looked at again as rarely."""
@@ -38,6 +39,8 @@ DEEP = 0.25
 @dataclass(frozen=True)
 class Correction:
     """Of one object, the mean over the last frames, each None where too little tells; and in how many frames it was seen.
+
+    All on the CPU, where it is decided what is done.
 
     colours  coefficients `[15]` (`changed`)
     depths   optical depths of its missing shadow
@@ -85,7 +88,8 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     """A frame `[3, H, W]` with the objects of `instance` `[H, W]` (ids from 1) in colours that belong there, without noise and sharpening
     that nothing around them has, and with the shadows that they lacked; and their corrections, to be passed with the next frame. Pixels
     that are neither an object's nor shaded stay as they are."""
-    found = {i: box for i, box in boxes(instance).items() if not _fills(instance, i, box)}
+    ids = instance.cpu()
+    found = {i: box for i, box in boxes(ids).items() if not _fills(ids, i, box)}
     if not found:
         return rgb, {}
     counts = {i: before[i].count if i in before else 0 for i in found}
@@ -93,9 +97,9 @@ def correct(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, before: C
     over = reaching_over(instance) if due else instance
     new = _looked_at(net, rgb, instance, over, due)
     after = {i: before[i].followed(new.get(i)) if i in before else new[i] for i in found}
-    out = rgb.clone()
+    out = rgb.clone(memory_format=torch.contiguous_format)
     _shade(out, instance, found, after)
-    _recolour(out, instance, found, after)
+    _recolour(out, Pixels.of(ids, found, out.device), [after[i].colours for i in found])
     after |= _with_noise(out, over, due, after)
     _calm(out, instance, found, after)
     return out, after
@@ -111,24 +115,30 @@ def _looked_at(net: ObjectNet, rgb: torch.Tensor, instance: torch.Tensor, over: 
     """Corrections by this frame alone of the objects that are due, without noise; `over` is `reaching_over` of the ids."""
     if not due:
         return {}
-    whole, read, around, seams, grains = whole_of(rgb), [], [], [], []
+    outlines, grounds, grains = [], [], []
     for i, box in due.items():
-        part, edge, beyond = (x[..., box.outer_rows, box.outer_columns] for x in (rgb, instance, over))
-        for ids in (edge, beyond):
-            mask = ids == i
-            at = spots(mask, box, float(mask.sum()) / rgb[0].numel())
-            y, x = at.yx.unbind(1)
-            read.append(evidence(part[:, y, x].T, at, whole))
-            seams.append((part, ids, i, at.edges, box))
-        places, (y, x) = box.ground(edge <= 0)
-        around.append(read_ground(rgb[:, y, x].T, places))
+        part, beyond = (x[..., box.outer_rows, box.outer_columns] for x in (rgb, over))
+        outlines += [Outline.of(ids, i, box) for ids in (instance, over)]
+        grounds.append(box.ground(instance))
         grains.append(of_object(part.permute(1, 2, 0), beyond == i, beyond <= 0))
-    fits = [fitted(*seam, guess, net.usual) for seam, guess in zip(seams, net(Evidence.stacked(read)), strict=True)]
+    objects = Outlines(outlines)
+    at = spots(objects, instance.numel())
+    guesses = net(evidence(_colours(rgb, at.yx), at, whole_of(rgb)))
+    fits = fitted(rgb, objects, guesses, net.usual)
+    around = Boxes(due.values(), rgb.device)
+    yx, known = around.spread(grounds, SEEN, repeated=False)
+    shades = net.shade(read_ground(_colours(rgb, yx), around.places(yx), known)).cpu()
     new = {}
-    for i, at_edge, further, shade, grain in zip(due, fits[::2], fits[1::2], net.shade(torch.stack(around)), grains, strict=True):
+    for i, at_edge, further, shade, grain in zip(due, fits[::2], fits[1::2], shades, grains, strict=True):
         colours, ends = at_edge.with_beyond(further)
         new[i] = Correction(colours, ends * shade, grain, None, 1)
     return new
+
+
+def _colours(rgb: torch.Tensor, yx: torch.Tensor) -> torch.Tensor:
+    """Of a picture `[3, H, W]` at rows and columns `[S, N, 2]`: `[S, N, 3]`."""
+    y, x = yx.unbind(2)
+    return rgb[:, y, x].movedim(0, -1)
 
 
 def _with_noise(out: torch.Tensor, over: torch.Tensor, due: dict[int, Box], after: Corrections) -> Corrections:
@@ -165,20 +175,21 @@ def _shade(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], aft
         if surely == 0:
             continue
         lines = along(box.outer_rows, box.rows, out.device), along(box.outer_columns, box.columns, out.device)
-        total[box.outer_rows, box.outer_columns] += surely * (optical_depths(*lines, depths) - NONE).clamp_min(0)
+        total[box.outer_rows, box.outer_columns] += surely * (optical_depths(*lines, depths.to(out.device)) - NONE).clamp_min(0)
     y, x = ((total > 0) & (instance <= 0)).nonzero().unbind(1)
     out[:, y, x] = shaded(out[:, y, x].T, total[y, x]).T
 
 
-def _recolour(out: torch.Tensor, instance: torch.Tensor, found: dict[int, Box], after: Corrections) -> None:
-    """Change the colours of all objects in the picture `out` `[3, H, W]`, where that is not slight."""
-    for i, box in found.items():
-        part, mask = out[:, box.rows, box.columns], instance[box.rows, box.columns] == i
-        given, height = part.permute(1, 2, 0), along(box.rows, box.rows, out.device)
-        change = changed(given, height[:, None].expand(mask.shape), after[i].colours[None])
-        surely = _surely(float(change.square().mean(-1)[mask].mean().sqrt()), SLIGHT)
-        if surely > 0:
-            part.copy_(torch.where(mask, (given + surely * change).clamp(0, 1).permute(2, 0, 1), part))
+def _recolour(out: torch.Tensor, pixels: Pixels, colours: Sequence[torch.Tensor]) -> None:
+    """Change the colours of objects in the picture `out` `[3, H, W]` by their coefficients, where that is not slight."""
+    given = out.flatten(1)[:, pixels.at].T
+    coefficients = torch.stack(list(colours)).to(out.device)
+    change = changed(given[:, None], pixels.height[:, None], coefficients[pixels.which])[:, 0]
+    by = torch.stack([of.mean() for of in change.square().mean(1).split(pixels.counts)]).sqrt()
+    surely = [_surely(power, SLIGHT) for power in by.tolist()]
+    if any(surely):
+        share = torch.tensor(surely, device=out.device)[pixels.which, None]
+        out.flatten(1)[:, pixels.at] = torch.where(share > 0, (given + share * change).clamp(0, 1), given).T
 
 
 def _surely(found: float, slight: float) -> float:

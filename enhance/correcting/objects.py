@@ -8,18 +8,15 @@ Trained to be near in the picture, it corrects less the less sure it is. A missi
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
-from scipy import ndimage
 from torch import nn
 from torch.nn import functional as F
 
 from enhance.batch import Batch
-from enhance.correcting.shade import DOWN, SEEN, ShadeNet, at_most
+from enhance.correcting.outlines import Outlines
+from enhance.correcting.shade import ShadeNet
 
 PIXELS = 384
 """Pixels of an object by which a correction is judged."""
@@ -28,9 +25,6 @@ SEAM, INSIDE, AROUND, ROWS, COLUMNS = 192, 96, 96, 8, 12
 """How many profiles and pixels are read; of the whole picture, a grid of ROWS x COLUMNS."""
 REACH = 4
 """Pixels of a profile on either side of the seam."""
-DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
-FEWEST = 64
-"""Pixels that an object must have: what is smaller stays as it is."""
 COEFFICIENTS = 15
 LUMA = (0.299, 0.587, 0.114)
 
@@ -68,78 +62,6 @@ class Objects(Batch):
     height: torch.Tensor
 
 
-@dataclass(frozen=True)
-class Box:
-    """An object's own rows and columns of a frame, and those with what is around it."""
-
-    rows: slice
-    columns: slice
-    outer_rows: slice
-    outer_columns: slice
-
-    @classmethod
-    def around(cls, rows: slice, columns: slice, height: int, width: int) -> Box:
-        wide = max(8, (rows.stop - rows.start) // 2), max(8, (columns.stop - columns.start) // 2)
-        grown = [slice(max(0, s.start - by), min(n, s.stop + by)) for s, by, n in zip((rows, columns), wide, (height, width), strict=True)]
-        return cls(rows, columns, *grown)
-
-    def places(self, where: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """Of the N pixels that are True in bool `[h, w]` of the outer part: places `[N, 2]` down and across the box, -1..1 within it; and
-        their rows and columns in the frame."""
-        return self._at(*where.nonzero().unbind(1))
-
-    def ground(self, free: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        """The same of those that `read_ground` would read, at most SEEN."""
-        above = int((along(self.outer_rows, self.rows, free.device) <= DOWN[0]).sum())
-        found = free[above:].nonzero()
-        y, x = found[at_most(SEEN, len(found), free.device)].unbind(1)
-        return self._at(y + above, x)
-
-    def _at(self, y: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        y, x = y + self.outer_rows.start, x + self.outer_columns.start
-        return self.placed(y, x), (y, x)
-
-    def placed(self, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """Places `[N, 2]` in the box of rows and columns of the frame."""
-        return torch.stack([_share(y, self.rows), _share(x, self.columns)], -1)
-
-
-def along(part: slice, side: slice, device: torch.device) -> torch.Tensor:
-    """Places `[n]` of the pixels of `part` along a side of a box: -1 where that begins, 1 where it ends."""
-    return _share(torch.arange(part.start, part.stop, device=device), side)
-
-
-def _share(at: torch.Tensor, side: slice) -> torch.Tensor:
-    return (at + 0.5 - side.start) / (side.stop - side.start) * 2 - 1
-
-
-def boxes(instance: torch.Tensor) -> dict[int, Box]:
-    """Of every object of FEWEST pixels and more in `[H, W]`, by its id above 0."""
-    ids = instance.clamp_min(0).long().cpu().numpy()
-    height, width = ids.shape
-    names: Sequence[int] = range(int(ids.max()) + 1)
-    if len(names) > ids.size:  # as colours that stand for objects: SciPy would make a list as long as the highest
-        several, ids = np.unique(np.append(ids, 0), return_inverse=True)
-        names, ids = several.tolist(), ids[:-1].reshape(height, width)
-    found = {}
-    for i, box in enumerate(ndimage.find_objects(ids), 1):
-        if box is not None and int((ids[box] == i).sum()) >= FEWEST:
-            found[names[i]] = Box.around(box[0], box[1], height, width)
-    return found
-
-
-def reaching_over(ids: torch.Tensor) -> torch.Tensor:
-    """Ids `[h, w]` where every object has also the pixels next to it that are nobody's (0 and less).
-
-    So objects are looked at. At the last pixel that is mostly an object's, and the next, colours are still a mixture of both: what differs
-    across the seam there is the object from its ground, which would be taken for a wrong light. A pixel on, it is the ground on both sides.
-    """
-    near = F.pad(ids.clamp_min(0), (1, 1, 1, 1))
-    near = torch.maximum(torch.maximum(near[:-2], near[1:-1]), near[2:])
-    near = torch.maximum(torch.maximum(near[:, :-2], near[:, 1:-1]), near[:, 2:])
-    return torch.where((ids <= 0) & (near > 0), near, ids)
-
-
 def grid_of(rgb: torch.Tensor) -> torch.Tensor:
     """Evenly spaced pixels of a frame `[3, H, W]`: `[3, ROWS, COLUMNS]`, of which the grid is all of them again."""
     y, x = _grid(rgb.device)
@@ -159,15 +81,14 @@ def _grid(device: torch.device) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True)
 class Spots:
-    """Where an object is looked at.
+    """Where S objects are looked at.
 
-    yx      `[N, 2]`: rows and columns of the box's outer part: of the seam's profiles, of pixels inside, and around
-    place   `[M, 2]`: profiles' and pixels' places in the box, -1..1
-    along   `[SEAM, 2]`: the direction of each profile, outwards
-    within  `[SEAM, 8]`: which of a profile's pixels are in the object
-    known   bool `[SEAM]`: which profiles there are
-    size    logarithm of the object's share of the frame, near 0
-    edges   `[E, 4]`: all pixels at the seam, and the way out along rows or columns
+    yx      `[S, N, 2]`: rows and columns of the frame: of the seam's profiles, of pixels inside, and around
+    place   `[S, M, 2]`: profiles' and pixels' places in the box, -1..1
+    along   `[S, SEAM, 2]`: the direction of each profile, outwards
+    within  `[S, SEAM, 8]`: which of a profile's pixels are in the object
+    known   bool `[S, SEAM]`: which profiles there are
+    size    `[S]`: logarithm of the object's share of the frame, near 0
     """
 
     yx: torch.Tensor
@@ -175,57 +96,36 @@ class Spots:
     along: torch.Tensor
     within: torch.Tensor
     known: torch.Tensor
-    size: float
-    edges: torch.Tensor
+    size: torch.Tensor
 
 
-def spots(mask: torch.Tensor, box: Box, share: float) -> Spots:
-    """Of an object with bool `mask` `[h, w]` in the box's outer part and with its share of the frame."""
-    seam = _edges(mask)
-    count = min(SEAM, len(seam))
-    known = torch.arange(SEAM, device=mask.device) < count
-    edges = F.pad(_spread(seam, count) if count else seam, (0, 0, 0, SEAM - count))
-    steps = torch.arange(1 - REACH, REACH + 1, device=mask.device)
-    y = (edges[:, :1] + steps * edges[:, 2:3]).clamp(0, mask.shape[0] - 1)
-    x = (edges[:, 1:2] + steps * edges[:, 3:]).clamp(0, mask.shape[1] - 1)
-    pixels = [_spread(mask.nonzero(), INSIDE), _spread((mask if mask.all() else ~mask).nonzero(), AROUND)]
-    yx = torch.cat([edges[:, :2], *pixels])
+def spots(objects: Outlines, frame: int) -> Spots:
+    """Of objects of a frame of so many pixels."""
+    edges, known = objects.seam(SEAM)
+    steps = torch.arange(1 - REACH, REACH + 1, device=edges.device)
+    first, last = objects.first[:, None, None], objects.end[:, None, None] - 1
+    way = (edges[:, :, None, :2] + steps[:, None] * edges[:, :, None, 2:]).clamp(first, last)
+    inside = objects.spread([o.own for o in objects.each], INSIDE)[0]
+    around = objects.spread([o.beside for o in objects.each], AROUND)[0]
+    sizes = torch.tensor([len(o.own) / frame for o in objects.each], device=edges.device)
     return Spots(
-        torch.cat([torch.stack([y, x], -1).flatten(0, 1), *pixels]),
-        box.placed(yx[:, 0] + box.outer_rows.start, yx[:, 1] + box.outer_columns.start),
-        edges[:, 2:].float(),
-        mask[y, x],
+        torch.cat([way.flatten(1, 2), inside, around], 1),
+        objects.places(torch.cat([edges[..., :2], inside, around], 1)),
+        edges[..., 2:].float(),
+        objects.mine(objects.ids(*way.unbind(3))),
         known,
-        math.log(share) / 4 + 1,
-        seam,
+        sizes.log() / 4 + 1,
     )
 
 
 def evidence(colours: torch.Tensor, at: Spots, whole: torch.Tensor) -> Evidence:
-    """Of one object: `colours` `[N, 3]` of its spots, and `whole_of` the frame."""
-    profiles, pixels = (colours * 2 - 1).split([2 * REACH * SEAM, INSIDE + AROUND])
-    places, around = at.place.split([SEAM, INSIDE + AROUND])
-    pixels = torch.cat([pixels, around, torch.full_like(around[:, :1], at.size)], 1)
-    inside, outside = pixels.split([INSIDE, AROUND])
-    seam = torch.cat([profiles.view(SEAM, 2 * REACH, 3), at.within[..., None].to(colours.dtype)], 2)
-    return Evidence(seam[None], torch.cat([places, at.along], 1)[None], at.known[None], inside[None], outside[None], whole)
-
-
-def _edges(mask: torch.Tensor) -> torch.Tensor:
-    """Pixels of `mask` at its seam `[E, 4]`, with the way out along rows or columns; where the picture ends is no seam."""
-    h, w = mask.shape
-    further = F.pad(mask, (1, 1, 1, 1), value=True)
-    found = []
-    for dy, dx in DIRECTIONS:
-        yx = (mask & ~further[1 + dy : 1 + dy + h, 1 + dx : 1 + dx + w]).nonzero()
-        found.append(torch.cat([yx, torch.tensor([[dy, dx]], device=yx.device).expand(len(yx), 2)], 1))
-    return torch.cat(found)
-
-
-def _spread(rows: torch.Tensor, count: int) -> torch.Tensor:
-    """`count` of the rows, evenly spaced."""
-    at = (torch.arange(count, device=rows.device) + 0.5) / count * len(rows)
-    return rows[at.long()]
+    """Of S objects: `colours` `[S, N, 3]` of their spots, and `whole_of` the frame."""
+    profiles, pixels = (colours * 2 - 1).split([2 * REACH * SEAM, INSIDE + AROUND], 1)
+    places, around = at.place.split([SEAM, INSIDE + AROUND], 1)
+    pixels = torch.cat([pixels, around, at.size[:, None, None].expand(-1, INSIDE + AROUND, 1)], 2)
+    inside, outside = pixels.split([INSIDE, AROUND], 1)
+    seam = torch.cat([profiles.unflatten(1, (SEAM, 2 * REACH)), at.within[..., None].to(colours.dtype)], 3)
+    return Evidence(seam, torch.cat([places, at.along], 2), at.known, inside, outside, whole.expand(len(seam), -1, -1))
 
 
 def _reader(channels: int, width: int) -> nn.Sequential:

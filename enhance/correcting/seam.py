@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import torch
 
-from enhance.correcting.objects import COEFFICIENTS, LUMA, Box, Objects
+from enhance.correcting.objects import COEFFICIENTS, LUMA, Objects
+from enhance.correcting.outlines import Outlines
 
 PROFILES = 512
 """Most profiles across a seam that are read."""
@@ -56,37 +57,52 @@ class Fit:
 
     def with_beyond(self, beyond: Fit) -> tuple[torch.Tensor, float]:
         """Coefficients and how surely the object ends, by this seam, of a mask's edge, and by that of a mask a pixel larger
-        (`objects.reaching_over`). As far as the jump at the edge is undone, what is in other colours ends there, and its surface goes on.
+        (`outlines.reaching_over`). As far as the jump at the edge is undone, what is in other colours ends there, and its surface goes on.
         Else both show what an object and its ground differ by, each by other pixels, and the smaller change is nearer to the truth."""
         least = min(beyond, self, key=lambda fit: fit.by).coefficients
         return torch.lerp(least, self.coefficients, self.undoes), (1 - self.undoes) * max(self.ends, beyond.ends)
 
 
-def fitted(rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor, box: Box, guess: torch.Tensor, usual: torch.Tensor) -> Fit:
-    """The change that object `i` needs, by its seam.
+@dataclass(frozen=True)
+class _Profiles:
+    """Of S seams, N each: colours inside and outside `[S, N, 3]` and at which height of the box `[S, N]`, of those that are `known`
+    `[S, N]`, which lie in the picture and meet no other object; and what colours change by from there to further out `[S, N, 3]`, `[S, N]`
+    of which are `told`, as they meet none there either."""
 
-    rgb, ids  `[3, h, w]` and `[h, w]`: the box's outer part
-    edges     `[E, 4]`: pixels at the object's seam there, and the way out (`Spots.edges`)
-    guess     `[15]`, which is returned where the seam has too few profiles to say anything; they do not say that it ends, either
-    usual     `[15, 15]`: a root of the covariance of what objects need (`usual_changes`); of zeros, the guess is kept
+    inside: torch.Tensor
+    outside: torch.Tensor
+    height: torch.Tensor
+    known: torch.Tensor
+    texture: torch.Tensor
+    told: torch.Tensor
+
+
+def fitted(rgb: torch.Tensor, objects: Outlines, guesses: torch.Tensor, usual: torch.Tensor) -> list[Fit]:
+    """The changes that S objects of a frame `[3, H, W]` need, each by its seam, on the CPU.
+
+    guesses  `[S, 15]`, which are returned where a seam has too few profiles to say anything; they do not say that it ends, either
+    usual    `[15, 15]`: a root of the covariance of what objects need (`usual_changes`); of zeros, the guesses are kept
     """
-    inside, outside, row, texture = _profiles(rgb, ids, i, edges)
-    if len(inside) < FEWEST_PROFILES:
-        return Fit(guess, float("inf"), 0.0, 0.0)
-    height = box.placed(row + box.outer_rows.start, torch.zeros_like(row))[:, 0]
-    does = effects(inside, height)
-    found, off = _robust(does @ usual, outside - inside - does @ guess)
-    coefficients = guess + usual @ found
-    jump = (outside - inside).square().mean(1).median()
-    undoes = _fall(float((off.median() / jump.clamp_min(1e-9)).sqrt()), UNDONE, STAYS)
-    ends = _ends(off, texture) * (1 - _fall(len(inside), UNTOLD, TOLD))
-    return Fit(coefficients, float((does @ coefficients).square().mean().sqrt()), undoes, ends)
-
-
-def _ends(off: torch.Tensor, texture: torch.Tensor) -> float:
-    """How surely an object ends, by the mean squares `[N]` that its profiles still differ by and differences `[M, 3]` in what is around."""
-    usual = float(texture.square().mean(1).median().sqrt()) if len(texture) >= FEWEST_PROFILES else 0.0
-    return 1 - _fall(float(off.median().sqrt()) / max(usual, EVEN), GOES_ON, ENDS)
+    seen = _profiles(rgb, objects)
+    does = effects(seen.inside, seen.height)
+    jump = seen.outside - seen.inside
+    found, off = _robust(does @ usual, jump - (does @ guesses[:, None, :, None])[..., 0], seen.known)
+    coefficients = guesses + found @ usual.T
+    by = ((does @ coefficients[:, None, :, None]).square().mean((2, 3)) * seen.known).sum(1) / seen.known.sum(1)
+    left, jumps, textures = (
+        _median(x, known) for x, known in ((off, seen.known), (_power(jump), seen.known), (_power(seen.texture), seen.told))
+    )
+    # all at once to where it is decided upon: a GPU would be waited for each time
+    facts = torch.stack([seen.known.sum(1), seen.told.sum(1), by, left, jumps, textures], 1).tolist()
+    fits = []
+    for guess, wanted, (count, told, power, least, most, rough) in zip(guesses.cpu(), coefficients.cpu(), facts, strict=True):
+        if count < FEWEST_PROFILES:
+            fits.append(Fit(guess, float("inf"), 0.0, 0.0))
+            continue
+        undoes = _fall((least / max(most, 1e-9)) ** 0.5, UNDONE, STAYS)
+        ends = 1 - _fall(least**0.5 / max(rough**0.5 if told >= FEWEST_PROFILES else 0.0, EVEN), GOES_ON, ENDS)
+        fits.append(Fit(wanted, power**0.5, undoes, ends * (1 - _fall(count, UNTOLD, TOLD))))
+    return fits
 
 
 def _fall(x: float, start: float, end: float) -> float:
@@ -94,42 +110,53 @@ def _fall(x: float, start: float, end: float) -> float:
     return min(1.0, max(0.0, (end - x) / (end - start)))
 
 
-def _robust(does: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """How much of each usual change `[15]`, by what each of them does to colours `[N, 3, 15]` and what these miss `[N, 3]`; and the mean
-    squares `[N]` that are left. Reweighted least squares (Cauchy's), for a spread that the profiles themselves show."""
-    flat, missing = does.flatten(0, 1), missing.flatten()
+def _power(colours: torch.Tensor) -> torch.Tensor:
+    """Mean squares `[...]` of `[..., 3]`."""
+    return colours.square().mean(-1)
+
+
+def _median(x: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """`[S]` of those of `x` `[S, N]` that are known; NaN where none is."""
+    return x.where(known, torch.nan).nanmedian(1).values
+
+
+def _robust(does: torch.Tensor, missing: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """How much of each usual change `[S, 15]`, by what each of them does to colours `[S, N, 3, 15]` and what these miss `[S, N, 3]`, of the
+    profiles that are known `[S, N]`; and the mean squares `[S, N]` that are left. Reweighted least squares (Cauchy's), for a spread that
+    the profiles themselves show; where none is known, nothing."""
+    flat, flat_missing = does.flatten(1, 2), missing.flatten(1)[..., None]
     pull = PULL * torch.eye(COEFFICIENTS, device=does.device)
-    off = missing.new_zeros(len(does))
-    spread = missing.view(-1, 3).square().mean(1).median().clamp_min(EXACT**2)
+    off, weighs = missing.new_zeros(missing.shape[:2]), known.to(missing)
+    spread = _median(_power(missing), known).nan_to_num().clamp_min(EXACT**2)
     for _ in range(ROUNDS):
-        weighted = flat / (off + spread).repeat_interleave(3)[:, None]
-        found = torch.linalg.solve(weighted.T @ flat + pull, weighted.T @ missing)
-        off = (flat @ found - missing).view(-1, 3).square().mean(1)
-        spread = (1.5 * off.median()).clamp_min(EXACT**2)
-    return found, off
+        weighted = (flat * (weighs / (off + spread[:, None])).repeat_interleave(3, 1)[..., None]).mT
+        found = torch.linalg.solve(weighted @ flat + pull, weighted @ flat_missing)
+        off = _power((flat @ found - flat_missing).view_as(missing))
+        spread = (1.5 * _median(off, known)).nan_to_num().clamp_min(EXACT**2)
+    return found[..., 0], off
 
 
-def _profiles(rgb: torch.Tensor, ids: torch.Tensor, i: int, edges: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Colours inside and outside the seam `[N, 3]`, of profiles that lie in the picture and meet no other object; their rows `[N]`; and
-    what colours change by from there to further out `[M, 3]`, where that meets none either."""
-    h, w = ids.shape
-    edges = edges[torch.arange(min(PROFILES, len(edges)), device=edges.device) * len(edges) // PROFILES] if len(edges) > PROFILES else edges
-    off = torch.tensor(OFF, device=edges.device)
-    steps = torch.cat([-off, 1 + off, 1 + FURTHER + off])
-    y, x = edges[:, :1] + steps * edges[:, 2:3], edges[:, 1:2] + steps * edges[:, 3:]
-    there = (y >= 0) & (y < h) & (x >= 0) & (x < w)
-    y, x = y.clamp(0, h - 1), x.clamp(0, w - 1)
-    free = (there & (ids[y, x] <= 0)).unflatten(1, (3, len(OFF))).all(2)
-    clear = (there & (ids[y, x] == i))[:, : len(OFF)].all(1) & free[:, 1]
-    inside, outside, further = rgb[:, y[clear], x[clear]].permute(1, 2, 0).unflatten(1, (3, len(OFF))).mean(2).unbind(1)
-    return inside, outside, edges[clear, 0], (further - outside)[free[clear, 2]]
+def _profiles(rgb: torch.Tensor, objects: Outlines) -> _Profiles:
+    """Of all seams, as many for each as the longest has, PROFILES at most."""
+    edges, there = objects.seam(max(1, min(PROFILES, max(len(o.edges) for o in objects.each))))
+    off = torch.tensor(OFF, device=rgb.device)
+    steps = torch.cat([-off, 1 + off, 1 + FURTHER + off])[:, None]
+    way = edges[:, :, None, :2] + steps * edges[:, :, None, 2:]
+    first, last = objects.first[:, None, None], objects.end[:, None, None] - 1
+    inner = ((way >= first) & (way <= last)).all(3)
+    y, x = way.clamp(first, last).unbind(3)
+    ids = objects.ids(y, x)
+    free = (inner & (ids <= 0)).unflatten(2, (3, len(OFF))).all(3)
+    known = there & (inner & objects.mine(ids))[..., : len(OFF)].all(2) & free[..., 1]
+    inside, outside, further = rgb[:, y, x].movedim(0, -1).unflatten(2, (3, len(OFF))).mean(3).unbind(2)
+    return _Profiles(inside, outside, objects.places(edges[..., :2])[..., 0], known, further - outside, known & free[..., 2])
 
 
 def effects(rgb: torch.Tensor, height: torch.Tensor) -> torch.Tensor:
-    """What a unit of each coefficient adds to `rgb` `[N, 3]` at `height` `[N]`, as `objects.changed` does: `[N, 3, 15]`."""
-    luma = (rgb @ rgb.new_tensor(LUMA))[:, None]
-    each = torch.stack([torch.ones_like(rgb), rgb, rgb * rgb, luma - rgb, height[:, None] * rgb], -1)
-    return (each[:, :, :, None] * torch.eye(3, device=rgb.device)[:, None]).flatten(2)
+    """What a unit of each coefficient adds to `rgb` `[..., 3]` at `height` `[...]`, as `objects.changed` does: `[..., 3, 15]`."""
+    luma = (rgb @ rgb.new_tensor(LUMA))[..., None]
+    each = torch.stack([torch.ones_like(rgb), rgb, rgb * rgb, luma - rgb, height[..., None] * rgb], -1)
+    return (each[..., None] * torch.eye(3, device=rgb.device)[:, None]).flatten(-2)
 
 
 def usual_changes(objects: Objects) -> torch.Tensor:

@@ -44,21 +44,21 @@ class ShadeNet(nn.Module):
         return self.layers(read).float()
 
 
-def read_ground(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Of sRGB `[N, 3]` of ground at `places` `[N, 2]` by an object: by knot the mean logarithm of its light against the median, its
-    spread, and how much of the ground is there, `[READ]`."""
-    near = (places[:, 0] > DOWN[0]).nonzero()[:, 0]
-    near = near[at_most(SEEN, len(near), rgb.device)]
-    if len(near) == 0:
-        return rgb.new_zeros(READ)
-    light = torch.log(linear_from_srgb(rgb[near]).mean(-1) + DARKEST)
-    light = light - light.median()
-    down, across = (_hats(places[near, i], knots) for i, knots in enumerate((DOWN, ACROSS)))
-    counts = torch.einsum("nd,nk->dk", down, across)
-    mean, square = (torch.einsum("n,nd,nk->dk", v, down, across) / counts.clamp_min(1e-6) for v in (light, light.square()))
-    known = counts > 2
+def read_ground(rgb: torch.Tensor, places: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Of sRGB `[B, N, 3]` of ground at `places` `[B, N, 2]` by B objects, where it is known `[B, N]`: by knot the mean logarithm of its
+    light against the median, its spread, and how much of the ground is there, `[B, READ]`."""
+    if not places.shape[1]:
+        return rgb.new_zeros(len(rgb), READ)
+    near = known & (places[..., 0] > DOWN[0])
+    light = torch.log(linear_from_srgb(rgb).mean(-1) + DARKEST)
+    light = (light - light.where(near, torch.nan).nanmedian(1, keepdim=True).values).where(near, 0.0)
+    down, across = (_hats(places[..., i], knots) for i, knots in enumerate((DOWN, ACROSS)))
+    sums = torch.einsum("vbn,bnd,bnk->vbdk", torch.stack([near.to(light), light, light.square()]), down, across).flatten(2)
+    counts, mean, square = *sums[:1], *(sums[1:] / sums[0].clamp_min(1e-6))
+    there = counts > 2
     spread = (square - mean.square()).clamp_min(0).sqrt()
-    return torch.cat([(mean * known).flatten(), (spread * known).flatten(), (counts / len(near) * 20).clamp_max(2).flatten()])
+    share = counts / near.sum(1, keepdim=True).clamp_min(1)
+    return torch.cat([mean * there, spread * there, (share * 20).clamp_max(2)], 1)
 
 
 def at_most(most: int, count: int, device: torch.device) -> torch.Tensor:

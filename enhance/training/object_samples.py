@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from enhance.correcting.objects import PIXELS, Box, Evidence, Objects, boxes, evidence, grid_of, reaching_over, spots, whole_of
+from enhance.correcting.objects import PIXELS, Evidence, Objects, evidence, grid_of, spots, whole_of
+from enhance.correcting.outlines import Box, Outline, Outlines, boxes, reaching_over
 from enhance.pairs.isp import alter, random_isp
 from enhance.pairs.masks import random_mask
 from enhance.pairs.shards import RENDERED, Shard
@@ -92,11 +93,10 @@ class ObjectSampler:
         fresh: bool,
     ) -> list[tuple]:
         ids = instance[box.outer_rows, box.outer_columns].int()
-        mask, seen_as = ids == pick, reaching_over(torch.where(ids == 255, 0, ids)) == pick
-        share = float(seen_as.sum()) / instance.numel()
-        at = spots(seen_as, box, share)
+        mask, seen_as = ids == pick, reaching_over(torch.where(ids == 255, 0, ids))
+        at = spots(Outlines([Outline.of(seen_as, pick, box.alone())]), instance.numel())
         judged = mask.nonzero()[torch.from_numpy(rng.integers(int(mask.sum()), size=PIXELS))]
-        y, x = torch.cat([at.yx, judged]).unbind(1)
+        y, x = torch.cat([at.yx[0], judged]).unbind(1)
         strips = [p[y + box.outer_rows.start, x + box.outer_columns.start].T[:, None].float() / 255 for p in (given, wanted)]
         thin = given[:: max(1, given.shape[0] // 45), :: max(1, given.shape[1] // 80)].permute(2, 0, 1)
         grid = grid_of(thin).float() / 255
@@ -116,7 +116,7 @@ class ObjectSampler:
                     seen = alter(seen, others, isp if rng.random() < 0.5 else random_isp(rng))
             seen, target = seen[:, 0].T, target[:, 0].T
             seen = ((seen * 255).round() + torch.from_numpy(rng.random(seen.shape, dtype=np.float32)) - 0.5) / 255
-            read = evidence(seen[:-PIXELS], at, whole_of(whole))
+            read = evidence(seen[None, :-PIXELS], at, whole_of(whole))
             drawn.append((_mirrored(read) if rng.random() < 0.5 else read, seen[-PIXELS:], target[-PIXELS:], height))
         return drawn
 

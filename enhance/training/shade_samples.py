@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from enhance.batch import Batch
-from enhance.correcting.objects import boxes
-from enhance.correcting.shade import read_ground
+from enhance.correcting.outlines import boxes
+from enhance.correcting.shade import DOWN, SEEN, at_most, read_ground
 from enhance.pairs.isp import random_isp
 from enhance.pairs.shards import Shard
 
@@ -79,5 +79,8 @@ def _twice(rng: np.random.Generator, given: torch.Tensor, target: torch.Tensor, 
     grade, out = random_isp(rng, 0.7), []
     for a, b, where in ((given, target, places), (grade(given), grade(target), places * torch.tensor([1.0, -1.0]))):
         k = torch.from_numpy(rng.integers(len(where), size=PIXELS))
-        out.append((read_ground(a[:, 0].T, where), where[k], a[:, 0, k].T, b[:, 0, k].T))
+        low = (where[:, 0] > DOWN[0]).nonzero()[:, 0]
+        at = low[at_most(SEEN, len(low), low.device)]
+        read = read_ground(a[None, :, 0, at].mT, where[None, at], torch.ones(1, len(at), dtype=torch.bool))[0]
+        out.append((read, where[k], a[:, 0, k].T, b[:, 0, k].T))
     return out

@@ -9,19 +9,17 @@ from enhance.correcting import corrections
 from enhance.correcting.corrections import DEEP, SLIGHT, STEADY, Correction, correct
 from enhance.correcting.objects import (
     COEFFICIENTS,
-    FEWEST,
     PIXELS,
     REACH,
     SEAM,
     Evidence,
     ObjectNet,
-    boxes,
     changed,
     evidence,
-    reaching_over,
     spots,
     whole_of,
 )
+from enhance.correcting.outlines import FEWEST, Outline, Outlines, boxes, reaching_over
 from enhance.correcting.shade import KNOTS, READ
 from enhance.demo import CAMERA, DATA, MOVING, PARKED, SHIFT
 from enhance.training.object_samples import ObjectSampler
@@ -40,11 +38,9 @@ def scene(top=10, left=20, height=16, width=24, seed=0):
 
 
 def read(rgb, instance):
-    (box,) = boxes(instance).values()
-    crop = rgb[:, box.outer_rows, box.outer_columns]
-    mask = instance[box.outer_rows, box.outer_columns] > 0
-    at = spots(mask, box, float(mask.sum()) / instance.numel())
-    return evidence(crop[:, at.yx[:, 0], at.yx[:, 1]].T, at, whole_of(rgb)), at
+    ((i, box),) = boxes(instance).items()
+    at = spots(Outlines([Outline.of(instance, i, box)]), instance.numel())
+    return evidence(rgb[:, at.yx[..., 0], at.yx[..., 1]].movedim(0, -1), at, whole_of(rgb)), at
 
 
 def stirred():
@@ -62,7 +58,7 @@ def test_a_new_network_changes_nothing():
 def test_profiles_lead_out_of_the_object():
     e, at = read(*scene())
     assert int(at.known.sum()) == 2 * (16 + 24)
-    seen = e.seam[0][at.known]
+    seen = e.seam[at.known]
     assert (seen[:, :REACH, 3] == 1).all() and (seen[:, REACH:, 3] == 0).all()
 
 
@@ -70,7 +66,7 @@ def test_a_profile_shows_the_pixels_on_its_way():
     rgb, instance = scene()
     rgb[:, :, 43], rgb[:, :, 44] = 0.25, 0.75  # the object's last column, and the next
     e, at = read(rgb, instance)
-    rightwards = e.seam[0][at.known & (at.along[:, 1] == 1)]
+    rightwards = e.seam[at.known & (at.along[..., 1] == 1)]
     assert (rightwards[:, REACH - 1, :3] == -0.5).all() and (rightwards[:, REACH, :3] == 0.5).all()
 
 
@@ -165,7 +161,7 @@ def test_the_ground_is_read_up_to_the_mask_s_edge(monkeypatch):
     """As it was learnt: where an object touches its ground it is darkest, and without that it seems to lack a shadow."""
     rgb, instance = scene()
     seen = []
-    monkeypatch.setattr(corrections, "read_ground", lambda rgb, places: seen.append(places) or torch.zeros(READ))
+    monkeypatch.setattr(corrections, "read_ground", lambda rgb, places, known: seen.append(places[known]) or torch.zeros(1, READ))
     correct(stirred(), rgb, instance, {})
     (box,) = boxes(instance).values()
     below = box.placed(torch.tensor([box.rows.stop]), torch.tensor([30]))

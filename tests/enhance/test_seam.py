@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from enhance.correcting.objects import COEFFICIENTS, Objects, _edges, boxes, changed, reaching_over
+from enhance.correcting.objects import COEFFICIENTS, Objects, changed
+from enhance.correcting.outlines import Outline, Outlines, boxes, reaching_over
 from enhance.correcting.seam import Fit, effects, fitted, usual_changes
 from enhance.pairs.isp import Isp, alter
 
@@ -30,8 +31,8 @@ def seam(rgb, ids, guess=NOTHING, usual=BROAD, over=0):
     box = boxes(ids)[1]
     for _ in range(over):
         ids = reaching_over(ids)
-    part, inner = rgb[:, box.outer_rows, box.outer_columns], ids[box.outer_rows, box.outer_columns]
-    return fitted(part, inner, 1, _edges(inner == 1), box, guess, usual)
+    (fit,) = fitted(rgb, Outlines([Outline.of(ids, 1, box)]), guess[None], usual)
+    return fit
 
 
 def found(rgb, ids, guess=NOTHING, usual=BROAD):
@@ -132,3 +133,19 @@ def test_usual_changes_are_those_of_the_objects():
     covariance = root @ root.T
     assert covariance[0, 0].sqrt() == pytest.approx(0.1, rel=0.15) and covariance[0, 1] == pytest.approx(float(covariance[0, 0]), rel=0.05)
     assert covariance.diagonal()[3:].max() < 1e-3
+
+
+def test_seams_read_together_say_what_each_says_alone():
+    rgb = surface(7)
+    ids = torch.zeros(240, 360, dtype=torch.int32)
+    ids[20:80, 30:100], ids[100:220, 120:300], ids[232:, :8] = 1, 2, 3  # the last, in a corner, has too few profiles
+    found = boxes(ids)
+    rgb = alter(rgb, (ids == 2).float()[None], ISP)
+    outlines = [Outline.of(each, i, found[i]) for each in (ids, reaching_over(ids)) for i in found]
+    guesses = 0.1 * torch.randn(len(outlines), COEFFICIENTS, generator=torch.Generator().manual_seed(8))
+    together = fitted(rgb, Outlines(outlines), guesses, BROAD)
+    for outline, guess, fit in zip(outlines, guesses, together, strict=True):
+        (alone,) = fitted(rgb, Outlines([outline]), guess[None], BROAD)
+        torch.testing.assert_close(fit.coefficients, alone.coefficients, atol=1e-4, rtol=1e-3)
+        assert (fit.by, fit.undoes, fit.ends) == pytest.approx((alone.by, alone.undoes, alone.ends), abs=1e-3)
+    assert [fit.by == float("inf") for fit in together] == [False, False, True] * 2 and together[1].undoes == 1 > together[0].undoes

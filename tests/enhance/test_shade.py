@@ -42,8 +42,12 @@ def ground(dark=1.0, seed=0):
     return torch.where(at_base, dark, 1.0) * torch.rand(3000, 1, generator=g).mul(0.1).add(0.4).expand(-1, 3), places
 
 
+def read(rgb, places):
+    return read_ground(rgb[None], places[None], torch.ones(1, len(places), dtype=torch.bool))[0]
+
+
 def test_a_new_network_shades_nothing_and_reads_darkness_where_it_is():
-    bright, dark = read_ground(*ground()), read_ground(*ground(0.3))
+    bright, dark = read(*ground()), read(*ground(0.3))
     assert (ShadeNet()(bright[None]) == 0).all()
     fell = (bright - dark)[:KNOTS].reshape(len(DOWN) - 2, len(ACROSS) - 2)
     assert fell[2:4, 2:6].min() > 1 and fell[0].abs().max() < 0.1
@@ -51,15 +55,24 @@ def test_a_new_network_shades_nothing_and_reads_darkness_where_it_is():
 
 def test_other_exposure_reads_alike_and_mirrored_ground_reads_mirrored():
     rgb, places = ground(0.5)
-    first = read_ground(srgb_from_linear(0.1 * linear_from_srgb(rgb)), places)
-    assert torch.allclose(first, read_ground(srgb_from_linear(0.2 * linear_from_srgb(rgb)), places), atol=0.15)
-    turned = read_ground(rgb, places * torch.tensor([1.0, -1.0])).reshape(3, len(DOWN) - 2, len(ACROSS) - 2)
-    assert torch.allclose(turned.flip(-1).flatten(), read_ground(rgb, places), atol=1e-4)
+    first = read(srgb_from_linear(0.1 * linear_from_srgb(rgb)), places)
+    assert torch.allclose(first, read(srgb_from_linear(0.2 * linear_from_srgb(rgb)), places), atol=0.15)
+    turned = read(rgb, places * torch.tensor([1.0, -1.0])).reshape(3, len(DOWN) - 2, len(ACROSS) - 2)
+    assert torch.allclose(turned.flip(-1).flatten(), read(rgb, places), atol=1e-4)
 
 
 def test_no_ground_in_reach_is_read_as_nothing():
-    assert (read_ground(torch.zeros(0, 3), torch.zeros(0, 2)) == 0).all()
-    assert (read_ground(torch.rand(9, 3), torch.full((9, 2), -1.0)) == 0).all()
+    assert (read(torch.zeros(0, 3), torch.zeros(0, 2)) == 0).all()
+    assert (read(torch.rand(9, 3), torch.full((9, 2), -1.0)) == 0).all()
+
+
+def test_objects_read_together_read_as_each_alone():
+    (rgb, places), few = ground(0.5), 400
+    known = torch.ones(2, len(rgb), dtype=torch.bool)
+    known[1, few:] = False
+    both = read_ground(torch.stack([rgb, rgb.flip(0)]), torch.stack([places, places.flip(0)]), known)
+    assert torch.allclose(both[0], read(rgb, places), atol=1e-5)
+    assert torch.allclose(both[1], read(rgb.flip(0)[:few], places.flip(0)[:few]), atol=1e-5)
 
 
 def test_it_learns_to_shade_what_lacks_a_shadow_and_only_that(tmp_path):

@@ -51,7 +51,7 @@ def _road(seed: int) -> list[Mesh]:
         grain(seed + 3, (0.85, 0.85, 0.82), 0.06),
         grain(seed + 4, (0.33, 0.4, 0.22), 0.4),
     )
-    out = [panel((LOW, -EDGE - 3, 0), (HIGH - LOW, 0, 0), (0, 2 * EDGE + 6, 0), asphalt, 6.0)]
+    out = [panel((LOW, -EDGE - 3, 0), (HIGH - LOW, 0, 0), (0, 2 * EDGE + 6, 0), asphalt, 7.3)]
     out.append(panel((-900, -900, -0.1), (2400, 0, 0), (0, 1800, 0), grass, 12.0))
     for side in (-1, 1):
         for y in (1.0, EDGE):
