@@ -23,6 +23,7 @@ from recon.fit.strides import stride_of
 from recon.log import Log
 from recon.objects.tracks import LIMBED
 from recon.ready import moving_things
+from recon.seeds.sunken import without_sunken
 from recon.seeds.triangulate import triangulated
 from recon.start import Start, prepare
 from recon.views.exposed import exposed_by
@@ -72,9 +73,11 @@ def _prepared(
 ) -> tuple[Frames, Start]:
     """The frames, with what sparse points tell of their skies and, where they are to be `estimated`, their gains; and what a fit of them
     starts from."""
-    sparse = log.points
-    if sparse is None and not log.sweeps_within(span):
-        sparse = triangulated(log, frames)
+    driven, sparse = log.ego.within(span), log.points
+    if sparse is not None:
+        sparse = without_sunken(sparse, log, driven)
+    elif not log.sweeps_within(span):
+        sparse = without_sunken(triangulated(log, frames), log, driven)
         frames = replace(frames, views=under_their_sky(log, names, frames.views, sparse))
         if estimated:
             frames = replace(frames, views=exposed_by(sparse, log, names, frames.views))

@@ -13,6 +13,7 @@ from recon.movers.going import boxed
 from recon.movers.sighting import Sighting, sightings
 from recon.objects.tracks import named
 from recon.seeds.stereo import Plate, plate_of
+from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
 from recon.views.view import View
 from render.progress import Progress
@@ -73,10 +74,14 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
     if len(path) < 2 or len(times) < FEWEST:
         return ()
     paces = np.linalg.norm(np.gradient(eyes, times / 1e6, axis=0), axis=1)
+
+    def looked_at(i: int) -> list[Sighting]:
+        return sightings(plates[i], int(times[i]), around(i, plates, times), ground, path, float(paces[i]))
+
     seen = []
     with Progress("traffic", total=len(views)) as steps:
-        for i, plate in enumerate(plates):
-            seen.append(sightings(plate, int(times[i]), around(i, plates, times), ground, path, float(paces[i])))
+        for found in side_by_side(looked_at, range(len(views))):
+            seen.append(found)
             steps.step()
     return named(boxes(seen, times, plates, Lane(log.ego), ground), log.ego)
 

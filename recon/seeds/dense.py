@@ -16,6 +16,7 @@ from recon.seeds.planes import swept
 from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.road import Road
 from recon.seeds.stereo import Plate, plate_of
+from recon.seeds.sunken import cells_of, known_ground
 from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
 from recon.views.project import project
@@ -55,7 +56,7 @@ FARTHEST = 1000.0
 
 DUG, BURIED = 0.3, 0.1
 """Metres under the ground where things may still be found, since it is not known better; where more than this part of a picture's points
-are under that, it is not known at all."""
+are under that, it is not known at all but where points lie on it (`known_ground`)."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,7 @@ def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: l
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
     """Of training pictures spread over the drive (`VIEWS`), those that show points of `sparse` and resemble others."""
     found = []
+    known = known_ground(sparse.xyz, ground, log.ego) if len(sparse.xyz) and log.meta.get("metric", True) else None
     for c, name in enumerate(frames.names):
         views = frames.of(c)
         cameras = [frames.camera(log, v) for v in views]
@@ -159,7 +161,9 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
         points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
         chosen = _chosen(plates, points)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
-            for i, depth in zip(chosen, side_by_side(partial(_depth_of, plates=plates, points=points, ground=ground), chosen), strict=True):
+            for i, depth in zip(
+                chosen, side_by_side(partial(_depth_of, plates=plates, points=points, ground=ground, known=known), chosen), strict=True
+            ):
                 found += [Depths(views[i], cameras[i], plates[i], depth)] if depth is not None else []
                 steps.step()
     return found
@@ -179,14 +183,22 @@ def _chosen(plates: list[Plate], points: list[np.ndarray]) -> list[int]:
     return sorted({j for i in spread(range(len(plates)), most // 5) for j in (i, *companions(i, plates, far))})
 
 
+def _met(plate: Plate, depth: np.ndarray) -> np.ndarray:
+    """Where a plate's pixels are in the world at a depth z `[h, w]`, `[h, w, 3]`; at its eye where that is not finite."""
+    rays = plate.rays().double().numpy() * np.where(np.isfinite(depth), depth, 0.0)[..., None]
+    back = np.linalg.inv(plate.cam_from_world)
+    return rays @ back[:3, :3].T + back[:3, 3]
+
+
 def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
     """Depths z of those of the points that a plate has before it."""
     z = plate.shown(points)[2]
     return z[z > 0]
 
 
-def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Ground) -> np.ndarray | None:
-    """Depth z of one of the plates; nothing where it shows none of its points or resembles no other."""
+def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Ground, known: np.ndarray | None) -> np.ndarray | None:
+    """Depth z of one of the plates; nothing where it shows none of its points or resembles no other. known: the cells of the ground that
+    nothing is under, whatever points say."""
     shown = points[i]
     z = _before(plates[i], shown)
     others = companions(i, plates, float(np.median(z))) if len(z) else []
@@ -194,7 +206,8 @@ def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Gro
         return None
     deepest = ground_depth(plates[i], ground, DUG)
     if (shown[:, 2] < ground.height(torch.from_numpy(shown[:, :2])).numpy() - DUG).mean() > BURIED:
-        deepest = np.full_like(deepest, np.inf)
+        sure = known is not None and known[cells_of(_met(plates[i], deepest), ground)]
+        deepest = np.where(sure, deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
     nearest = min(near, max(near / 3, 0.95 * float(deepest.min())))
     return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, shown, deepest), FARTHEST)

@@ -46,8 +46,12 @@ TOLD, EVERY = 200, 4.0
 WAVES = 0.03
 """Metres off its middle up to which the road is taken to be where points show it."""
 
-WIDE = 4.0
-"""Metres beside the path up to which the road is known; beyond its ends that is as far as it goes straight on."""
+WIDE, WIDEST = 4.0, 12.0
+"""Metres beside the path up to which the road is known; beyond its ends that is as far as it goes straight on. It may be wider, up to the
+other, as far as next to nothing stands on it."""
+
+STANDS, TALL, TELLING = 0.05, 3.0, 100
+"""Part of the points above a metre of it that may stand there, of those so many metres high at most, and how many it takes to say so."""
 
 DRIVEN, OFF, KERB, NOISE = 1.5, 0.6, 0.2, 2.5
 """Metres beside the path where the car drove: what is no more metres than this off the road, or half of the cameras' height, is the road;
@@ -86,7 +90,7 @@ def road_by_pictures(
     if not log.meta.get("metric", True):
         return None
     path = Path(ego)
-    points = points[np.isfinite(path.tree.query(points[:, :2], distance_upper_bound=DRIVEN + 1.0)[0])]
+    points = points[np.isfinite(path.tree.query(points[:, :2], distance_upper_bound=WIDEST + 1.0)[0])]
     along, left, level = path.beside(points[:, :2])
     eyes = np.concatenate([log.camera(name).world_from_cam[:, :3, 3].numpy() for name in names])
     mount = float(np.median(eyes[:, 2] - path.beside(eyes[:, :2])[2]))
@@ -105,7 +109,19 @@ def road_by_pictures(
     below -= (below + mount) * _rise(alike)
     told = f"{below + mount:.2f} m below the cameras, all along their path, as its pictures show of it on the whole"
     print(f"{log.path}: points show its road in waves of {100 * waves:.0f} cm, so it is taken to be {told}", file=sys.stderr)
-    return _laid(path, guess, below, off, min(off, max(KERB, NOISE * waves)))
+    slack = min(off, max(KERB, NOISE * waves))
+    return _laid(path, guess, below, off, slack, [_wide(side * left, points[:, 2] - level + below, slack) for side in (1, -1)])
+
+
+def _wide(aside: np.ndarray, above: np.ndarray, slack: float) -> float:
+    """Metres to one side up to which points `[N]`, so far to that side of the path and so far above the road, show that nothing stands."""
+    wide = WIDE
+    while wide < WIDEST:
+        there = (aside >= wide) & (aside < wide + 1) & (above < TALL)
+        if there.sum() < TELLING or (above[there] > slack).mean() > STANDS:
+            break
+        wide += 1
+    return wide
 
 
 def _rise(alike: Sequence[np.ndarray]) -> float:
@@ -178,16 +194,17 @@ def _alike(
     return (one * other).sum((1, 2)) / np.maximum(1e-6, np.linalg.norm(one, axis=(1, 2)) * np.linalg.norm(other, axis=(1, 2)))
 
 
-def _laid(path: Path, guess: Ground, below: float, driven: float, beside: float) -> Road:
-    """The road so many metres below a path, in a ground's cells; its slack where the car drove, and beside."""
+def _laid(path: Path, guess: Ground, below: float, driven: float, beside: float, wide: Sequence[float]) -> Road:
+    """The road so many metres below a path, in a ground's cells; its slack where the car drove, and beside; how wide it is to the left and
+    to the right."""
     rows, columns = guess.heights.shape
     x, y = (origin + guess.cell * np.arange(n) for origin, n in zip(guess.origin, (columns, rows), strict=True))
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    far, _ = path.tree.query(xy, distance_upper_bound=WIDE + 4 * guess.cell)
+    far, _ = path.tree.query(xy, distance_upper_bound=max(wide) + 4 * guess.cell)
     cells = np.flatnonzero(np.isfinite(far))
     along, left, level = path.beside(xy[cells])
     heights, slack = guess.heights.numpy().astype(np.float64).ravel(), np.zeros(rows * columns)
     heights[cells] = level - below  # also of the cells around those that are known, between which heights are linear
-    within = (np.abs(left) < WIDE) & (along > 1) & (along < len(path.places) - 2)
+    within = (left < wide[0]) & (left > -wide[1]) & (along > 1) & (along < len(path.places) - 2)
     slack[cells[within]] = np.where(np.abs(left[within]) < DRIVEN, driven, beside)
     return Road(replace(guess, heights=torch.from_numpy(heights.reshape(rows, columns)).float()), slack.reshape(rows, columns))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from painted import AHEAD, BOARD, SIZE, WALL, board_left, depth_of, drive
+from painted import AHEAD, BOARD, HEIGHT, SIZE, WALL, board_left, depth_of, drive
 
 from recon.ground import estimate_ground
 from recon.log import SparsePoints, Track
@@ -176,6 +176,21 @@ def test_a_ground_that_is_wrong_makes_no_depths():
     for up, shown in ((0.5, few), (0.9, points), (30.0, points)):
         errors, share = _off((log, frames, shown, Ground(torch.full((400, 400), up), (-100.0, -100.0), 0.5)))
         assert (errors < 0.1).mean() > 0.95 and share.mean() > 0.15, up
+
+
+def test_nothing_is_looked_for_under_a_road_that_points_show_however_many_seem_to_be_there():
+    log = drive(STEPS, ("front",))
+    frames = load_frames(log, ["front"], ALL, SIZE, 8)
+    noise = torch.Generator().manual_seed(3)
+    for view in frames.views:  # a road of which pictures tell nothing
+        view.image[100:] = torch.randint(100, 140, (80, 320, 3), generator=noise, dtype=torch.uint8)
+    points = _exact(log, frames)
+    sunken = np.random.default_rng(4).uniform((5.0, 30.0, -9.0), (15.0, 60.0, -1.0), (len(points.xyz), 3))  # beside it, in every picture
+    shown = tuple(np.concatenate([s, len(points.xyz) + np.arange(len(s))]) for s in points.seen["front"])
+    both = SparsePoints(np.concatenate([points.xyz, sunken]), {"front": shown})
+    for own in depths(log, frames, both, estimate_ground(points.xyz, log.ego)):
+        below = depth_of(own.camera.resized(*own.depth.shape[::-1])).numpy()[55:]
+        assert np.nanmax(own.depth[55:] / below) < 1 + 1.2 * DUG / HEIGHT
 
 
 def test_what_moves_with_the_camera_is_not_believed():

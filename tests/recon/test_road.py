@@ -9,7 +9,7 @@ from painted import HEIGHT, SIZE, drive
 
 from recon.ground import estimate_ground
 from recon.seeds.dense import Depths
-from recon.seeds.road import KERB, OFF, WIDE, Road, road_by_pictures
+from recon.seeds.road import KERB, OFF, WIDE, WIDEST, Road, road_by_pictures
 from recon.seeds.stereo import plate_of
 from recon.views.view import View
 from recon.way import Path
@@ -50,6 +50,18 @@ def test_a_road_that_points_show_in_waves_goes_along_with_the_path(log, capsys):
     assert across.max() < WIDE + 0.5 and (lies[:, 0] > 18).any(), "goes on beyond the last picture"
     beside = road.slack[(road.slack > 0) & (road.slack < OFF)]
     assert KERB < beside.min() == beside.max() < OFF
+
+
+@pytest.mark.parametrize("kerb", [None, 6.0])
+def test_a_road_is_as_wide_as_nothing_stands_on_it(log, kerb):
+    """To the left of its path there is a barrier, or none; to the right there are points for eight metres."""
+    x, y = np.meshgrid(np.arange(-5, 25, 0.1), np.arange(-8, 14, 0.1))
+    z = 0.1 * (x // 4 % 3 - 1) + np.random.default_rng(0).normal(0, 0.02, x.shape)
+    z += np.where(kerb is not None and y > kerb, np.arange(len(y))[:, None] % 5 / 5, 0.0)
+    lies = found(log, np.column_stack([x.ravel(), (y + x / 12).ravel(), z.ravel()])).points()
+    middle = (lies[:, 0] > 2) & (lies[:, 0] < 10)
+    across = (lies[:, 1] - lies[:, 0] / 12)[middle]
+    assert across.min() == pytest.approx(-8, abs=0.6) and across.max() == pytest.approx(WIDEST if kerb is None else kerb, abs=0.6)
 
 
 def test_a_world_of_no_metres_is_left_as_it_is(log):

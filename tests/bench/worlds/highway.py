@@ -12,7 +12,7 @@ from tests.bench.worlds.place import Light, Place, along, clock
 from tests.bench.worlds.solids import box, crown, grain, joined, painted, panel, plain
 from tests.bench.worlds.street import FRAMES, LIDAR, STEP_US, car, models_in, rig
 
-SPEED = 24.0
+SPEED = 24.7
 LANE, LOW, HIGH = 3.7, -60.0, 420.0
 """Metres: a lane's width, and where the road begins and ends."""
 
@@ -30,9 +30,9 @@ def highway(meshes: Path, seed: int = 2) -> Place:
         "highway",
         joined([*_road(seed), *_beside(chance)]),
         (
-            car("ahead", models["prius_hybrid"], [(26.0, lanes[1]), (900.0, lanes[1])], 25.0, times),
-            car("overtakes", models["hatchback_blue"], [(-14.0, lanes[0]), (900.0, lanes[0])], 29.0, times),
-            car("overtaken", models["pickup"], [(34.0, lanes[2]), (900.0, lanes[2])], 20.0, times),
+            car("ahead", models["prius_hybrid"], [(26.0, lanes[1]), (900.0, lanes[1])], 25.7, times),
+            car("overtakes", models["hatchback_blue"], [(-14.0, lanes[0]), (900.0, lanes[0])], 29.6, times),
+            car("overtaken", models["pickup"], [(34.0, lanes[2]), (900.0, lanes[2])], 20.8, times),
             car("coming", models["hatchback_red"], [(230.0, -lanes[1]), (-900.0, -lanes[1])], 26.0, times),
             car("second", models["hatchback"], [(330.0, -lanes[2]), (-900.0, -lanes[2])], 24.0, times),
         ),
