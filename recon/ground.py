@@ -83,6 +83,13 @@ def _ground(heights: np.ndarray, low: np.ndarray, cell: float) -> Ground:
     return Ground(torch.from_numpy(heights).float(), (float(low[0]), float(low[1])), cell)
 
 
+def cells_of(points: np.ndarray, ground: Ground) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns `[...]` of a ground's cells in which points `[..., 3]` are, or the nearest."""
+    at = np.round((points[..., :2] - np.array(ground.origin)) / ground.cell).astype(np.int64)
+    rows, columns = ground.heights.shape
+    return at[..., 1].clip(0, rows - 1), at[..., 0].clip(0, columns - 1)
+
+
 def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> torch.Tensor:
     """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it and next to none
     below, `BARE` where besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess. stray:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from recon.ground import cells_of
 from recon.log import Log, SparsePoints, Track
 from recon.seeds.ground_rays import ground_hits
 from recon.seeds.measured import PICTURES, Measured, by_pictures
@@ -16,7 +17,7 @@ from recon.seeds.planes import swept
 from recon.seeds.points import Cloud, nearest_box
 from recon.seeds.road import Road
 from recon.seeds.stereo import Plate, plate_of
-from recon.seeds.sunken import cells_of, known_ground
+from recon.seeds.sunken import known_ground
 from recon.side_by_side import side_by_side
 from recon.views.frames import Frames
 from recon.views.project import project
@@ -83,8 +84,7 @@ class Depths:
 
     def points(self) -> np.ndarray:
         """What its pixels show, `[h, w, 3]` in the world."""
-        back = np.linalg.inv(self.plate.cam_from_world)
-        return (self.plate.rays().double().numpy() * self.depth[..., None]) @ back[:3, :3].T + back[:3, 3]
+        return self.plate.points(self.depth)
 
     def cells(self, size: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Row and column `[h, w]` of what its pixels show on a grid of a size (rows, columns) over the picture."""
@@ -161,9 +161,8 @@ def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> li
         points = [sparse.xyz[sparse.seen[name][v.index]] for v in views]
         chosen = _chosen(plates, points)
         with Progress(f"depths of {name}", total=len(chosen)) as steps:
-            for i, depth in zip(
-                chosen, side_by_side(partial(_depth_of, plates=plates, points=points, ground=ground, known=known), chosen), strict=True
-            ):
+            work = partial(_depth_of, plates=plates, points=points, ground=ground, known=known)
+            for i, depth in zip(chosen, side_by_side(work, chosen), strict=True):
                 found += [Depths(views[i], cameras[i], plates[i], depth)] if depth is not None else []
                 steps.step()
     return found
@@ -183,13 +182,6 @@ def _chosen(plates: list[Plate], points: list[np.ndarray]) -> list[int]:
     return sorted({j for i in spread(range(len(plates)), most // 5) for j in (i, *companions(i, plates, far))})
 
 
-def _met(plate: Plate, depth: np.ndarray) -> np.ndarray:
-    """Where a plate's pixels are in the world at a depth z `[h, w]`, `[h, w, 3]`; at its eye where that is not finite."""
-    rays = plate.rays().double().numpy() * np.where(np.isfinite(depth), depth, 0.0)[..., None]
-    back = np.linalg.inv(plate.cam_from_world)
-    return rays @ back[:3, :3].T + back[:3, 3]
-
-
 def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
     """Depths z of those of the points that a plate has before it."""
     z = plate.shown(points)[2]
@@ -206,8 +198,8 @@ def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Gro
         return None
     deepest = ground_depth(plates[i], ground, DUG)
     if (shown[:, 2] < ground.height(torch.from_numpy(shown[:, :2])).numpy() - DUG).mean() > BURIED:
-        sure = known is not None and known[cells_of(_met(plates[i], deepest), ground)]
-        deepest = np.where(sure, deepest, np.inf)
+        met = plates[i].points(np.where(np.isfinite(deepest), deepest, 0.0))
+        deepest = np.where(known[cells_of(met, ground)] if known is not None else False, deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
     nearest = min(near, max(near / 3, 0.95 * float(deepest.min())))
     return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, shown, deepest), FARTHEST)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from recon.ground import cells_of
 from recon.log import Log, LogCamera
 from recon.registration.mounts_by_road import far_pairs, laid_out
 from recon.way import LONG, Path
@@ -68,10 +69,8 @@ class Road:
     def off(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Metres `[...]` by which points `[..., 3]`, NaN or not, are above it, and its slack there."""
         known, points = np.isfinite(points).all(-1), np.nan_to_num(points)
-        place = np.round((points[..., :2] - np.array(self.ground.origin)) / self.ground.cell).astype(np.int64)
-        row, column = place[..., 1].clip(0, self.slack.shape[0] - 1), place[..., 0].clip(0, self.slack.shape[1] - 1)
         above = points[..., 2] - self.ground.height(torch.from_numpy(points[..., :2])).numpy()
-        return np.where(known, above, np.nan), np.where(known, self.slack[row, column], 0.0)
+        return np.where(known, above, np.nan), np.where(known, self.slack[cells_of(points, self.ground)], 0.0)
 
     def points(self) -> np.ndarray:
         """Points `[N, 3]` that lie on it, four in each of its cells."""

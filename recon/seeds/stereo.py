@@ -54,6 +54,11 @@ class Plate:
         y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
         return torch.stack([(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1], torch.ones_like(x)], -1)
 
+    def points(self, depth: np.ndarray) -> np.ndarray:
+        """Where its pixels are in the world at a depth z `[h, w]`, `[h, w, 3]`."""
+        back = np.linalg.inv(self.cam_from_world)
+        return (self.rays().double().numpy() * depth[..., None]) @ back[:3, :3].T + back[:3, 3]
+
     def eye(self) -> np.ndarray:
         """Where it was taken, `[3]` in the world."""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.ground import estimate_ground
+from recon.ground import cells_of, estimate_ground
 from recon.log import Log, SparsePoints
 from recon.seeds.ground_rays import ground_hits
 from recon.way import Path
@@ -46,13 +46,6 @@ def known_ground(points: np.ndarray, ground: Ground, ego: Trajectory, wide: floa
     count = np.bincount(np.ravel_multi_index(cells, shape)[lying], minlength=ground.heights.numel()).reshape(shape)
     side = 2 * round(CLOSE / ground.cell) + 1
     return further | (ndimage.uniform_filter(count.astype(np.float64), side, mode="constant") * side**2 > SOME - 0.5)
-
-
-def cells_of(points: np.ndarray, ground: Ground) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns `[...]` of a ground's cells in which points `[..., 3]` are, or the nearest."""
-    at = np.round((points[..., :2] - np.array(ground.origin)) / ground.cell).astype(np.int64)
-    rows, columns = ground.heights.shape
-    return at[..., 1].clip(0, rows - 1), at[..., 0].clip(0, columns - 1)
 
 
 def without_sunken(sparse: SparsePoints, log: Log, ego: Trajectory) -> SparsePoints:
