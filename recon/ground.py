@@ -63,7 +63,7 @@ def estimate_ground(points: np.ndarray, ego: Trajectory) -> Ground:
     off = np.full(shape, np.nan)
     points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
     column, row = np.round((points[:, :2] - low) / cell).astype(np.int64).clip(0, np.array(shape[::-1]) - 1).T
-    above = points[:, 2] - _ground(level, low, cell).height(torch.from_numpy(points[:, :2])).numpy()
+    above = above_ground(points, _ground(level, low, cell))
     near = np.abs(above) < 4 + STEEPEST * distance[row, column]
     points, above, place = points[near], above[near], (row * shape[1] + column)[near]
     # what is sorted, filled and averaged is how far the ground is from what the path leads one to expect: so it goes uphill with the path
@@ -90,6 +90,11 @@ def cells_of(points: np.ndarray, ground: Ground) -> tuple[np.ndarray, np.ndarray
     return at[..., 1].clip(0, rows - 1), at[..., 0].clip(0, columns - 1)
 
 
+def above_ground(points: np.ndarray, ground: Ground) -> np.ndarray:
+    """Metres `[...]` that points `[..., 3]` are above a ground."""
+    return points[..., 2] - ground.height(torch.from_numpy(points[..., :2])).numpy()
+
+
 def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> torch.Tensor:
     """What static points `[N, 3]` show of the ground, uint8 `[Y, X]`: `GROUND` in cells where enough of them lie on it and next to none
     below, `BARE` where besides next to none stand there or in the cells around, else 0. Between such cells its height is a guess. stray:
@@ -97,7 +102,7 @@ def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> to
     at = (points[:, :2] - np.array(ground.origin)) / ground.cell
     column, row = np.round(at).astype(np.int64).T
     rows, columns = ground.heights.shape
-    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    off = above_ground(points, ground)
     inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
 
     def count(which: np.ndarray) -> np.ndarray:
@@ -115,7 +120,7 @@ def shown_ground(points: np.ndarray, ground: Ground, stray: float = STRAY) -> to
 def _noise_under(points: np.ndarray, place: np.ndarray, ground: Ground) -> torch.Tensor:
     """How far points `[N, 3]` in cells `place` lie above a ground that the lowest of them tell, where they are its own and differ by noise:
     heights `[Y, X]` to be added, so that it goes through their middle."""
-    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    off = above_ground(points, ground)
     usual = float(np.median(off[np.abs(off) < 2 * NOISE])) if (np.abs(off) < 2 * NOISE).any() else 0.0
     lying = np.abs(off - usual) < NOISE
     cells = ground.heights.numel()

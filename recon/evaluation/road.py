@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
+from recon.ground import above_ground
 from recon.log import Track
 from recon.objects.actors import box_skin
 from recon.views.frames import Frames
@@ -48,7 +49,7 @@ def road_points(points: np.ndarray, ground: Ground) -> np.ndarray:
 def standing(points: np.ndarray, ground: Ground, tracks: Sequence[Track], time_us: int) -> np.ndarray:
     """What may hide the road at a moment, `[M, 3]`: those of lidar's points `[N, 3]` that are off it, and the sides of all boxes, of whose
     glass and dark paint no beam comes back."""
-    off = points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
+    off = above_ground(points, ground)
     skins = [points[np.abs(off) >= ON_ROAD]]
     for track in tracks:
         pose = track.trajectory().near(time_us).numpy()

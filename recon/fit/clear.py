@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from recon.fit.model import Splats
+from recon.ground import above_ground
 from recon.log import Log, Track
 from recon.movers.freespace import RangeImage, range_images
 from recon.objects.actors import SWEPT_MARGIN, inside
@@ -63,7 +64,7 @@ class Clear:
 
     def seen_through(self, points: np.ndarray) -> np.ndarray:
         """Whether points `[N, 3]` lie where lidars looked through; bool `[N]`."""
-        above = points[:, 2] - self.ground.height(torch.from_numpy(points[:, :2])).numpy()
+        above = above_ground(points, self.ground)
         asked = np.flatnonzero(above > ABOVE)
         through, there = np.zeros((2, len(asked)), np.int64)
         for image in self.images:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from recon.ground import above_ground
 from recon.log import Track
 from recon.movers.following import Cluster
 from scenes.ground import Ground
@@ -45,7 +46,7 @@ def boxed(clusters: Sequence[Cluster], ground: Ground, stamps_us: np.ndarray) ->
     path = smoothed(times, placed, stamps / 1e6)
     turned = np.interp(stamps / 1e6, times, np.unwrap(headings(middles, CHORDS[-1])))
     base = np.column_stack([path, ground.height(torch.from_numpy(path)).numpy()])
-    tops = [np.quantile(c.xyz[:, 2] - ground.height(torch.from_numpy(c.xyz[:, :2])).numpy(), 0.98) for c in clusters]
+    tops = [np.quantile(above_ground(c.xyz, ground), 0.98) for c in clusters]
     size = np.array([*size, np.quantile(tops, MOST_SEEN)])
     went = np.linalg.norm(path - path.mean(0), axis=1).max() > WENT / 2
     if not went or size[:2].max() < LEAST or size[2] < LEAST_HIGH or size[1] > WIDEST:

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from recon.ground import estimate_ground
+from recon.ground import above_ground, estimate_ground
 from recon.log import LidarPoints, Log, Sweep, Track
 from recon.movers.boxing import boxed
 from recon.movers.following import FEWEST, Cluster, Followed, Patience, follow
@@ -137,7 +137,7 @@ def candidates(log: Log, time_us: int, points: LidarPoints, ground: Ground, part
     a car's size."""
     xyz = points.xyz
     local = _in_body(log, time_us, xyz)
-    height = xyz[:, 2] - ground.height(torch.from_numpy(xyz[:, :2])).numpy()
+    height = above_ground(xyz, ground)
     own = (np.abs(local[:, 0]) < part * LENGTH / 2) & (np.abs(local[:, 1]) < part * WIDTH / 2)
     away = np.linalg.norm(local[:, :2], axis=1)
     kept = xyz[(height > part * HEIGHTS[0]) & (height < HEIGHTS[1]) & (away < REACH) & ~own]

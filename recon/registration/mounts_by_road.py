@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.ground import estimate_ground
+from recon.ground import above_ground, estimate_ground
 from recon.log import Log, LogCamera, Sweep
 from recon.registration.corrected import REMOUNTED, as_corrected
 from scenes.ground import Ground
@@ -85,7 +85,7 @@ class Street:
 
     def above(self, xyz: np.ndarray) -> np.ndarray:
         """Metres `[...]` above the ground."""
-        return xyz[..., 2] - self.ground.height(torch.from_numpy(xyz[..., :2])).numpy()
+        return above_ground(xyz, self.ground)
 
     def bare(self, eye: np.ndarray, middle: np.ndarray, time_us: int) -> bool:
         """Whether nothing stands at a moment between an eye `[3]` and the far side of a piece of road about a point `[3]`."""

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from recon.ground import above_ground
 from recon.log import Log
 from recon.seeds.carpet import NEAR_GROUND
 from recon.seeds.points import Cloud, middle_colours, one_a_voxel
@@ -66,7 +67,7 @@ def seen_from_aside(log: Log, frames: Frames, points: np.ndarray, known: Cloud, 
 
 def _off(points: np.ndarray, ground: Ground) -> np.ndarray:
     """Which of world points `[N, 3]` stand off the ground, bool `[N]`."""
-    return points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy() > NEAR_GROUND
+    return above_ground(points, ground) > NEAR_GROUND
 
 
 def _moved(camera: Camera, by: torch.Tensor) -> Camera:

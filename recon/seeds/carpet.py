@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from recon.ground import above_ground
 from recon.seeds.points import Cloud, alike, middle_colours
 from scenes.gaussians import Gaussians
 from scenes.ground import Ground
@@ -36,7 +37,7 @@ LOGIT = 2.0
 def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: int) -> Gaussians:
     """Flat splats on the ground within `REACH` of the path wherever `cloud` has no ground point near, coloured as what lies on it there;
     `most` at most, farther apart on a long way."""
-    off = np.abs(cloud.xyz[:, 2] - ground.height(torch.from_numpy(cloud.xyz[:, :2])).numpy())
+    off = np.abs(above_ground(cloud.xyz, ground))
     own = off < NEAR_GROUND
     lying = off < (LYING if (off < LYING).any() else NEAR_GROUND)
     path = ego.world_from_body[:, :2, 3].numpy()

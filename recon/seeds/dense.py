@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from recon.ground import cells_of
+from recon.ground import above_ground, cells_of
 from recon.log import Log, SparsePoints, Track
 from recon.seeds.ground_rays import ground_hits
 from recon.seeds.measured import PICTURES, Measured, by_pictures
@@ -153,7 +153,7 @@ def _points_themselves(log: Log, frames: Frames, sparse: SparsePoints, movers: l
 def depths(log: Log, frames: Frames, sparse: SparsePoints, ground: Ground) -> list[Depths]:
     """Of training pictures spread over the drive (`VIEWS`), those that show points of `sparse` and resemble others."""
     found = []
-    known = known_ground(sparse.xyz, ground, log.ego) if len(sparse.xyz) and log.meta.get("metric", True) else None
+    known = known_ground(sparse.xyz, ground, log.ego) & log.meta.get("metric", True)
     for c, name in enumerate(frames.names):
         views = frames.of(c)
         cameras = [frames.camera(log, v) for v in views]
@@ -188,7 +188,7 @@ def _before(plate: Plate, points: np.ndarray) -> np.ndarray:
     return z[z > 0]
 
 
-def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Ground, known: np.ndarray | None) -> np.ndarray | None:
+def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Ground, known: np.ndarray) -> np.ndarray | None:
     """Depth z of one of the plates; nothing where it shows none of its points or resembles no other. known: the cells of the ground that
     nothing is under, whatever points say."""
     shown = points[i]
@@ -197,9 +197,9 @@ def _depth_of(i: int, plates: list[Plate], points: list[np.ndarray], ground: Gro
     if not others:
         return None
     deepest = ground_depth(plates[i], ground, DUG)
-    if (shown[:, 2] < ground.height(torch.from_numpy(shown[:, :2])).numpy() - DUG).mean() > BURIED:
+    if (above_ground(shown, ground) < -DUG).mean() > BURIED:
         met = plates[i].points(np.where(np.isfinite(deepest), deepest, 0.0))
-        deepest = np.where(known[cells_of(met, ground)] if known is not None else False, deepest, np.inf)
+        deepest = np.where(known[cells_of(met, ground)], deepest, np.inf)
     near = NEARER * max(float(np.quantile(z, 0.05)), 0.1 * float(np.median(z)))
     nearest = min(near, max(near / 3, 0.95 * float(deepest.min())))
     return np.minimum(swept(plates[i], [plates[j] for j in others], nearest, shown, deepest), FARTHEST)

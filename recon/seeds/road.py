@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from recon.ground import cells_of
+from recon.ground import above_ground, cells_of
 from recon.log import Log, LogCamera
 from recon.registration.mounts_by_road import far_pairs, laid_out
 from recon.way import LONG, Path
@@ -69,8 +69,7 @@ class Road:
     def off(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Metres `[...]` by which points `[..., 3]`, NaN or not, are above it, and its slack there."""
         known, points = np.isfinite(points).all(-1), np.nan_to_num(points)
-        above = points[..., 2] - self.ground.height(torch.from_numpy(points[..., :2])).numpy()
-        return np.where(known, above, np.nan), np.where(known, self.slack[cells_of(points, self.ground)], 0.0)
+        return np.where(known, above_ground(points, self.ground), np.nan), np.where(known, self.slack[cells_of(points, self.ground)], 0.0)
 
     def points(self) -> np.ndarray:
         """Points `[N, 3]` that lie on it, four in each of its cells."""
@@ -112,12 +111,12 @@ def road_by_pictures(
     return _laid(path, guess, below, off, slack, [_wide(side * left, points[:, 2] - level + below, slack) for side in (1, -1)])
 
 
-def _wide(aside: np.ndarray, above: np.ndarray, slack: float) -> float:
+def _wide(aside: np.ndarray, high: np.ndarray, slack: float) -> float:
     """Metres to one side up to which points `[N]`, so far to that side of the path and so far above the road, show that nothing stands."""
     wide = WIDE
     while wide < WIDEST:
-        there = (aside >= wide) & (aside < wide + 1) & (above < TALL)
-        if there.sum() < TELLING or (above[there] > slack).mean() > STANDS:
+        there = (aside >= wide) & (aside < wide + 1) & (high < TALL)
+        if there.sum() < TELLING or (high[there] > slack).mean() > STANDS:
             break
         wide += 1
     return wide

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from scipy import ndimage
 
-from recon.ground import cells_of, estimate_ground
+from recon.ground import above_ground, cells_of, estimate_ground
 from recon.log import Log, SparsePoints
 from recon.seeds.ground_rays import ground_hits
 from recon.way import Path
@@ -32,17 +31,17 @@ CLOSE, SOME = 1.5, 3
 """Metres each way from a place within which so many points that lie on the ground show it there, too."""
 
 
-def known_ground(points: np.ndarray, ground: Ground, ego: Trajectory, wide: float = LIMIT) -> np.ndarray | None:
+def known_ground(points: np.ndarray, ground: Ground, ego: Trajectory, wide: float = LIMIT) -> np.ndarray:
     """In which cells `[Y, X]` of a ground nothing can be seen through it: so many metres beside a body's path, and where several of points
-    `[N, 3]` lie on it. None where those along the path do not, so that it may be anywhere."""
+    `[N, 3]` lie on it; none where those along the path do not, so that it may be anywhere."""
     shape, path = tuple(ground.heights.shape), Path(ego).places
     on = np.arange(1.0, ON)[:, None]
     ends = path[0] + on * (path[0] - path[1]), path[-1] + on * (path[-1] - path[-2])
     driven, further = _beside(path, ground) < WIDE, _beside(np.concatenate([path, *ends]), ground) < wide
     cells = cells_of(points, ground)
-    lying, near = np.abs(_above(points, ground)) < LYING, driven[cells]
+    lying, near = np.abs(above_ground(points, ground)) < LYING, driven[cells]
     if (lying & near).sum() < FEWEST or lying[near].mean() < SHARE:
-        return None
+        return np.zeros(shape, bool)
     count = np.bincount(np.ravel_multi_index(cells, shape)[lying], minlength=ground.heights.numel()).reshape(shape)
     side = 2 * round(CLOSE / ground.cell) + 1
     return further | (ndimage.uniform_filter(count.astype(np.float64), side, mode="constant") * side**2 > SOME - 0.5)
@@ -50,14 +49,12 @@ def known_ground(points: np.ndarray, ground: Ground, ego: Trajectory, wide: floa
 
 def without_sunken(sparse: SparsePoints, log: Log, ego: Trajectory) -> SparsePoints:
     """The points without those that most of the pictures that show them see through known ground (`known_ground`) along a body's path; all
-    of them where none is, or they are not metric."""
-    if not log.meta.get("metric", True) or not len(sparse.xyz):
+    of them where they are not metric."""
+    if not log.meta.get("metric", True):
         return sparse
     ground = estimate_ground(sparse.xyz, ego)
     known = known_ground(sparse.xyz, ground, ego, WIDE)
-    if known is None:
-        return sparse
-    sunken = _above(sparse.xyz, ground) < -UNDER
+    sunken = above_ground(sparse.xyz, ground) < -UNDER
     through, seen = np.zeros((2, len(sparse.xyz)))
     for name, frames in sparse.seen.items():
         eyes = log.camera(name).world_from_cam[:, :3, 3].numpy()
@@ -72,11 +69,6 @@ def without_sunken(sparse: SparsePoints, log: Log, ego: Trajectory) -> SparsePoi
     order = np.cumsum(kept) - 1
     left = {name: tuple(order[s[kept[s]]] for s in frames) for name, frames in sparse.seen.items()}
     return replace(sparse, xyz=sparse.xyz[kept], seen=left)
-
-
-def _above(points: np.ndarray, ground: Ground) -> np.ndarray:
-    """Metres `[N]` that points `[N, 3]` are above a ground."""
-    return points[:, 2] - ground.height(torch.from_numpy(points[:, :2])).numpy()
 
 
 def _beside(places: np.ndarray, ground: Ground) -> np.ndarray:
