@@ -24,6 +24,7 @@ from recon.seeds.beyond import beyond_lidar
 from recon.seeds.carpet import carpet
 from recon.seeds.dense import Depths, agreeing, cloud_from_pictures, points_of
 from recon.seeds.fill import Search
+from recon.seeds.fineness import seen_from
 from recon.seeds.measured import Measured, by_lidar, by_lidar_of_movers
 from recon.seeds.points import Cloud, colours, fewer, first_exposures, merged_colours, splats_from, thin
 from recon.seeds.road import road_by_pictures
@@ -125,13 +126,19 @@ def prepare(
     else:
         street = _lidar_street(log, frames, sweeps, split, movers, driven, taken_us, known, report)
     ground, gains = street.ground, street.gains
-    path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     shares = (street.points, SEED_PART), (street.beyond, BEYOND_PART), (street.aside, ASIDE_PART)
-    cloud, sides = _thinned(path, *((points, int(budget * part)) for points, part in shares))
     nearest = nearest_of(street.measured)
+    few = [
+        thin(points, seen_from(points.xyz, ground, ego, rig.values(), nearest), int(budget * part))
+        for points, part in shares
+        if len(points.xyz)
+    ]
+    cloud, sides = Cloud.cat([points for points, _ in few]), np.concatenate([sides for _, sides in few])
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values(), nearest))
-    background = Gaussians.cat([background, carpet(cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
+    shown = np.concatenate([points.xyz for points, _ in shares])
+    background = Gaussians.cat([background, carpet(shown, cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
 
+    path = cKDTree(ego.world_from_body[:, :3, 3].numpy())
     groups, reaches, tracks = [], [], []
     for track, seeds in actor_seeds(log, frames, sweeps, split, ground, gains, sh_count, budget):
         groups.append(seeds)
@@ -200,12 +207,6 @@ def _lidar_street(
     everything = struck.completed(by_lidar_of_movers(log, frames, sweeps, split))
     measured = [everything, by_all_sweeps(log, frames, split, movers).without(by_pictures), by_pictures]
     return _Street(points, beyond, aside, ground, gains, measured)
-
-
-def _thinned(path: cKDTree, *parts: tuple[Cloud, int]) -> tuple[Cloud, np.ndarray]:
-    """Of each cloud about as many points as it may have, together, and their voxels' sides (`thin`)."""
-    few = [thin(cloud, path.query(cloud.xyz)[0], most) for cloud, most in parts if len(cloud.xyz)]
-    return Cloud.cat([cloud for cloud, _ in few]), np.concatenate([sides for _, sides in few])
 
 
 def _usual(frames: Frames, gains: np.ndarray) -> np.ndarray:

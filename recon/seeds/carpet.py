@@ -27,6 +27,9 @@ REACH = 10.0
 NEAR_GROUND = 0.25
 """Metres from the ground's height within which a point belongs to the ground."""
 
+KNOWN = 0.1
+"""Metres, the sides of cells in which a point of the ground makes it known."""
+
 LYING = 0.08
 """Metres from the ground's height within which a point is surely the ground's: above lie tyres and the sills of parked cars."""
 
@@ -34,16 +37,16 @@ LOGIT = 2.0
 """Of the opacity."""
 
 
-def carpet(cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: int) -> Gaussians:
-    """Flat splats on the ground within `REACH` of the path wherever `cloud` has no ground point near, coloured as what lies on it there;
-    `most` at most, farther apart on a long way."""
+def carpet(shown: np.ndarray, cloud: Cloud, ground: Ground, ego: Trajectory, sh_count: int, most: int) -> Gaussians:
+    """Flat splats on the ground within `REACH` of the path wherever none of the points `shown` `[N, 3]` lies on it near, coloured as what
+    of `cloud` does; `most` at most, farther apart on a long way."""
     off = np.abs(above_ground(cloud.xyz, ground))
-    own = off < NEAR_GROUND
     lying = off < (LYING if (off < LYING).any() else NEAR_GROUND)
+    own = np.unique(np.floor(shown[np.abs(above_ground(shown, ground)) < NEAR_GROUND, :2] / KNOWN), axis=0)
     path = ego.world_from_body[:, :2, 3].numpy()
-    if not own.any() or most < 1:
+    if not len(own) or not lying.any() or most < 1:
         return Gaussians.empty(sh_count)
-    known, spacing = cKDTree(cloud.xyz[own, :2]), SPACING
+    known, spacing = cKDTree((own + 0.5) * KNOWN), SPACING
     while len(xy := _bare(path, known, spacing)) > most:
         spacing *= max(WIDER, (len(xy) / most) ** 0.5)
     if not len(xy):

@@ -41,7 +41,7 @@ from tests.bench.recon import fitted
 from tests.bench.references import pictures
 from tests.bench.worlds.corner import corner
 from tests.bench.worlds.highway import highway
-from tests.bench.worlds.place import Place
+from tests.bench.worlds.place import UNSEEN, Place
 from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
@@ -84,9 +84,10 @@ def figures(
     heights = camera.world_from_cam[2, 3] + world_directions(camera)[..., 2] * truth.depth
     ground = (truth.who == 0) & (heights < LOW)
     parts = [psnr(rgb, truth.rgb, part) if part.any() else float("nan") for part in (ground, moving)]
-    everywhere = torch.ones_like(solid)
-    ratios = [sharpness(picture, everywhere) / sharpness(truth.rgb, everywhere) for picture in (rgb, enhanced)]
-    return [psnr(rgb, truth.rgb), psnr(enhanced, truth.rgb), *parts, *ratios, *(100 * s for s in (*shares, open_))], [rgb, enhanced]
+    lit = truth.who != UNSEEN
+    ratios = [sharpness(picture, lit) / sharpness(truth.rgb, lit) for picture in (rgb, enhanced)]
+    all_ = [psnr(picture, truth.rgb, lit) for picture in (rgb, enhanced)]
+    return [*all_, *parts, *ratios, *(100 * s for s in (*shares, open_))], [rgb, enhanced]
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ import torch
 
 from render.rays import world_directions
 from scenes.poses import inverse
-from tests.bench.worlds.place import Light, Mover, Part, Place, along, looking
+from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, fisheye, looking
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.solids import box, joined, panel, plain
@@ -56,6 +56,35 @@ def test_the_sun_casts_shadows_away_from_itself(place):
     rgb, *_ = place.seen(camera)
     shade, sunny = (rgb[pixel(camera, (10.5, side * 1.6, 0.0))].mean() for side in (1, -1))
     assert shade < 0.7 * sunny
+
+
+def test_rows_are_read_one_after_the_other(place):
+    """Each row is that of a camera which takes all at once at the row's moment: of what stands still to a hundredth of a pixel."""
+    rig = replace(place.rig["front"], shutter="rows", readout_us=90_000)
+    _, depth, who = place.seen(rig.along(place.ego, int(TIMES[0])))
+    for row in (4, 30, 34, 47):
+        at = int(TIMES[0]) + round((row + 0.5) / 48 * 90_000)
+        _, then, there = place.seen(rig.at(place.ego.at(at), at))
+        assert (who[row] == there[row]).float().mean() > 0.98, "movers stand still for a millisecond"
+        still = (who[row] == 0) & (there[row] == 0)
+        assert torch.allclose(depth[row][still], then[row][still], atol=2e-3)
+    assert (who == 1).any()
+
+
+def test_a_drive_read_row_by_row_has_poses_of_the_middle_row(place, tmp_path):
+    rig = replace(place.rig["front"], shutter="rows", readout_us=20_000)
+    camera = recorded(replace(place, rig={"front": rig}), ["front"], tmp_path).camera("front")
+    assert camera.times_us.tolist() == (TIMES[:-1] + 10_000).tolist() and (camera.shutter, camera.readout_us) == ("rows", 20_000)
+    assert camera.world_from_cam[2, 0, 3] == pytest.approx(0.21)
+
+
+def test_a_fisheye_shows_a_circle(place):
+    camera = fisheye((64, 48), 200.0, (0.0, 0.0, 1.0), TIMES[:-1]).along(place.ego, int(TIMES[0]))
+    rgb, depth, who = place.seen(camera)
+    assert (who[0, 0], who[24, 0], who[24, 63]) == (UNSEEN, UNSEEN, UNSEEN) and not rgb[who == UNSEEN].any()
+    assert depth[24, 32] == pytest.approx(10.0, abs=0.02)
+    row = 24 + int(64 * 45 / 200)  # down by 45 degrees, 1 m above the ground
+    assert who[row, 32] == 0 and depth[row, 32] == pytest.approx(2**0.5, rel=0.03)
 
 
 def test_limbs_swing_about_their_joint():

@@ -38,7 +38,7 @@ def highway(meshes: Path, seed: int = 2) -> Place:
         ),
         Light((-0.5, -0.35, 0.79), (1.0, 0.95, 0.86), (0.24, 0.28, 0.34), 25.0),
         along([(x, lanes[1] + 0.2 * math.sin(x / 60)) for x in np.arange(-2.0, 260.0, 2.0)], SPEED, times),
-        {"front": rig(times)["front"]},
+        rig(times),
         LIDAR,
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (LANE, 0.0), (-2.0, 0.0), (-LANE, 0.0)),
     )

@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from render.rays import camera_rays, world_directions
+from render.rays import camera_rays, readout, world_directions
 from render.tracer import Blockers, Mesh, TracedMesh, fibonacci
-from scenes import Pinhole
+from scenes import Fisheye, Pinhole
 from scenes.camera import Camera, RigCamera
 from scenes.poses import CAM_FROM_FLU, inverse, translation
 from scenes.poses import yaw as turn
@@ -29,6 +29,15 @@ AROUND = 24
 
 OFF = 4e-3
 """Metres off a surface at which its light is looked for."""
+
+CIRCLE = math.radians(95.0)
+"""From the axis, as far as a lens shows anything: beyond, a picture is black."""
+
+TICK_US = 1000
+"""While a picture is read out row by row, movers stand still for so long."""
+
+UNSEEN = -2
+"""Who is there in a pixel that no light reaches."""
 
 
 @dataclass(frozen=True)
@@ -103,29 +112,32 @@ class Place:
         return TracedMesh(self.still)
 
     def seen(self, camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What a camera of a global shutter takes: rgb `[H, W, 3]` display-referred; depth `[H, W]` in metres, inf in the sky, and who is
-        there, `[H, W]`, -1 sky, 0 what stands still, movers from 1, both along the rays through the pixels' centres."""
+        """What a camera takes at once or row by row: rgb `[H, W, 3]` display-referred; depth `[H, W]` in metres, inf in the sky, and who is
+        there, `[H, W]`, `UNSEEN` past a fisheye's edge, -1 sky, 0 what stands still, movers from 1, both along the rays through the pixels'
+        centres. Shade is that of one moment, halfway."""
         fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
-        colours = self._shaded(fine)
-        small = colours.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
-        origins, directions = _rays(camera)
-        (_, distance, _, who), rays = self._first(origins, directions, camera.time_us), camera_rays(camera)
-        depth = distance.reshape(camera.height, camera.width) / rays.norm(dim=-1)
-        return srgb_from_linear(small.clamp(0, 1)), depth, who.reshape(camera.height, camera.width)
+        small = self._shaded(fine).reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
+        (_, distance, _, who), rays = self._first(*_rays(camera)), camera_rays(camera)
+        depth, who = (found.reshape(camera.height, camera.width) for found in (distance, who))
+        beyond = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2]) > CIRCLE
+        small[beyond], who[beyond] = 0.0, UNSEEN
+        return srgb_from_linear(small.clamp(0, 1)), depth / rays.norm(dim=-1), who
 
     def distances(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Metres along unit world rays `[N, 3]` to the first surface, inf for none, and who it is, as `seen` says."""
-        _, distance, _, who = self._first(origins, directions, time_us)
+        _, distance, _, who = self._first(origins, directions, torch.full((len(origins),), time_us))
         return distance, who
 
-    def _first(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, ...]:
-        """Albedo `[N, 3]` sRGB, metres `[N]`, world normals `[N, 3]`, and who `[N]`."""
+    def _first(self, origins: torch.Tensor, directions: torch.Tensor, times_us: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Albedo `[N, 3]` sRGB, metres `[N]`, world normals `[N, 3]`, and who `[N]`, along rays of a time each."""
         colours, normals, distance = self.traced.trace(origins, directions)
         who = torch.where(distance.isfinite(), 0, -1)
+        ticks, tick = times_us.unique(return_inverse=True)
         for number, mover in enumerate(self.movers, 1):
-            for traced, pose in zip(mover.traced, mover.poses(time_us), strict=True):
-                back, forth = inverse(pose).float(), pose.float()
-                local, ways = origins @ back[:3, :3].T + back[:3, 3], directions @ back[:3, :3].T
+            for traced, poses in zip(mover.traced, zip(*map(mover.poses, ticks.tolist()), strict=True), strict=True):
+                forth = torch.stack(poses)
+                back = inverse(forth).float()
+                local, ways = _moved(back, tick, origins) + back[tick, :3, 3], _moved(back, tick, directions)
                 near = _meets(traced.mesh, local, ways).nonzero()[:, 0]
                 if not len(near):
                     continue
@@ -133,16 +145,17 @@ class Place:
                 first = t < distance[near]
                 at = near[first]
                 colours[at], distance[at], who[at] = c[first], t[first], number
-                normals[at] = n[first] @ forth[:3, :3].T
+                normals[at] = _moved(forth.float(), tick[at], n[first])
         return colours[:, :3], distance, normals, who
 
     def _shaded(self, camera: Camera) -> torch.Tensor:
         """Linear colours `[N, 3]` of all pixels."""
-        origins, directions = _rays(camera)
-        albedo, distance, normals, who = self._first(origins, directions, camera.time_us)
+        origins, directions, times_us = _rays(camera)
+        albedo, distance, normals, who = self._first(origins, directions, times_us)
         solid = who >= 0
         points = origins[solid] + directions[solid] * distance[solid, None] + OFF * normals[solid]
-        blockers, sun = Blockers(self._triangles(camera.time_us)), torch.tensor(self.light.sun)[None]
+        halfway = camera.time_us + camera.readout_us // 2
+        blockers, sun = Blockers(self._triangles(halfway)), torch.tensor(self.light.sun)[None]
         lit = blockers.open_share(points, sun, torch.ones(1), 1e3) * (normals[solid] @ sun[0]).clamp_min(0)
         open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach)
         light = lit[:, None] * torch.tensor(self.light.sunlight) + 2 * open_[:, None] * torch.tensor(self.light.ambient)
@@ -159,10 +172,19 @@ class Place:
         return np.concatenate(found)
 
 
-def _rays(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where a camera's rays begin, and unit world directions through its pixels' centres, `[H W, 3]` both."""
-    directions = world_directions(camera).reshape(-1, 3)
-    return camera.world_from_cam[:3, 3].float().expand(len(directions), 3), torch.nn.functional.normalize(directions, dim=1)
+def _rays(camera: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where a camera's rays begin and unit world directions through its pixels' centres, `[H W, 3]` both, and when, `[H W]`, to a tick."""
+    directions = torch.nn.functional.normalize(world_directions(camera).reshape(-1, 3), dim=1)
+    eyes = readout(camera, camera.world_from_cam, camera.world_from_cam_end)[:, :3, 3].float()
+    late = TICK_US * ((torch.arange(camera.height) + 0.5) / camera.height * camera.readout_us / TICK_US).floor().long()
+    return eyes.repeat_interleave(camera.width, 0), directions, (camera.time_us + late).repeat_interleave(camera.width)
+
+
+def _moved(poses: torch.Tensor, which: torch.Tensor, ways: torch.Tensor) -> torch.Tensor:
+    """Directions `[N, 3]` turned each by the one of `poses` `[T, 4, 4]` that `which` `[N]` says."""
+    if len(poses) == 1:
+        return ways @ poses[0, :3, :3].T
+    return torch.einsum("nij,nj->ni", poses[which, :3, :3], ways)
 
 
 def _meets(mesh: Mesh, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
@@ -187,6 +209,12 @@ def looking(size: tuple[int, int], angle: float, yaw: float, at: Sequence[float]
     focal = size[0] / 2 / math.tan(math.radians(angle) / 2)
     mount = translation(*at) @ turn(math.radians(yaw)) @ inverse(CAM_FROM_FLU)
     return RigCamera(Pinhole(focal, focal, size[0] / 2, size[1] / 2), *size, mount, times_us=times_us)
+
+
+def fisheye(size: tuple[int, int], angle: float, at: Sequence[float], times_us: torch.Tensor) -> RigCamera:
+    """An equidistant fisheye that looks ahead, `angle` degrees wide from the left edge to the right one; else as `looking`."""
+    focal = size[0] / math.radians(angle)
+    return RigCamera(Fisheye(focal, focal, size[0] / 2, size[1] / 2), *size, translation(*at) @ inverse(CAM_FROM_FLU), times_us=times_us)
 
 
 def clock(frames: int, step_us: int) -> torch.Tensor:

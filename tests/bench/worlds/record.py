@@ -31,7 +31,7 @@ LOOKS = 8
 
 @dataclass(frozen=True)
 class Truth:
-    """What would be seen: rgb `[H, W, 3]`, 0..1; depth `[H, W]` metres, inf in the sky; who `[H, W]`: -1 sky, 0 street, movers from 1."""
+    """What would be seen: rgb `[H, W, 3]`, 0..1; depth `[H, W]` metres, inf in the sky; who `[H, W]`: as of `Place.seen`."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -46,8 +46,10 @@ def recorded(place: Place, names: Sequence[str], folder: Path) -> Log:
         camera = place.rig[name]
         views = [camera.along(ego, int(t)) for t in camera.times_us]
         files = tuple(_picture(place, view, folder / f"{name}_{i:03d}.png") for i, view in enumerate(views))
-        poses = torch.stack([view.world_from_cam for view in views])
-        cameras[name] = LogCamera(name, camera.lens, camera.width, camera.height, files, camera.times_us, poses)
+        halfway = camera.times_us + camera.readout_us // 2
+        poses = torch.stack([ego.near(int(t)) @ camera.body_from_cam for t in halfway])
+        kind = camera.lens, camera.width, camera.height
+        cameras[name] = LogCamera(name, *kind, files, halfway, poses, camera.shutter, camera.readout_us)
     stamps = next(iter(place.rig.values())).times_us.tolist()
     sweeps = tuple(Sweep(i, t, partial(_sweep, place, t, folder / f"sweep_{i:03d}.npz")) for i, t in enumerate(stamps))
     tracks = tuple(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from recon.assets.mesh_files import read_mesh
 from render.tracer import Mesh
 from scenes.camera import RigCamera
 from tests.bench.worlds.people import walker
-from tests.bench.worlds.place import Light, Mover, Part, Place, along, clock, looking
+from tests.bench.worlds.place import Light, Mover, Part, Place, along, clock, fisheye, looking
 from tests.bench.worlds.solids import box, crown, facade, grain, joined, moved, panel, plain
 
 FRAMES, STEP_US = 80, 100_000
@@ -20,7 +21,7 @@ HALF, KERB, JUNCTION, LENGTH = 6.5, 0.13, (62.0, 72.0), (-20.0, 140.0)
 """Metres: half of the road's width, the pavement's height, where a street crosses, and where houses begin and end."""
 
 CARS = ("hatchback", "hatchback_blue", "hatchback_red", "pickup", "prius_hybrid")
-SPEED = 6.0
+SPEED, READOUT_US = 6.0, 30_000
 STANDING = (
     ("fire_hydrant", 18.0, -HALF - 0.6),
     ("postbox", 24.0, HALF + 0.8),
@@ -59,9 +60,16 @@ def models_in(meshes: Path) -> dict[str, Mesh]:
 
 
 def rig(times_us: torch.Tensor) -> dict[str, RigCamera]:
-    """A car's cameras, ahead and to the left, that take a picture at all but the last of these times."""
-    yaws = {"front": 0.0, "left": 75.0}
-    return {name: looking((480, 270), 64.0, yaw, (1.5, 0.0, 1.55), times_us[:-1]) for name, yaw in yaws.items()}
+    """A car's cameras that take a picture at all but the last of these times: ahead, one that is read out row by row, one of a fisheye's
+    whole circle, and to the left."""
+    at, times = (1.5, 0.0, 1.55), times_us[:-1]
+    front = looking((480, 270), 64.0, 0.0, at, times)
+    return {
+        "front": front,
+        "rolling": replace(front, shutter="rows", readout_us=READOUT_US),
+        "fisheye": fisheye((480, 360), 190.0, at, times),
+        "left": looking((480, 270), 64.0, 75.0, at, times),
+    }
 
 
 def plaster(chance: np.random.Generator) -> np.ndarray:
