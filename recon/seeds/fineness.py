@@ -16,7 +16,8 @@ from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
 CELL, APART, AWAY = 0.1, 0.2, 6.0
-"""In distances to the path: sides of cells of which all is seen alike, steps of the path from which they are looked at, and how far off."""
+"""In distances to the path: sides of cells of which all is seen as one point is, steps of the path from which it
+is looked at, and how far off."""
 
 LYING = 0.15
 """Metres from the ground within which something lies on it, and is seen as aslant."""
@@ -35,8 +36,9 @@ def seen_from(xyz: np.ndarray, ground: Ground, ego: Trajectory, rig: Iterable[Ri
     found = np.empty(len(xyz))
     for level in np.unique(levels):
         of, scale = levels == level, 2.0**level
-        cells, which = np.unique(np.floor(xyz[of] / (CELL * scale)).astype(np.int64), axis=0, return_inverse=True)
-        best = _best((cells + 0.5) * (CELL * scale), ground, _steps(ego, APART * scale, scale), cameras, AWAY * scale)
+        cells = np.floor(xyz[of] / (CELL * scale)).astype(np.int64)
+        _, first, which = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        best = _best(xyz[of][first], ground, _steps(ego, APART * scale, scale), cameras, AWAY * scale)
         found[of] = best[which.ravel()]
     return np.where(np.isfinite(found), np.maximum(found, away), away)
 
