@@ -161,10 +161,20 @@ def test_the_carpet_takes_the_streets_colour_not_that_of_a_cars_sill():
     road = road[np.abs(road[:, :2]).max(1) > 1.5]
     sill = np.array([[0.0, y, 0.15] for y in np.arange(-1, 1, 0.4)])
     rgb = np.concatenate([np.full((len(road), 3), 0.4), np.tile([[0.1, 0.1, 0.9]], (len(sill), 1))])
-    laid = carpet(Cloud(np.concatenate([road, sill]), rgb), flat, ego, 4, 10_000)
+    points = np.concatenate([road, sill])
+    laid = carpet(points, Cloud(points, rgb), flat, ego, 4, 10_000)
     gap = laid.means[:, :2].abs().amax(1) < 1.3
     assert gap.sum() > 20
     torch.testing.assert_close(rgb_from_sh(laid.sh[gap, 0]), torch.full((int(gap.sum()), 3), 0.4), atol=1e-4, rtol=0)
+
+
+def test_no_carpet_lies_where_points_were_left_out():
+    """Of a road that was measured every 20 cm one seed in 2 m is kept: none of the carpet belongs between them."""
+    flat, ego = Ground(torch.zeros(41, 41), (-10.0, -10.0), 0.5), Trajectory(torch.zeros(1, dtype=torch.int64), torch.eye(4)[None].double())
+    x, y = np.meshgrid(np.arange(-12, 12, 0.2), np.arange(-12, 12, 0.2))
+    road = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    seeds = Cloud(road[::100], np.full((len(road[::100]), 3), 0.4))
+    assert not len(carpet(road, seeds, flat, ego, 4, 10_000)) and len(carpet(seeds.xyz, seeds, flat, ego, 4, 10_000)) > 1000
 
 
 def test_on_a_long_way_the_carpet_keeps_to_its_part_and_still_hides_what_is_below():
@@ -173,12 +183,12 @@ def test_on_a_long_way_the_carpet_keeps_to_its_part_and_still_hides_what_is_belo
     poses = torch.stack([translation(float(x), float(x), 1.8) for x in along])
     ego, flat = Trajectory(100_000 * torch.arange(len(along)), poses), Ground(torch.zeros(2, 2), (0.0, 0.0), 1.0)
     road = np.column_stack([along, along - 3, 0 * along])
-    laid = carpet(Cloud(road, np.full((len(road), 3), 0.4)), flat, ego, 1, 10_000)
+    laid = carpet(road, Cloud(road, np.full((len(road), 3), 0.4)), flat, ego, 1, 10_000)
     assert 8_000 < len(laid) <= 10_000
     spread = laid.log_scales[0, 0].exp()
     away = cKDTree(laid.means[:, :2].numpy()).query(np.column_stack([along + 5, along + 1]))[0]
     assert (away < 1.0 / 0.75 * float(spread)).all()
-    few = carpet(Cloud(road[:9], np.full((9, 3), 0.4)), flat, Trajectory(ego.times_us[:9], poses[:9]), 1, 20_000)
+    few = carpet(road[:9], Cloud(road[:9], np.full((9, 3), 0.4)), flat, Trajectory(ego.times_us[:9], poses[:9]), 1, 20_000)
     assert few.log_scales[0, 0].exp() == pytest.approx(0.75 * 0.3)
 
 
