@@ -141,7 +141,7 @@ def merged_colours(seen: np.ndarray, gains: np.ndarray) -> np.ndarray:
 
 
 def thin(cloud: Cloud, distance: np.ndarray, budget: int) -> tuple[Cloud, np.ndarray]:
-    """At most about `budget` points: one a voxel whose side grows with distance to the path. Also returns each point's voxel side.
+    """At most about `budget` points: one a voxel, whose side grows with its `distance` `[N]`. Also returns their voxels' sides.
 
     The side is k times the distance, at least 4 cm, in half octaves; k is found by bisection so that the budget is met.
     """
