@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from recon.log import Log, LogCamera
 from recon.views.drawn_over import drawn_over
+from recon.views.image_circle import image_circle
 from recon.views.staying import SOFT, staying
 
 WIDTH, BLUR = 320, 0.7
@@ -41,25 +42,29 @@ WIDE, MOST, RIM = 0.15, 0.4, 0.02
 
 
 def with_ego_masks(log: Log, names: Sequence[str], width: int) -> Log:
-    """The log, of whose cameras `names` know what of their pictures shows the car, or is drawn over them: by pictures `width` pixels wide
-    where nobody says."""
+    """The log, of whose cameras `names` know what of their pictures shows the car, is drawn over them or lies beyond the lens's image: by
+    pictures `width` pixels wide where nobody says."""
 
     def told(camera: LogCamera) -> LogCamera:
         size = (width, round(width * camera.height / camera.width))
-        car, drawn = not_the_street(log, camera, range(len(camera)), lambda i: camera.image(i, *size))
-        masks = [at_size(mask, *size[::-1]).numpy() for mask in (car, drawn) if mask is not None]
+        found = not_the_street(log, camera, range(len(camera)), lambda i: camera.image(i, *size))
+        masks = [at_size(mask, *size[::-1]).numpy() for mask in found.values()]
         return replace(camera, ego_mask=np.logical_or.reduce(masks) if masks else np.zeros((1, 1), bool))
 
     return replace(log, cameras={name: told(camera) if name in names else camera for name, camera in log.cameras.items()})
 
 
-def not_the_street(
-    log: Log, camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray]
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """What of a camera's frames shows the car (`ego_mask`), and what is drawn over them (`drawn_over`), as data sets' are not."""
-    picture = cache(picture)
-    drawn = drawn_over(camera, indices, picture) if camera.ego_mask is None and not log.sweeps else None
-    return ego_mask(camera, indices, picture, drawn), drawn
+def not_the_street(log: Log, camera: LogCamera, indices: Sequence[int], picture: Callable[[int], np.ndarray]) -> dict[str, np.ndarray]:
+    """Masks `[h, w]` of a camera's frames by what is said of them: the car (`ego_mask`), what is drawn over them (`drawn_over`), as data
+    sets' are not, and what no light reaches (`image_circle`); those that there are, and the first alone where the camera says it."""
+    picture, told = cache(picture), camera.ego_mask is not None
+    drawn = None if told or log.sweeps else drawn_over(camera, indices, picture)
+    found = {
+        "the lowest part of its pictures, {}, shows the recording car itself": ego_mask(camera, indices, picture, drawn),
+        "a part of its pictures, {}, is drawn over them": drawn,
+        "the rim of its pictures, {}, lies beyond the lens's image": None if told else image_circle(camera, indices, picture),
+    }
+    return {said: mask for said, mask in found.items() if mask is not None}
 
 
 def ego_mask(

@@ -132,10 +132,8 @@ def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tup
 def _ego(log: Log, camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:
     """The recording car in a camera's images of `size` (width, height), and what is drawn over them, bool `[H, W]`; None where they show
     nothing of either. Says so."""
-    car, drawn = not_the_street(log, camera, list(images), lambda i: images[i].numpy())
     masks = []
-    for small, which, what in ((car, "the lowest part", "shows the recording car itself"), (drawn, "a part", "is drawn over them")):
-        if small is not None:
-            print(f"{camera.name}: {which} of its pictures, {small.mean():.1%}, {what} and is left out", file=sys.stderr)
-            masks.append(at_size(small, size[1], size[0]))
+    for told, small in not_the_street(log, camera, list(images), lambda i: images[i].numpy()).items():
+        print(f"{camera.name}: {told.format(f'{small.mean():.1%}')} and is left out", file=sys.stderr)
+        masks.append(at_size(small, size[1], size[0]))
     return torch.stack(masks).any(0) if masks else None
