@@ -76,6 +76,9 @@ def test_a_drive_read_row_by_row_has_poses_of_the_middle_row(place, tmp_path):
     camera = recorded(replace(place, rig={"front": rig}), ["front"], tmp_path).camera("front")
     assert camera.times_us.tolist() == (TIMES[:-1] + 10_000).tolist() and (camera.shutter, camera.readout_us) == ("rows", 20_000)
     assert camera.world_from_cam[2, 0, 3] == pytest.approx(0.21)
+    truth = next(iter(looks(replace(place, rig={"front": rig}), "front", tmp_path, [2])))[2]
+    at_once = place.rig["front"].at(place.ego.at(int(TIMES[2]) + 10_000), int(TIMES[2]) + 10_000)
+    assert torch.equal(truth.depth, place.seen(at_once)[1]), "as scenes' cameras take it"
 
 
 def test_a_fisheye_shows_a_circle(place):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -62,13 +62,15 @@ def recorded(place: Place, names: Sequence[str], folder: Path) -> Log:
 
 
 def looks(place: Place, name: str, folder: Path, held_out: list[int]) -> Iterator[tuple[tuple[float, float], int, Truth]]:
-    """How far aside and up, the frame's index, and what a camera would see from there, at `LOOKS` of the frames that no fit sees."""
-    camera = place.rig[name]
+    """How far aside and up, the frame's index, and what a camera would see from there, at `LOOKS` of the frames that no fit sees: all at
+    once, at the middle row's moment, as scenes' cameras do."""
+    camera = replace(place.rig[name], shutter="global", readout_us=0)
+    moments = camera.times_us + place.rig[name].readout_us // 2
     some = held_out[:: max(1, len(held_out) // LOOKS)]
     for left, up in place.aside:
         path = place.ego.shifted(lateral=left, vertical=up)
         for i in some:
-            view = camera.along(path, int(camera.times_us[i]))
+            view = camera.along(path, int(moments[i]))
             yield (left, up), i, _truth(place, view, folder / f"{name}_{i:03d}_{left:+g}_{up:+g}")
 
 
