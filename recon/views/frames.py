@@ -130,8 +130,8 @@ def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tup
 
 
 def _ego(log: Log, camera: LogCamera, images: dict[int, torch.Tensor], size: tuple[int, int]) -> torch.Tensor | None:
-    """The recording car in a camera's images of `size` (width, height), and what is drawn over them, bool `[H, W]`; None where they show
-    nothing of either. Says so."""
+    """The recording car in a camera's images of `size` (width, height), what is drawn over them and what lies beyond the lens's image, bool
+    `[H, W]`; None where there is nothing of these. Says so."""
     masks = []
     for told, small in not_the_street(log, camera, list(images), lambda i: images[i].numpy()).items():
         print(f"{camera.name}: {told.format(f'{small.mean():.1%}')} and is left out", file=sys.stderr)
