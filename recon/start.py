@@ -128,14 +128,10 @@ def prepare(
     ground, gains = street.ground, street.gains
     shares = (street.points, SEED_PART), (street.beyond, BEYOND_PART), (street.aside, ASIDE_PART)
     nearest = nearest_of(street.measured)
-    few = [
-        thin(points, seen_from(points.xyz, ground, ego, rig.values(), nearest), int(budget * part))
-        for points, part in shares
-        if len(points.xyz)
-    ]
-    cloud, sides = Cloud.cat([points for points, _ in few]), np.concatenate([sides for _, sides in few])
+    few = [thin(p, seen_from(p.xyz, ground, ego, rig.values(), nearest), int(budget * part)) for p, part in shares if len(p.xyz)]
+    cloud, sides = Cloud.cat([p for p, _ in few]), np.concatenate([sides for _, sides in few])
     background = splats_from(cloud, sides, sh_count, WIDEST_SEED * reach_at(cloud.xyz, ego, rig.values(), nearest))
-    shown = np.concatenate([points.xyz for points, _ in shares])
+    shown = np.concatenate([p.xyz for p, _ in shares])
     background = Gaussians.cat([background, carpet(shown, cloud, ground, ego, sh_count, int(budget * CARPET_PART))])
 
     path = cKDTree(ego.world_from_body[:, :3, 3].numpy())

@@ -49,7 +49,9 @@ def _best(xyz: np.ndarray, ground: Ground, poses: torch.Tensor, cameras: list[Ri
     tree, lies, best = cKDTree(xyz), np.abs(above_ground(xyz, ground)) < LYING, np.full(len(xyz), np.inf)
     for pose in poses:
         near = np.array(tree.query_ball_point(pose[:3, 3].numpy(), reach), dtype=np.int64)
-        for camera in cameras if len(near) else []:
+        if not len(near):
+            continue
+        for camera in cameras:
             view = camera.at(pose, 0)
             _, _, depth, seen = project(xyz[near], inverse(view.world_from_cam).numpy(), view)
             eye = float(above_ground(view.world_from_cam[None, :3, 3].numpy(), ground)[0])

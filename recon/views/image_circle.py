@@ -12,6 +12,7 @@ import torch
 
 from recon.log import LogCamera
 from render.rays import camera_rays
+from scenes.spread import spread
 
 LOOKS = 48
 """Pictures that are searched, evenly taken."""
@@ -34,7 +35,7 @@ def image_circle(camera: LogCamera, indices: Sequence[int], picture: Callable[[i
     """
     if not len(indices):
         return None
-    some = [indices[i] for i in np.unique(np.linspace(0, len(indices) - 1, LOOKS).round().astype(int))]
+    some = spread(indices, LOOKS)
     brightest = np.max([picture(i).max(-1) for i in some], 0)
     rays = camera_rays(camera.camera(some[0], *brightest.shape[::-1]))
     angles = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2]).masked_fill_((rays == 0).all(-1), torch.pi).numpy()
