@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from street import START_US, STEP_US, box, rig, road, sky
+from street import START_US, STEP_US, box, rig, road, sky, splats
 
 from recon.log import LidarPoints, Log, LogCamera, Packed, Sweep, Track
 from render import render_frame
@@ -72,8 +72,17 @@ class Walking(Scene):
         return [still, *(replace(p, gaussians=person(self.phase(self.actors[p.instance - 1], time_us))) for p in people)]
 
 
-def walk(frames=32, width=192, height=108, stiff: tuple[str, ...] = ()) -> Walking:
-    """A slow car's front and left camera; one person crosses the street before it, another walks ahead of it along the kerb."""
+def crossing() -> Gaussians:
+    """White stripes along the street, half a metre wide and as far apart, where one person crosses it."""
+    x, y = torch.meshgrid(torch.arange(5.0, 12.0, 0.05), torch.arange(-4.0, 4.0, 0.05), indexing="ij")
+    painted = (torch.floor(y / 0.5) % 2 == 0).flatten()
+    points = torch.stack([x, y, torch.full_like(x, 0.02)], -1).reshape(-1, 3)[painted]
+    return splats(points, (0.98, 0.98, 0.98), (0.05, 0.04, 0.01))
+
+
+def walk(frames=32, width=192, height=108, stiff: tuple[str, ...] = (), striped=False) -> Walking:
+    """A slow car's front and left camera; one person crosses the street before it, on stripes or not, another walks ahead of it along the
+    kerb."""
     times = START_US + STEP_US * torch.arange(frames + 1)
     ego = torch.stack([translation(0.05 * i, 0.0, 0.0) for i in range(frames + 1)])
     left = pose_from([math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)], [0.0, 0.0, 0.0])
@@ -82,7 +91,7 @@ def walk(frames=32, width=192, height=108, stiff: tuple[str, ...] = ()) -> Walki
     cameras = {n: replace(c, times_us=times[:-1] + (20_000 if n == "left_camera" else 0)) for n, c in rig(width, height).items()}
     whoever = Asset(person(0.0), SIZE, "pedestrian")
     return Walking(
-        Placed(road(), torch.eye(4, dtype=torch.float64)),
+        Placed(Gaussians.cat([road(), crossing()]) if striped else road(), torch.eye(4, dtype=torch.float64)),
         (Actor(whoever, Trajectory(times, across), "ped_1"), Actor(whoever, Trajectory(times, ahead), "ped_2")),
         sky(),
         Trajectory(times, ego),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +13,7 @@ from recon.fit.motion import Motion
 from recon.log import Track
 from recon.views.frames import Frames
 from recon.views.view import View
+from scenes.camera import Camera
 from scenes.poses import inverse
 from scenes.trajectory import Trajectory
 
@@ -43,6 +46,13 @@ GRID = (10, 12)
 
 LEGS = 0.55
 
+DIFFERS = 30.0
+"""Mean levels of 255 by which something differs from what is behind it, from which on it surely is something else."""
+
+OTHERS, GONE_US, FARTHEST = 12, 700_000, 100.0
+"""Views by which it is told what is behind somebody, how long before or after they are taken, so that somebody has gone on, and metres to
+the street within which they are asked."""
+
 
 def gone(path: Trajectory, times_us: torch.Tensor) -> torch.Tensor:
     """Metres `[T - 1]` gone between rising times."""
@@ -60,21 +70,73 @@ def waves(turns: torch.Tensor, count: int) -> torch.Tensor:
     return torch.stack([wave(k * turns) for k in range(1, (count + 1) // 2 + 1) for wave in (torch.cos, torch.sin)], 1)[:, :count]
 
 
+@dataclass(frozen=True)
+class _Look:
+    """A view of somebody's legs: where its camera is then, and points `[GRID, 3]` in the world on an upright plane through the box that
+    faces it; up: the box's own `[3]`, from its base `[3]`."""
+
+    view: View
+    camera: Camera
+    points: torch.Tensor
+    base: torch.Tensor
+    up: torch.Tensor
+
+    def colours(self) -> torch.Tensor:
+        """Colours `[GRID, 3]`, 0..255."""
+        return _colours(self.view, self.camera, self.points)[0]
+
+    def stands_out(self, others: Sequence[View], motion: Motion) -> torch.Tensor:
+        """How much what is shown differs, 0..1, from the street behind it, as the median of others shows that, in the means of two by two
+        places, `[GRID / 4]`; 0 where none of them shows it, and where the line of sight meets no ground."""
+        eye = self.camera.world_from_cam[:3, 3]
+        ways = self.points - eye
+        down = -(ways @ self.up)
+        depth = ((eye - self.base) @ self.up) / down.clamp_min(1e-6)
+        street = eye + depth[:, None] * ways
+        met = (down > 0) & ((street - eye).norm(dim=1) < FARTHEST)
+        seen = []
+        for other in others:
+            colours, inside = _colours(other, motion.camera(other), street)
+            seen.append(colours.masked_fill(~(inside & met)[:, None], torch.nan))
+        behind = torch.stack(seen).nanmedian(0).values if seen else torch.full_like(self.colours(), torch.nan)
+        differs = ((self.colours() - behind).abs().mean(1) / DIFFERS).clamp_max(1).nan_to_num(0)
+        return F.avg_pool2d(differs.view(1, *reversed(GRID)), 2).flatten()
+
+
 @torch.no_grad()
 def stride_of(track: Track, frames: Frames, motion: Motion) -> float | None:
     """A stride's length in metres: of `CANDIDATES` the one whose waves explain most of what changes where the legs are; None where no
-    pictures show them or none stands out. A least-squares periodogram (Lomb 1976) over the metres gone, of all places together."""
+    pictures show them or none stands out.
+
+    First colours are asked. Who walks before something painted, as a crossing's stripes, has those pass behind the legs; then what differs
+    from the street behind it tells where these are.
+    """
+    path = track.trajectory()
+    of_cameras = [[v for v in frames.of(c) if path.covers(v.time_us)] for c in range(len(frames.names))]
+    looks = [[look for v in views if (look := _look(v, track, path, motion)) is not None] for views in of_cameras]
+    looks = [some for some in looks if len(some) >= FEWEST]
+
+    def standing_out(look: _Look) -> torch.Tensor:
+        views = [v for v in frames.of(look.view.camera) if abs(v.time_us - look.view.time_us) > GONE_US]
+        return look.stands_out(sorted(views, key=lambda v: abs(v.time_us - look.view.time_us))[:OTHERS], motion)
+
+    for told in (_Look.colours, standing_out):
+        shown = [(torch.tensor([k.view.time_us for k in some]), torch.stack([told(k).flatten() for k in some])) for some in looks]
+        if (stride := _rhythm(shown, track)) is not None:
+            return stride
+    return None
+
+
+def _rhythm(shown: Sequence[tuple[torch.Tensor, torch.Tensor]], track: Track) -> float | None:
+    """The stride by which what is shown changes, of each camera at its times `[T]` what places show, `[T, K]`; None where none stands out.
+    A least-squares periodogram (Lomb 1976) over the metres gone, of all places together."""
     path, (least, longest) = track.trajectory(), WALKED if track.label == "pedestrian" else PEDALLED
     strides = float(track.size[2]) * torch.logspace(math.log10(least), math.log10(longest), CANDIDATES, dtype=torch.float64)
     explained, chance = torch.zeros(CANDIDATES, dtype=torch.float64), 0.0
-    for camera in range(len(frames.names)):
-        shown = [(v.time_us, p) for v in frames.of(camera) if (p := _legs(v, track, path, motion)) is not None]
-        if len(shown) < FEWEST:
-            continue
-        times, pictures = torch.tensor([t for t, _ in shown]), torch.stack([p for _, p in shown]).double()
+    for times, pictures in shown:
         near = ((times[:, None] - times).abs() <= AROUND_US).double()
         without_mean = torch.eye(len(times), dtype=torch.float64) - near / near.sum(1, keepdim=True)
-        changes, metres = without_mean @ pictures, gone(path, times)
+        changes, metres = without_mean @ pictures.double(), gone(path, times)
         chance += WAVES / len(times) * float(changes.square().sum())
         for i, stride in enumerate(strides.tolist()):
             basis, _ = torch.linalg.qr(without_mean @ waves(phase(metres, times, stride), WAVES))
@@ -85,12 +147,10 @@ def stride_of(track: Track, frames: Frames, motion: Motion) -> float | None:
     return float(strides[best]) if believed else None
 
 
-def _legs(view: View, track: Track, path: Trajectory, motion: Motion) -> torch.Tensor | None:
-    """Colours `[GRID * 3]` of a view on an upright plane through the box that faces the camera; None where it does not show them all."""
-    if not path.covers(view.time_us):
-        return None
-    camera = motion.camera(view)
-    cam_from_box = inverse(camera.world_from_cam) @ path.at(view.time_us)
+def _look(view: View, track: Track, path: Trajectory, motion: Motion) -> _Look | None:
+    """How a view sees legs, somewhere in whose time it was taken; None where it does not show them all, or they are small."""
+    camera, box = motion.camera(view), path.at(view.time_us)
+    cam_from_box = inverse(camera.world_from_cam) @ box
     eye = inverse(cam_from_box)[:2, 3]
     away = float(eye.norm())
     tall = float(camera.lens.focal()[1]) * float(track.size[2]) / away
@@ -99,9 +159,21 @@ def _legs(view: View, track: Track, path: Trajectory, motion: Motion) -> torch.T
     across = torch.tensor([-float(eye[1]), float(eye[0]), 0.0], dtype=torch.float64) / away
     u, v = torch.linspace(-0.5, 0.5, GRID[0]).double(), torch.linspace(0, LEGS * float(track.size[2]), GRID[1]).double()
     points = u[None, :, None] * across + v[:, None, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    pixels = camera.lens.project(points.reshape(-1, 3) @ cam_from_box[:3, :3].T + cam_from_box[:3, 3])
-    places = 2 * pixels / torch.tensor([camera.width, camera.height]) - 1
-    if not (places.abs() < 1).all():
-        return None
-    image = view.image.permute(2, 0, 1)[None].float()
-    return F.grid_sample(image, places.float().view(1, *reversed(GRID), 2), align_corners=False).flatten()
+    world = points.reshape(-1, 3) @ box[:3, :3].T + box[:3, 3]
+    return _Look(view, camera, world, box[:3, 3], box[:3, 2]) if _colours(view, camera, world)[1].all() else None
+
+
+def _colours(view: View, camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Colours `[N, 3]`, 0..255, of world points `[N, 3]` in a view, and whether they are before its camera and in its picture, `[N]`."""
+    back = inverse(camera.world_from_cam)
+    local = points @ back[:3, :3].T + back[:3, 3]
+    pixels = camera.lens.project(local).nan_to_num(-1.0)
+    inside = (pixels > 0).all(-1) & (pixels < torch.tensor([camera.width, camera.height])).all(-1) & (local[:, 2] > 0)
+    if not inside.any():
+        return torch.zeros(len(points), 3), inside
+    # of a large picture the few pixels around them are enough
+    (left, top), (right, bottom) = (pixels[inside].amin(0) - 1).clamp_min(0).int().tolist(), (pixels[inside].amax(0) + 2).int().tolist()
+    part = view.image[top:bottom, left:right].permute(2, 0, 1)[None].float()
+    places = 2 * (pixels - torch.tensor([left, top])) / torch.tensor([part.shape[3], part.shape[2]]) - 1
+    shown = F.grid_sample(part, places.float().clamp(-9, 9)[None, None], align_corners=False)
+    return shown[0, :, 0].T, inside

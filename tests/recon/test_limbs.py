@@ -11,10 +11,15 @@ import walker
 from recon.assemble import assemble
 from recon.assets.extract import at_rest
 from recon.begin import begin
+from recon.body_path import body_path
 from recon.defaults import choose
 from recon.fit.config import FitConfig
 from recon.fit.fit import Fit
+from recon.fit.knots import Knots
+from recon.fit.motion import Motion
+from recon.fit.strides import stride_of
 from recon.objects.tracks import LIMBED
+from recon.views.frames import load_frames
 from render import render_frame
 from scenes import Scene
 
@@ -64,6 +69,19 @@ def test_the_length_of_strides_is_found(part, monkeypatch):
     turns = torch.atan2(gaits["ped_2"][:, 1], gaits["ped_2"][:, 0]).double().diff()
     strides = float(turns.remainder(2 * math.pi).sum()) / (2 * math.pi)
     assert gone / strides == pytest.approx(part * 1.75, rel=0.06)
+
+
+@pytest.mark.parametrize("stiff", [(), ("ped_1",)], ids=["walks", "stiff"])
+def test_who_crosses_on_stripes_walks_if_his_legs_do(stiff):
+    """The stripes pass behind them as regularly."""
+    size = (224, 126)
+    log = walker.log_of(walker.walk(32, *size, stiff=stiff, striped=True))
+    names, span = choose(log, ["front_camera"])
+    frames = load_frames(log, names, span, size, 8)
+    rig = log.rig(dict(zip(frames.names, frames.sizes, strict=True)))
+    knots = Knots(body_path(log, frames, rig), torch.tensor([v.time_us for v in frames.of(0)]))
+    found = stride_of(log.tracks[0], frames, Motion(frames, rig, knots, list(log.tracks)))
+    assert found is None if stiff else found == pytest.approx(walker.STRIDE * walker.SIZE[2], rel=0.05)
 
 
 def test_who_holds_still_has_no_limbs_and_what_has_none_is_not_looked_at(walk):
