@@ -87,7 +87,7 @@ def _prepared(
         start = prepare(log, frames, span, config.budget, coefficients, lambda what: steps.step(note=what), sparse, known)
     if sparse is not None and not log.tracks:
         found = moving_things(len(start.tracks))
-        print(f"{log.path} has neither boxes nor lidar: its pictures show {found} along the street", file=sys.stderr)
+        print(f"{log.path} has neither boxes nor lidar: its pictures show {found}", file=sys.stderr)
     return frames, start
 
 

@@ -54,12 +54,19 @@ def boxed(thing: Sequence[Sighting], times: np.ndarray, plates: Sequence[Plate],
     base = np.column_stack([middle, ground.height(torch.from_numpy(middle)).numpy()])
     poses = upright(base, np.unwrap(ways) + np.pi * (np.median([s.speed for s in thing]) < 0))
     size = np.array([*CAR, HIGH])
+    return while_there("car", size, stamps, poses, plates, own)
+
+
+def while_there(label: str, size: np.ndarray, stamps: np.ndarray, poses: torch.Tensor, plates: Sequence[Plate], own: np.ndarray) -> Track:
+    """The track of a box of a size, whose poses `[T, 4, 4]` at stamps `[T]`, those of `plates`, are known, in that part of its time in
+    which it is there: when it was seen, `own` `[S]`, for a moment more, and while a border cuts it or it is beside us."""
+    first, last = np.searchsorted(stamps, own[[0, -1]])
     there = np.abs(stamps - np.clip(stamps, *own[[0, -1]])) <= BEYOND_US
     there |= np.array([_leaves(pose, size, plate) for pose, plate in zip(poses.numpy(), plates, strict=True)])
     gone = np.flatnonzero(~there)
     kept = slice(gone[gone < first].max(initial=-1) + 1, gone[gone > last].min(initial=len(stamps)))
-    where = f"seen at {base[kept][0].round(1).tolist()}"
-    return Track("", "car", True, size, stamps[kept], poses[kept], np.full(len(stamps[kept]), -1), (where,))
+    where = f"seen at {poses[kept][0, :3, 3].numpy().round(1).tolist()}"
+    return Track("", label, True, size, stamps[kept], poses[kept], np.full(len(stamps[kept]), -1), (where,))
 
 
 def _in_lane(thing: Sequence[Sighting], eyes: np.ndarray, stamps: np.ndarray, lane: Lane) -> np.ndarray:

@@ -73,7 +73,11 @@ class Sighting:
     there `[2]`, how far ahead of the camera what is seen of it is, and its speeds along the street and to its left in m/s, `speed` and
     `aside`; by how much it looks more alike than what stands still, `worth`, and the ground before it than if it went on there, `grounded`.
     cut: whether the picture's border is so near that there may be more of it beyond; rise: metres that the street climbs with every one of
-    it."""
+    it.
+
+    Of what crosses (`crossing.py`) the place is that of all that is seen of it, and the street's direction stands for that of the line of
+    sight; ends: where its left and right ends stand, `[2, 2]`; cuts: whether a border cuts the left one, and the right one;
+    high: metres up that it reaches."""
 
     time_us: int
     place: np.ndarray
@@ -85,11 +89,24 @@ class Sighting:
     grounded: float
     cut: bool
     rise: float = 0.0
+    ends: np.ndarray | None = None
+    cuts: tuple[bool, bool] = (False, False)
+    high: float = 0.0
 
     @property
     def axes(self) -> np.ndarray:
         """The directions `[2, 2]` of the street and to its left."""
         return np.array([self.along, [-self.along[1], self.along[0]]])
+
+    @property
+    def width(self) -> float:
+        """Metres from its left end to its right one; 0 where nobody knows of ends."""
+        return 0.0 if self.ends is None else float(np.linalg.norm(self.ends[0] - self.ends[1]))
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Metres a second `[2]` in the world."""
+        return np.array([self.speed, self.aside]) @ self.axes
 
 
 @dataclass(frozen=True)
@@ -120,7 +137,7 @@ def sightings(
     of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0].numpy()
     found = []
     for z in DISTANCES:
-        base = _base(plate, ground, z)
+        base = base_row(plate, ground, z)
         rows = slice(max(0, round(base - REAR[1] * plate.focal[1] / z)), round(base + BEFORE * plate.focal[1] / z) + 1 + WINDOW // 2)
         bottom = round(base) - rows.start
         before = slice(bottom + WINDOW // 2, None)
@@ -134,10 +151,10 @@ def sightings(
         across = max(1, round(REAR[0] * plate.focal[0] / z))
         rims = slice(bottom + WINDOW // 2)  # squares around pixels under a thing show its rim, which a bare street does not outdo
         worths = stands[rims].mean(0) - moving[:, rims].mean(1)
-        best, column = _beside(worths, across).argmax(0), np.arange(len(stands[0]))
-        worth = _beside(worths, across)[best, column]
-        grounded = _beside((moving[:, before] - of_ground[rows][before]).mean(1), across)[best, column]
-        hidden = _beside(of_ground[rows][before].mean(0), across) - hiding(standing[:, rows][:, before], inverse_depths * z, across)
+        best, column = beside(worths, across).argmax(0), np.arange(len(stands[0]))
+        worth = beside(worths, across)[best, column]
+        grounded = beside((moving[:, before] - of_ground[rows][before]).mean(1), across)[best, column]
+        hidden = beside(of_ground[rows][before].mean(0), across) - hiding(standing[:, rows][:, before], inverse_depths * z, across)
         fits = (worth > WORTH) & (grounded > GROUNDED) & (hidden < HIDDEN) & (np.abs(speeds[best]) >= SLOWEST)
         for x in np.flatnonzero(fits):
             cut = not across < x < len(stands[0]) - across
@@ -155,7 +172,7 @@ def sightings(
 def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: _Found) -> Sighting:
     """A sighting at the place that its outline tells, with its speeds along the street and across it."""
     one, shown = found.one, slice(max(0, found.x - found.across // 2), found.x + found.across // 2 + 1)
-    seen = [_shown(plate, x, one) for x in (found.x, *outline(found.worths, shown))]
+    seen = [one.axes @ shown_at(plate, x, one.away) for x in (found.x, *outline(found.worths, shown))]
     part = replace(plate, grey=plate.grey[:, shown], centre=(plate.centre[0] - shown.start, plate.centre[1]))
     speeds = np.stack(np.meshgrid(one.speed + DRIFTS[0], DRIFTS[1]), -1).reshape(-1, 2)
     each = np.column_stack([speeds @ one.axes, one.rise * speeds[:, 0]])
@@ -167,7 +184,7 @@ def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: 
 def outline(worths: np.ndarray, shown: slice) -> tuple[int, int]:
     """The first and last column of a thing that some columns show: by how much all look more alike, `worths` `[w]`, is there at least half
     of what it is in these."""
-    smooth = _beside(worths, WINDOW)
+    smooth = beside(worths, WINDOW)
     less = np.flatnonzero(smooth < worths[shown].mean() / 2)
     k = int(np.searchsorted(less, shown.start + int(smooth[shown].argmax())))
     return (int(less[k - 1]) + 1 if k else 0), (int(less[k]) - 1 if k < len(less) else len(worths) - 1)
@@ -192,13 +209,13 @@ def facing_us(seen: np.ndarray, *ends: np.ndarray) -> np.ndarray:
     return np.array([ahead, side * left]) if 1 / LIKE < (outer - inner) * ahead / usual < LIKE else seen
 
 
-def _shown(plate: Plate, column: int, one: Sighting) -> np.ndarray:
-    """What a column shows as far ahead as a sighting, `[2]` along the street and to its left of the camera."""
+def shown_at(plate: Plate, column: float, away: float) -> np.ndarray:
+    """What a column shows so far ahead, `[2]` in plan from the camera."""
     ray = np.array([(column + 0.5 - plate.centre[0]) / plate.focal[0], 0.0, 1.0]) @ plate.cam_from_world[:3, :3]
-    return one.axes @ (one.away * ray[:2])
+    return away * ray[:2]
 
 
-def _base(plate: Plate, ground: Ground, z: float) -> float:
+def base_row(plate: Plate, ground: Ground, z: float) -> float:
     """The row at which what is z ahead stands, in the median over the columns."""
     x = (np.arange(0, plate.grey.shape[1], 8) + 0.5 - plate.centre[0]) / plate.focal[0]
     turn, y = plate.cam_from_world[:3, :3], np.zeros_like(x)
@@ -213,7 +230,7 @@ def hiding(standing: torch.Tensor, nearer: torch.Tensor, across: int) -> np.ndar
     """What it costs to take what windows around columns show for something that stands before a thing, `[w]`: the least of the costs
     `standing` `[D, rows, w]` of depths that are `HIDING` times `nearer` `[D]` than that."""
     costs = standing[nearer > HIDING].mean(1).numpy()
-    return _beside(costs, across).min(0, initial=np.inf)
+    return beside(costs, across).min(0, initial=np.inf)
 
 
 def _along(path: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
@@ -228,6 +245,6 @@ def _along(path: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
     return ahead / np.linalg.norm(ahead), float(steep[2] / np.linalg.norm(steep[:2]))
 
 
-def _beside(costs: np.ndarray, across: int) -> np.ndarray:
+def beside(costs: np.ndarray, across: int) -> np.ndarray:
     """Means of `[..., w]` over so many columns."""
     return ndimage.uniform_filter1d(costs, across | 1, axis=-1, mode="nearest")

@@ -1,4 +1,4 @@
-"""Traffic that pictures alone show: what moves along the street, followed from picture to picture, as boxes."""
+"""Traffic that pictures alone show: what moves along the street, or crosses it, followed from picture to picture, as boxes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from recon.log import Log, Track
+from recon.movers.crossed import believed as crossing_believed
+from recon.movers.crossed import boxed as crossing_boxed
+from recon.movers.crossing import crossings
 from recon.movers.going import boxed
 from recon.movers.sighting import Sighting, sightings
 from recon.objects.tracks import named
@@ -37,6 +40,9 @@ GATE = (1.0, 0.2), (0.6, 0.03), 5.0
 """Metres, and parts of the distance, that a thing may be off where its speed takes it, along the street and across; and m/s that its speed
 may be."""
 
+FASTER_ACROSS = 2.5
+"""Metres a second by which what crosses may seem to be faster or slower than it was."""
+
 LOST_US = 500_000
 """How long after it was seen last a thing is given up."""
 
@@ -61,29 +67,39 @@ SAME = (1.3, 1.3), 0.4
 
 
 def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
-    """What moves along the street in the training pictures of the first camera of `frames`, as tracks at their moments.
+    """What moves along the street, or crosses it, in the training pictures of the first camera of `frames`, as tracks at their moments,
+    and at those of pictures before the first and after the last of them.
 
     Nothing where pictures do not follow one another soon (`GAPS_US`), or the recording car never goes, and nobody knows where the street
     leads.
     """
     views = spaced(sorted(frames.of(0), key=lambda v: v.time_us))
-    times = np.array([v.time_us for v in views])
-    plates = [plate_of(v.image, frames.camera(log, v)) for v in views]
+    times, plates = _plates(views, log, frames)
     eyes = np.array([p.eye()[:2] for p in plates])
     path = way_of(log.ego.world_from_body[:, :3, 3].numpy())
     if len(path) < 2 or len(times) < FEWEST:
         return ()
     paces = np.linalg.norm(np.gradient(eyes, times / 1e6, axis=0), axis=1)
 
-    def looked_at(i: int) -> list[Sighting]:
-        return sightings(plates[i], int(times[i]), around(i, plates, times), ground, path, float(paces[i]))
+    def looked_at(i: int) -> tuple[list[Sighting], list[Sighting]]:
+        told = plates[i], int(times[i]), around(i, plates, times), ground
+        return sightings(*told, path, float(paces[i])), crossings(*told)
 
-    seen = []
+    seen: list[tuple[list[Sighting], list[Sighting]]] = []
     with Progress("traffic", total=len(views)) as steps:
         for found in side_by_side(looked_at, range(len(views))):
             seen.append(found)
             steps.step()
-    return named(boxes(seen, times, plates, Lane(log.ego), ground), log.ego)
+    # what is there in the first picture that is fitted is there in those before it, too, and is not to pop up in a clip
+    ends = [v for v in frames.of(0, held_out=True) if not times[0] < v.time_us < times[-1]]
+    at = _plates(sorted([*views, *ends], key=lambda v: v.time_us), log, frames)
+    going, across = ([found[kind] for found in seen] for kind in (0, 1))
+    return named(apart([*boxes(going, *at, Lane(log.ego), ground), *crossed(across, *at, ground)]), log.ego)
+
+
+def _plates(views: Sequence[View], log: Log, frames: Frames) -> tuple[np.ndarray, list[Plate]]:
+    """Times `[T]` and plates of views."""
+    return np.array([v.time_us for v in views]), [plate_of(v.image, frames.camera(log, v)) for v in views]
 
 
 def spaced(views: Sequence[View]) -> list[View]:
@@ -105,11 +121,22 @@ def way_of(places: np.ndarray) -> np.ndarray:
 
 
 def boxes(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], lane: Lane, ground: Ground) -> list[Track]:
-    """Tracks of what was seen in pictures, `plates`, at `times` `[T]`, along a lane."""
-    followed = [f for f in follow(seen) if believed(f, times)]
+    """Tracks of what was `seen` going along a lane, at the `times` `[T]` of pictures, `plates`: those that were looked at and any others.
+    What is clearest comes first."""
+    things = sorted((f for f in follow(seen) if believed(f, times)), key=lambda f: -sum(s.worth for s in f))
+    return apart([boxed(thing, times, plates, lane, ground) for thing in things])
+
+
+def crossed(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], ground: Ground) -> list[Track]:
+    """The like of what was seen crossing; what is longest comes first, since wheels and doors are parts of cars."""
+    made = [crossing_boxed(thing, times, plates, ground) for thing in follow(seen) if crossing_believed(thing, times)]
+    return apart(sorted(made, key=lambda track: -track.size[0]))
+
+
+def apart(tracks: Sequence[Track]) -> list[Track]:
+    """Those of tracks that are no other, earlier one's."""
     made: list[Track] = []
-    for one in sorted(followed, key=lambda f: -sum(s.worth for s in f)):
-        track = boxed(one, times, plates, lane, ground)
+    for track in tracks:
         if not any(_within(track, other) > SAME[1] for other in made):
             made.append(track)
     return made
@@ -132,7 +159,7 @@ def follow(seen: list[list[Sighting]]) -> list[list[Sighting]]:
     for found in seen:
         live = [t for t in things if found and found[0].time_us - t[-1].time_us <= LOST_US]
         cost = np.array([[_apart(thing, s) for s in found] for thing in live]).reshape(len(live), len(found))
-        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < 3]
+        pairs = [(i, j) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < 4]
         for i, j in pairs:
             live[i].append(found[j])
         taken = {j for _, j in pairs}
@@ -143,13 +170,15 @@ def follow(seen: list[list[Sighting]]) -> list[list[Sighting]]:
 def _apart(thing: list[Sighting], s: Sighting) -> float:
     """How far a sighting is from where a thing should be: the sum of what it is off in parts of what is allowed; 9 where that is more."""
     last = thing[-PACE:]
-    speed = float(np.mean([k.speed for k in last]))
-    velocity = np.mean([[k.speed, k.aside] @ k.axes for k in last], axis=0)
+    velocity = np.mean([k.velocity for k in last], axis=0)
     place = np.mean([k.place + velocity * (s.time_us - k.time_us) / 1e6 for k in last], axis=0)
     off = s.place - place
     along, across = abs(off @ s.along), abs(off[1] * s.along[0] - off[0] * s.along[1])
-    parts = [along / (GATE[0][0] + GATE[0][1] * s.away), across / (GATE[1][0] + GATE[1][1] * s.away), abs(s.speed - speed) / GATE[2]]
-    return sum(parts) if max(parts) < 1 else 9.0
+    faster = [abs(s.speed - np.mean([k.speed for k in last])) / GATE[2]]
+    if s.ends is not None:  # what crosses is known by how fast it does; drifts of what goes along are too vague
+        faster.append(abs(s.axes[1] @ (s.velocity - velocity)) / FASTER_ACROSS)
+    parts = [along / (GATE[0][0] + GATE[0][1] * s.away), across / (GATE[1][0] + GATE[1][1] * s.away), *faster]
+    return float(sum(parts)) if max(parts) < 1 else 9.0
 
 
 def believed(thing: list[Sighting], times: np.ndarray) -> bool:

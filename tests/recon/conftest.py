@@ -1,6 +1,9 @@
+import painted
 import pytest
 from made_colmap import pictures_along, write_colmap
 from made_drive import write_drive
+
+from recon.seeds import stereo
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +32,12 @@ def own(workspace, tmp_path):
     import shutil
 
     return shutil.copytree(workspace, tmp_path / "walk")
+
+
+@pytest.fixture(scope="module")
+def small_pictures():
+    """Painted drives whose plates are small, with a wall far off."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stereo, "WIDTH", 160)
+        patch.setattr(painted, "WALL", 60.0)
+        yield

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import painted
 import pytest
 import torch
 from painted import BOARD, SIZE, Rear, drive
@@ -25,13 +24,7 @@ from scenes.trajectory import Trajectory
 FLAT = Ground(torch.zeros(300, 300), (-50.0, -75.0), 0.5)
 STEPS = [0.0] + [0.6] * 15
 
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stereo, "WIDTH", 160)
-        patch.setattr(painted, "WALL", 60.0)
-        yield
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def found(*rears: Rear, steps=STEPS, **how) -> tuple[Track, ...]:
@@ -53,7 +46,7 @@ def test_what_goes_along_the_street_is_found_where_it_is(start, speed, left):
         return start + speed * seconds, left + seconds * speed / 12
 
     (track,) = found(rear)
-    off = misses(track, rear, CAR[0] / 2)
+    off = misses(track, rear, CAR[0] / 2)[track.times_us > 0]  # the first picture is held out
     path = track.trajectory()
     went = (path.at(1_000_000)[:2, 3] - path.at(500_000)[:2, 3]).numpy() / 0.5
     assert track.moving and track.label == "car" and len(track.times_us) > 8
@@ -237,3 +230,14 @@ def test_a_way_is_as_fast_as_it_is_told_where_places_are_unsure():
     speeds = np.tile([5.0, 0.0], (11, 1)), np.array([0.3, 0.3])
     assert np.abs(smoothed(times, seen, times, told, speeds) - true).max() < 0.1
     assert np.abs(smoothed(times, seen, times, told) - true).max() > 0.8
+
+
+def test_what_the_first_fitted_picture_shows_is_there_in_the_one_before_it():
+    """Every eighth picture is held out, the first among them: a clip begins with it, and cars would pop up in its second one."""
+    (track,) = found(lambda seconds: (9 + 7.5 * seconds, -0.5 + seconds * 7.5 / 12))
+    log = drive(STEPS, ("front",), rears=())
+    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 8)
+    first = min(v.time_us for v in frames.views)
+    assert first < min(v.time_us for v in frames.of(0)) and track.times_us[0] == first
+    went = (track.world_from_box[1, 0, 3] - track.world_from_box[0, 0, 3]) / ((track.times_us[1] - track.times_us[0]) * 1e-6)
+    assert abs(float(went) - 7.5) < 2.0
