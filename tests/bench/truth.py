@@ -41,15 +41,19 @@ from tests.bench.recon import fitted
 from tests.bench.references import pictures
 from tests.bench.worlds.corner import corner
 from tests.bench.worlds.highway import highway
-from tests.bench.worlds.place import UNSEEN, Place
+from tests.bench.worlds.lights import lights
+from tests.bench.worlds.place import UNSEEN, Level, Place
 from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.street import street
+from tests.bench.worlds.underpass import underpass
 
 PLACES: dict[str, Callable[[Path], Place]] = {
     "street": street,
     "corner": corner,
     "highway": highway,
+    "lights": lights,
+    "underpass": underpass,
     "room": lambda _: room(False),
     "room with people": lambda _: room(True),
 }
@@ -60,7 +64,7 @@ OPEN = 0.5
 """Alpha under which a pixel counts as sky."""
 
 LOW = 0.2
-"""Metres above the floor up to which something is the ground: road, kerb and pavement, all of which these places have level."""
+"""Metres above the floor up to which something is the ground: road, kerb and pavement."""
 
 
 def without(log: Log, what: list[str]) -> Log:
@@ -69,9 +73,9 @@ def without(log: Log, what: list[str]) -> Log:
 
 
 def figures(
-    scene: Scene, references: References, enhancer: Enhancer, camera: Camera, truth: Truth
+    scene: Scene, references: References, enhancer: Enhancer, camera: Camera, truth: Truth, level: Level
 ) -> tuple[list[float], list[torch.Tensor]]:
-    """A row of `DECIBELS`, `RATIOS` and `SHARES` in one, and what is rendered, and that enhanced, `[H, W, 3]`."""
+    """A row of `DECIBELS`, `RATIOS` and `SHARES` in one, and what is rendered, and that enhanced, `[H, W, 3]`. level: as of `Place`."""
     with torch.no_grad():
         frame = render_frame(scene, camera, READS)
         shown = pictures(references, enhancer, frame)
@@ -81,8 +85,8 @@ def figures(
     drawn = (frame.depth / truth.depth)[solid]
     shares = [float(((drawn - 1).abs()).median()), *(float(part.float().mean()) for part in (drawn < 0.8, drawn > 1.25))]
     open_ = float((frame.alpha[solid] < OPEN).float().mean())
-    heights = camera.world_from_cam[2, 3] + world_directions(camera)[..., 2] * truth.depth
-    ground = (truth.who == 0) & (heights < LOW)
+    points = camera.world_from_cam[:3, 3] + world_directions(camera) * truth.depth[..., None]
+    ground = (truth.who == 0) & (points[..., 2] - level(points[..., 0], points[..., 1]) < LOW)
     parts = [psnr(rgb, truth.rgb, part) if part.any() else float("nan") for part in (ground, moving)]
     lit = truth.who != UNSEEN
     ratios = [sharpness(picture, lit) / sharpness(truth.rgb, lit) for picture in (rgb, enhanced)]
@@ -121,7 +125,7 @@ def main() -> None:
         for aside, index, truth in looks(place, asked.camera, folder, held_out):
             path = scene.ego.shifted(lateral=aside[0], vertical=aside[1])
             view = scene.camera(asked.camera, int(scene.frame_times(asked.camera)[index]), path)
-            row, shown = figures(scene, references, enhancer, view, truth)
+            row, shown = figures(scene, references, enhancer, view, truth, place.level)
             rows.setdefault(aside, []).append(row)
             if asked.look:
                 asked.look.mkdir(parents=True, exist_ok=True)

@@ -8,10 +8,12 @@ import torch
 
 from render.rays import world_directions
 from scenes.poses import inverse
-from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, fisheye, looking
+from scenes.sky import linear_from_srgb
+from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, fisheye, gone, looking
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.solids import box, joined, panel, plain
+from tests.bench.worlds.underpass import DEEP, DIP, height, over
 
 TIMES = 1_700_000_000_000_000 + 100_000 * torch.arange(6)
 SUN = (0.0, -0.6, 0.8)
@@ -134,3 +136,38 @@ def test_the_room_is_closed_but_for_its_windows():
         sky = rays[who < 0]
         assert (sky[:, 1] > 0).all(), "windows are to the left"
         assert len(sky) < 0.1 * len(rays) and metres[who == 0].max() < 60
+
+
+def test_a_picture_is_as_bright_as_it_is_exposed_long(place):
+    camera = place.rig["front"].along(place.ego, int(TIMES[2]))
+    usual = linear_from_srgb(place.seen(camera)[0])
+    later = replace(place, stops=np.array([TIMES[[1, 3]].numpy(), [0.0, 1.0]]))
+    longer = linear_from_srgb(later.seen(camera)[0])
+    dim = (usual > 0.01) & (usual < 0.6)
+    assert torch.allclose(longer[dim], 2**0.5 * usual[dim], rtol=1e-3), "halfway between its moments, half a stop"
+
+
+def test_where_hardly_anything_is_open_some_light_comes_all_the_same(place):
+    roof = panel((-40, 40, 2.5), (80, 0, 0), (0, -80, 0), plain((0.5, 0.5, 0.5)))
+    under = replace(place, still=joined([place.still, roof]))
+    camera = place.rig["front"].along(place.ego, int(TIMES[0]))
+    dark, lit = (
+        replace(under, light=replace(place.light, reach=100.0, bounced=bounced)).seen(camera)[0][40, 32].mean() for bounced in (0.0, 0.2)
+    )
+    assert lit > dark + 0.02
+
+
+def test_who_waits_stands_and_faces_where_he_goes():
+    path = gone([(0.0, 0.0), (0.0, 10.0)], np.array([0.0, 1.0, 2.0, 2.0, 2.0, 3.0]), TIMES)
+    assert path.world_from_body[:, 1, 3].tolist() == [0.0, 1.0, 2.0, 2.0, 2.0, 3.0]
+    assert torch.allclose(path.world_from_body[:, 1, 0], torch.ones(6, dtype=torch.float64))
+
+
+def test_what_drives_into_a_dip_goes_down_and_up_with_it():
+    middle = sum(DIP) / 2
+    path = over(along([(DIP[0] + 10.0, 0.0), (200.0, 0.0)], 100.0, TIMES))
+    places = path.world_from_body[:, :3, 3]
+    assert np.allclose(places[:, 2].numpy(), height(places[:, 0].numpy())) and height(np.array(middle)) == -DEEP
+    ahead = path.world_from_body[:, :3, 0]
+    assert ahead[0, 2] < -0.1 and ahead[-1, 2] > 0.05, "it looks down into it, and up out of it"
+    assert float(path.world_from_body[0, :3, 2] @ ahead[0]) == pytest.approx(0, abs=1e-12)

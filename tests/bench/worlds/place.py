@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,16 +39,20 @@ TICK_US = 1000
 UNSEEN = -2
 """Who is there in a pixel that no light reaches."""
 
+Level = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""Metres that the road is high, or would be, at places x and y."""
+
 
 @dataclass(frozen=True)
 class Light:
     """sun: unit direction to it; sunlight and ambient: linear colours that a white surface that faces it, or is wholly open, sends back;
-    reach: metres within which what stands around takes of the ambient light."""
+    reach: metres within which what stands around takes of the ambient light, bounced: of which this part comes all the same."""
 
     sun: tuple[float, float, float]
     sunlight: tuple[float, float, float]
     ambient: tuple[float, float, float]
     reach: float
+    bounced: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,8 @@ class Mover:
 @dataclass(frozen=True)
 class Place:
     """A world with a recorder in it. lidar: elevations of its beams in degrees, and where it stands on the body; aside: shifts, metres to
-    the left and upwards, at which the truth is looked at."""
+    the left and upwards, at which the truth is looked at; stops: how many
+    stops longer than at first it is exposed, and from when to when, microseconds: `[2, T]`, moments first."""
 
     name: str
     still: Mesh
@@ -106,6 +111,8 @@ class Place:
     rig: dict[str, RigCamera]
     lidar: tuple[tuple[float, ...], tuple[float, float, float]]
     aside: tuple[tuple[float, float], ...]
+    level: Level = lambda x, y: torch.zeros_like(x)
+    stops: np.ndarray | None = None
 
     @cached_property
     def traced(self) -> TracedMesh:
@@ -121,6 +128,8 @@ class Place:
         depth, who = (found.reshape(camera.height, camera.width) for found in (distance, who))
         beyond = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2]) > CIRCLE
         small[beyond], who[beyond] = 0.0, UNSEEN
+        if self.stops is not None:
+            small = small * 2 ** float(np.interp(camera.time_us, *self.stops))
         return srgb_from_linear(small.clamp(0, 1)), depth / rays.norm(dim=-1), who
 
     def distances(self, origins: torch.Tensor, directions: torch.Tensor, time_us: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -157,7 +166,7 @@ class Place:
         halfway = camera.time_us + camera.readout_us // 2
         blockers, sun = Blockers(self._triangles(halfway)), torch.tensor(self.light.sun)[None]
         lit = blockers.open_share(points, sun, torch.ones(1), 1e3) * (normals[solid] @ sun[0]).clamp_min(0)
-        open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach)
+        open_ = blockers.open_share(points, fibonacci(AROUND), torch.ones(AROUND), self.light.reach).clamp_min(self.light.bounced)
         light = lit[:, None] * torch.tensor(self.light.sunlight) + 2 * open_[:, None] * torch.tensor(self.light.ambient)
         colours = sky(directions)
         colours[solid] = linear_from_srgb(albedo[solid]) * light
@@ -224,15 +233,19 @@ def clock(frames: int, step_us: int) -> torch.Tensor:
 
 def along(points: Sequence[Sequence[float]], speed: float, times_us: torch.Tensor) -> Trajectory:
     """A trajectory over the ground from the first of points `[x, y]` through the others, and straight on, at a constant speed in m/s."""
+    return gone(points, speed * (times_us - times_us[0]).numpy() * 1e-6, times_us)
+
+
+def gone(points: Sequence[Sequence[float]], metres: np.ndarray, times_us: torch.Tensor) -> Trajectory:
+    """The like, gone so far `[T]` at times `[T]`."""
     way = np.asarray(points, np.float64)
-    metres = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
-    at = speed * (times_us - times_us[0]).numpy() * 1e-6
+    marks = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
 
     def where(m: np.ndarray) -> np.ndarray:
-        inside = np.stack([np.interp(m, metres, way[:, i]) for i in (0, 1)], 1)
+        inside = np.stack([np.interp(m, marks, way[:, i]) for i in (0, 1)], 1)
         last = (way[-1] - way[-2]) / np.linalg.norm(way[-1] - way[-2])
-        return inside + (m - metres[-1]).clip(0)[:, None] * last
+        return inside + (m - marks[-1]).clip(0)[:, None] * last
 
-    heading = where(at + 0.4) - where(np.maximum(at - 0.4, 0))
-    poses = [translation(x, y) @ turn(math.atan2(dy, dx)) for (x, y), (dx, dy) in zip(where(at), heading, strict=True)]
+    heading = where(metres + 0.4) - where(np.maximum(metres - 0.4, 0))
+    poses = [translation(x, y) @ turn(math.atan2(dy, dx)) for (x, y), (dx, dy) in zip(where(metres), heading, strict=True)]
     return Trajectory(times_us, torch.stack(poses))
