@@ -19,6 +19,12 @@ from recon.seeds.dense import FARTHEST, ground_depth
 from recon.seeds.stereo import WINDOW, Plate, box_means, unlike
 from scenes.ground import Ground
 
+Sides = Sequence[Sequence[tuple[Plate, int]]]
+"""Plates before one, and after it, with the times at which they were taken."""
+
+LEVEL = 0.3
+"""Part of a camera's axis that must be level: of one that looks down nobody knows what goes sideways."""
+
 FASTEST, SLOWEST = 12.0, 0.7
 """Metres a second sideways, at most and at least."""
 
@@ -62,11 +68,11 @@ class _Found:
         return self.worth + min(self.grounded, self.worth)
 
 
-def crossings(plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], ground: Ground) -> list[Sighting]:
+def crossings(plate: Plate, time_us: int, sides: Sides, ground: Ground) -> list[Sighting]:
     """What crosses a plate taken at a time, best first. sides: as of `sightings`, of which the nearest of each is asked: who walks looks
-    another half a second later."""
+    another half a second later. Nothing where the camera looks up or down."""
     sides = [side[:1] for side in sides]
-    if not sides:
+    if not sides or np.linalg.norm(plate.axis()[:2]) < LEVEL:
         return []
     still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
     deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
@@ -143,20 +149,17 @@ def _left(plate: Plate) -> np.ndarray:
     return np.array([-ahead[1], ahead[0], 0.0])
 
 
-def _moved(plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], speeds: np.ndarray):
+def _moved(plate: Plate, time_us: int, sides: Sides, speeds: np.ndarray) -> list[list[tuple[Plate, np.ndarray]]]:
     """Where what goes to the left at speeds `[N]` is when the others were taken: as `unlike` takes it."""
     return [[(other, np.outer(speeds * (t - time_us) / 1e6, _left(plate))) for other, t in side] for side in sides]
 
 
-def _step(plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], z: float) -> float:
+def _step(plate: Plate, time_us: int, sides: Sides, z: float) -> float:
     """Metres a second that take what is z ahead `STEP` pixels elsewhere until another picture."""
     return STEP * z / plate.focal[0] / max(abs(t - time_us) / 1e6 for side in sides for _, t in side)
 
 
-def _at(
-    plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], z: float, base: float, stands: np.ndarray,
-    of_ground: np.ndarray,
-) -> list[_Found]:  # fmt: skip
+def _at(plate: Plate, time_us: int, sides: Sides, z: float, base: float, stands: np.ndarray, of_ground: np.ndarray) -> list[_Found]:
     """What crosses z metres ahead, where things stand at the row `base`. stands, of_ground: what it costs in each pixel that something
     stands still, or is the ground."""
     rows = slice(max(0, round(base - BODY[1] * plate.focal[1] / z)), round(base + BEFORE * plate.focal[1] / z) + 1 + WINDOW // 2)
@@ -205,9 +208,7 @@ def _on_its_foot(found: _Found, columns: slice, stands: np.ndarray, bases: np.nd
     return replace(found, away=float(away), speed=float(found.speed * away / found.away))
 
 
-def _sighting(
-    plate: Plate, time_us: int, sides: Sequence[Sequence[tuple[Plate, int]]], found: _Found, columns: slice, stands: np.ndarray
-) -> Sighting:
+def _sighting(plate: Plate, time_us: int, sides: Sides, found: _Found, columns: slice, stands: np.ndarray) -> Sighting:
     """A thing that columns show, at the speed that fits these best, and as high as it looks more alike so. stands: what it costs in each
     pixel that something stands still."""
     part = replace(plate, grey=plate.grey[:, columns], centre=(plate.centre[0] - columns.start, plate.centre[1]))

@@ -6,7 +6,7 @@ import torch
 from painted import BOARD, SIZE, drive
 
 from recon.movers.crossed import LONGEST_US, PERSON, believed, boxed
-from recon.movers.crossing import _Found, _joined, _on_its_foot
+from recon.movers.crossing import _Found, _joined, _on_its_foot, crossings
 from recon.movers.sighting import DISTANCES, Sighting
 from recon.movers.traffic import traffic
 from recon.seeds import stereo
@@ -107,3 +107,11 @@ def test_legs_that_swing_tell_how_near_somebody_is():
     assert nearer.away == pytest.approx(8.0, rel=0.15) and nearer.speed == pytest.approx(3.0 * nearer.away / 20)
     stands[57:75] = 0.2
     assert _on_its_foot(trunk, slice(70, 80), stands, bases) == trunk
+
+
+def test_a_camera_that_looks_down_sees_nothing_cross():
+    down = np.diag([1.0, -1.0, -1.0, 1.0]) @ translation(z=-5.0).numpy()
+    grey = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) * 255 - 128
+    plate = stereo.Plate(grey, (60.0, 60.0), (32.0, 24.0), down, torch.zeros(48, 64, 2), np.ones((48, 64)))
+    later = stereo.Plate(grey.roll(6, 1), (60.0, 60.0), (32.0, 24.0), down, torch.zeros(48, 64, 2), np.ones((48, 64)))
+    assert crossings(plate, 0, [[(later, 200_000)]], FLAT) == []
