@@ -74,11 +74,16 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
     leads.
     """
     views = spaced(sorted(frames.of(0), key=lambda v: v.time_us))
-    times, plates = _plates(views, log, frames)
-    eyes = np.array([p.eye()[:2] for p in plates])
     path = way_of(log.ego.world_from_body[:, :3, 3].numpy())
-    if len(path) < 2 or len(times) < FEWEST:
+    if len(path) < 2 or len(views) < FEWEST:
         return ()
+    # what is there in the first picture that is fitted is there in those before it, too, and is not to pop up in a clip
+    ends = [v for v in frames.of(0, held_out=True) if not views[0].time_us < v.time_us < views[-1].time_us]
+    every = sorted([*views, *ends], key=lambda v: v.time_us)
+    stamps, of_every = np.array([v.time_us for v in every]), [plate_of(v.image, frames.camera(log, v)) for v in every]
+    fitted = [i for i, v in enumerate(every) if not v.held_out]
+    times, plates = stamps[fitted], [of_every[i] for i in fitted]
+    eyes = np.array([p.eye()[:2] for p in plates])
     paces = np.linalg.norm(np.gradient(eyes, times / 1e6, axis=0), axis=1)
 
     def looked_at(i: int) -> tuple[list[Sighting], list[Sighting]]:
@@ -90,16 +95,9 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
         for found in side_by_side(looked_at, range(len(views))):
             seen.append(found)
             steps.step()
-    # what is there in the first picture that is fitted is there in those before it, too, and is not to pop up in a clip
-    ends = [v for v in frames.of(0, held_out=True) if not times[0] < v.time_us < times[-1]]
-    at = _plates(sorted([*views, *ends], key=lambda v: v.time_us), log, frames)
     going, across = ([found[kind] for found in seen] for kind in (0, 1))
-    return named(apart([*boxes(going, *at, Lane(log.ego), ground), *crossed(across, *at, ground)]), log.ego)
-
-
-def _plates(views: Sequence[View], log: Log, frames: Frames) -> tuple[np.ndarray, list[Plate]]:
-    """Times `[T]` and plates of views."""
-    return np.array([v.time_us for v in views]), [plate_of(v.image, frames.camera(log, v)) for v in views]
+    along_lane = boxes(going, stamps, of_every, Lane(log.ego), ground)
+    return named(apart([*along_lane, *crossed(across, stamps, of_every, ground)]), log.ego)
 
 
 def spaced(views: Sequence[View]) -> list[View]:

@@ -100,8 +100,8 @@ class Mover:
 @dataclass(frozen=True)
 class Place:
     """A world with a recorder in it. lidar: elevations of its beams in degrees, and where it stands on the body; aside: shifts, metres to
-    the left and upwards, at which the truth is looked at; stops: how many
-    stops longer than at first it is exposed, and from when to when, microseconds: `[2, T]`, moments first."""
+    the left and upwards, at which the truth is looked at; level: the road's; stops: moments in microseconds, and how many stops longer than
+    at first its cameras expose then, `[2, T]`."""
 
     name: str
     still: Mesh

@@ -16,7 +16,7 @@ from scenes.trajectory import Trajectory
 from tests.bench.worlds.people import walker
 from tests.bench.worlds.place import Light, Place, along, clock
 from tests.bench.worlds.solids import box, crown, facade, grain, joined, painted, panel, plain
-from tests.bench.worlds.street import FRAMES, LIDAR, STEP_US, car, models_in, rig
+from tests.bench.worlds.street import FRAMES, LIDAR, STEP_US, car, models_in, plaster, rig
 
 SPEED, DEEP, DIP, SPAN = 9.0, 3.6, (12.0, 88.0), (42.0, 60.0)
 """Metres a second; how deep the street dips, and where; and where the bridge is."""
@@ -181,7 +181,7 @@ def _country(chance: np.random.Generator) -> list[Mesh]:
         while x < HIGH:
             width, tall = 3.0 * chance.integers(3, 6), 3.0 * chance.integers(2, 4)
             if not SPAN[0] - 4 - width < x < SPAN[1] + 4:
-                wall = facade(int(chance.integers(1 << 20)), tuple(chance.uniform(0.4, 0.8) * (1 + chance.uniform(-0.12, 0.12, 3))))
+                wall = plaster(chance)
                 out.append(box((x + width / 2, side * (HALF + 5 + chance.uniform(0, 3) + 5), 0), (width, 10.0, tall), wall, 3.0, roof))
             x += width + chance.uniform(1.5, 8.0)
         for x in np.arange(LOW, HIGH, 11.0):
