@@ -44,6 +44,10 @@ BEFORE = 0.7
 STANDING = 40, (4.0, 120.0)
 """Depths, in equal steps of their inverse, at which what stands still may be."""
 
+WALLS, BEHIND = 3.0, 0.4
+"""Pixels by which the distances at which a wall may be take what it shows elsewhere, and the least part of a place's inverse depth, at most
+`NEARER`, that its own may have there."""
+
 UNDER, NEARER = 0.87, 1.12
 """Parts of its inverse depth by which what stands still may be under the ground, and nearer than the place that is asked about."""
 
@@ -112,7 +116,7 @@ class Sighting:
 @dataclass(frozen=True)
 class _Found:
     """A sighting, `one`, of what so many columns `across` show around x, in `rows`; how good it is, `score`; and by how much each of all
-    columns looks more alike than what stands still, `worths` `[w]`."""
+    columns looks more alike than what stands still, `worths` `[w]`, which costs `stands` `[rows, w]`."""
 
     score: float
     one: Sighting
@@ -120,6 +124,12 @@ class _Found:
     across: int
     rows: slice
     worths: np.ndarray
+    stands: np.ndarray
+
+    @property
+    def shown(self) -> slice:
+        """The columns that show it."""
+        return slice(max(0, self.x - self.across // 2), self.x + self.across // 2 + 1)
 
 
 def sightings(
@@ -161,19 +171,48 @@ def sightings(
             told = float(z), float(speeds[best[x]]), 0.0, float(worth[x]), float(grounded[x])
             one = Sighting(time_us, eye[:2], along, *told, cut, rise)  # its outline tells where it is
             score = float(worth[x] + min(grounded[x], worth[x]))
-            found.append(_Found(score, one, int(x), across, slice(rows.start, rows.start + bottom), worths[best[x]]))
+            part = slice(rows.start, rows.start + bottom)
+            found.append(_Found(score, one, int(x), across, part, worths[best[x]], stands[:bottom]))
     kept: list[_Found] = []
     for new in sorted(found, key=lambda f: -f.score):
         if all(abs(new.x - old.x) > APART * max(new.across, old.across) for old in kept):
             kept.append(new)
-    return [_refined(plate, sides, new) for new in kept if new.one.away < DISTANCES[-1]]
+    kept = [_not_a_wall(plate, still, new, deepest) for new in kept if new.one.away < DISTANCES[-1]]
+    return [_refined(plate, sides, new) for new in kept if new.one.worth > WORTH]
+
+
+def _not_a_wall(plate: Plate, still: Sequence[Sequence[tuple[Plate, np.ndarray]]], found: _Found, deepest: np.ndarray) -> _Found:
+    """What was found, by how much it looks more alike than what stands still or is a wall along the street: a guard rail looks alike all
+    along, and at any depth, which a wall has many of, seems to go as fast as we do. deepest: depth `[h, w]` of the ground."""
+    one, rows = found.one, found.rows
+    columns = slice(max(0, found.shown.start - WINDOW), found.shown.stop + WINDOW)
+    part = _cropped(plate, columns)
+    left = torch.from_numpy(plate.cam_from_world[:3, :3] @ [*one.axes[1], 0.0]).float()
+    aside = (part.rays() @ left).abs().clamp_min(1 / FARTHEST)
+    middle = float(aside[rows, aside.shape[1] // 2].mean())
+    apart = max(float(np.linalg.norm(other.eye() - plate.eye())) for side in still for other, _ in side)
+    outermost = max(abs(edge - plate.centre[0]) for edge in (found.shown.start, found.shown.stop))
+    steps = 2 + int(outermost * apart * (NEARER - BEHIND) / one.away / WALLS)
+    farthest, stands = torch.from_numpy(UNDER / deepest[rows, columns]).float(), found.stands[:, columns]
+    walls = stands
+    for inverse in torch.linspace(BEHIND, NEARER, steps) / one.away:
+        inverses = aside * (inverse / middle)
+        costs = box_means(unlike(part, still, rows, 1 / inverses))[0]
+        walls = np.minimum(walls, torch.where(inverses[rows] >= farthest, costs, torch.inf).numpy())
+    less = beside((stands - walls).mean(0), found.across)[found.x - columns.start]
+    return replace(found, one=replace(one, worth=one.worth - float(less)))
+
+
+def _cropped(plate: Plate, columns: slice) -> Plate:
+    """A plate's columns, for `unlike`."""
+    return replace(plate, grey=plate.grey[:, columns], centre=(plate.centre[0] - columns.start, plate.centre[1]))
 
 
 def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: _Found) -> Sighting:
     """A sighting at the place that its outline tells, with its speeds along the street and across it."""
-    one, shown = found.one, slice(max(0, found.x - found.across // 2), found.x + found.across // 2 + 1)
+    one, shown = found.one, found.shown
     seen = [one.axes @ shown_at(plate, x, one.away) for x in (found.x, *outline(found.worths, shown))]
-    part = replace(plate, grey=plate.grey[:, shown], centre=(plate.centre[0] - shown.start, plate.centre[1]))
+    part = _cropped(plate, shown)
     speeds = np.stack(np.meshgrid(one.speed + DRIFTS[0], DRIFTS[1]), -1).reshape(-1, 2)
     each = np.column_stack([speeds @ one.axes, one.rise * speeds[:, 0]])
     ways = [[(other, each * (t - one.time_us) / 1e6) for other, t in side] for side in sides]
