@@ -24,6 +24,7 @@ from render.flat_field import in_flat_field
 from render.frame import render_frame
 from render.frame_types import Frame
 from render.kernels.detail import add_photo, carry_over
+from render.photo_noise import without_noise
 from render.portraits import portraits_of
 from render.rays import camera_rays, on_device
 from render.seen import GONE, NOISE, PARALLAX, PHOTOS, Seen, faded, run_over
@@ -212,7 +213,7 @@ class References:
             if shot.ego is not None:
                 ego = torch.from_numpy(shot.ego).to(device)[None, None].float()
                 instance = torch.where(F.interpolate(ego, instance.shape)[0, 0] > 0, GONE, instance)
-            differs = (photo - frame.rgb.clamp(0, 1)) / _gain(self.recorded, frame)
+            differs = without_noise(photo - frame.rgb.clamp(0, 1), photo) / _gain(self.recorded, frame)
             self.kept[key] = Seen.of(frame, F.pad(differs, (0, 1)), instance, placed)
         self.kept.move_to_end(key)
         while len(self.kept) > KEPT:
