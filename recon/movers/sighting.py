@@ -44,9 +44,9 @@ BEFORE = 0.7
 STANDING = 40, (4.0, 120.0)
 """Depths, in equal steps of their inverse, at which what stands still may be."""
 
-WALLS, BEHIND = 3.0, 0.4
-"""Pixels by which the distances at which a wall may be take what it shows elsewhere, and the least part of a place's inverse depth, at most
-`NEARER`, that its own may have there."""
+ALONG, FARTHEST_ALONG = (-8.0, -4.0, 4.0, 8.0), 8.0
+"""Pixels aside to where the street's direction takes a thing in its own picture, which a rail or a wall looks like there, and metres up to
+which that is asked for: what is straight ahead goes nowhere."""
 
 UNDER, NEARER = 0.87, 1.12
 """Parts of its inverse depth by which what stands still may be under the ground, and nearer than the place that is asked about."""
@@ -177,29 +177,22 @@ def sightings(
     for new in sorted(found, key=lambda f: -f.score):
         if all(abs(new.x - old.x) > APART * max(new.across, old.across) for old in kept):
             kept.append(new)
-    kept = [_not_a_wall(plate, still, new, deepest) for new in kept if new.one.away < DISTANCES[-1]]
+    kept = [_no_rail(plate, new) for new in kept if new.one.away < DISTANCES[-1]]
     return [_refined(plate, sides, new) for new in kept if new.one.worth > WORTH]
 
 
-def _not_a_wall(plate: Plate, still: Sequence[Sequence[tuple[Plate, np.ndarray]]], found: _Found, deepest: np.ndarray) -> _Found:
-    """What was found, by how much it looks more alike than what stands still or is a wall along the street: a guard rail looks alike all
-    along, and at any depth, which a wall has many of, seems to go as fast as we do. deepest: depth `[h, w]` of the ground."""
-    one, rows = found.one, found.rows
-    columns = slice(max(0, found.shown.start - WINDOW), found.shown.stop + WINDOW)
-    part = _cropped(plate, columns)
-    left = torch.from_numpy(plate.cam_from_world[:3, :3] @ [*one.axes[1], 0.0]).float()
-    aside = (part.rays() @ left).abs().clamp_min(1 / FARTHEST)
-    middle = float(aside[rows, aside.shape[1] // 2].mean())
-    apart = max(float(np.linalg.norm(other.eye() - plate.eye())) for side in still for other, _ in side)
-    outermost = max(abs(edge - plate.centre[0]) for edge in (found.shown.start, found.shown.stop))
-    steps = 2 + int(outermost * apart * (NEARER - BEHIND) / one.away / WALLS)
-    farthest, stands = torch.from_numpy(UNDER / deepest[rows, columns]).float(), found.stands[:, columns]
-    walls = stands
-    for inverse in torch.linspace(BEHIND, NEARER, steps) / one.away:
-        inverses = aside * (inverse / middle)
-        costs = box_means(unlike(part, still, rows, 1 / inverses))[0]
-        walls = np.minimum(walls, torch.where(inverses[rows] >= farthest, costs, torch.inf).numpy())
-    less = beside((stands - walls).mean(0), found.across)[found.x - columns.start]
+def _no_rail(plate: Plate, found: _Found) -> _Found:
+    """What was found, by how much it looks more alike than what stands still, or than it looks like itself some way along the street: rails
+    and walls look alike all along, and seem to go as fast as we do."""
+    one, columns = found.one, slice(max(0, found.shown.start - WINDOW), found.shown.stop + WINDOW)
+    metres = np.array(ALONG) * one.away / max(abs(found.x + 0.5 - plate.centre[0]), 1e-3)
+    metres = metres[np.abs(metres) <= FARTHEST_ALONG]
+    if not len(metres):
+        return found
+    ways = np.outer(metres, [*one.along, one.rise])
+    itself = unlike(_cropped(plate, columns), [[(plate, ways)]], found.rows, one.away).mean(0).numpy()
+    stands = found.stands[:, columns]
+    less = beside((stands - np.minimum(stands, itself)).mean(0), found.across)[found.x - columns.start]
     return replace(found, one=replace(one, worth=one.worth - float(less)))
 
 

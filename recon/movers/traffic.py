@@ -62,6 +62,10 @@ KEPT, AT_LEAST = 0.5, 1.0
 """Part of the speed that pictures tell, and metres a second at least, by which its places may have it go otherwise: what does not go where
 it seems to is something else."""
 
+ASIDE = 0.55, 0.06
+"""Metres a second, and parts of its speed, by which it may go to a side in the median, the more of both: what stands and is taken for
+something that comes seems to come aslant."""
+
 SAME = (1.3, 1.3), 0.4
 """Lengths and widths of a box within which another's middle belongs to the same thing, and the part of its time in which that must be."""
 
@@ -187,7 +191,9 @@ def believed(thing: list[Sighting], times: np.ndarray) -> bool:
     seconds = np.array([s.time_us for s in thing]) / 1e6
     seconds -= seconds.mean()
     steps = np.array([(s.place - thing[0].place) @ thing[0].along for s in thing])
-    told = float(np.median([s.speed for s in thing]))
+    told, aside = np.median([(s.speed, s.aside) for s in thing], axis=0)
+    if abs(aside) > max(ASIDE[0], ASIDE[1] * abs(told)):
+        return False
     went = float(np.polyfit(seconds, steps, 1)[0])
     return bool(abs(told) * np.ptp(seconds) > WENT and abs(went - told) < max(KEPT * abs(told), AT_LEAST))
 
