@@ -184,16 +184,22 @@ def sightings(
 def _no_rail(plate: Plate, found: _Found) -> _Found:
     """What was found, by how much it looks more alike than what stands still, or than it looks like itself some way along the street: rails
     and walls look alike all along, and seem to go as fast as we do."""
-    one, columns = found.one, slice(max(0, found.shown.start - WINDOW), found.shown.stop + WINDOW)
-    metres = np.array(ALONG) * one.away / max(abs(found.x + 0.5 - plate.centre[0]), 1e-3)
-    metres = metres[np.abs(metres) <= FARTHEST_ALONG]
-    if not len(metres):
-        return found
-    ways = np.outer(metres, [*one.along, one.rise])
-    itself = unlike(_cropped(plate, columns), [[(plate, ways)]], found.rows, one.away).mean(0).numpy()
+    columns = slice(max(0, found.shown.start - WINDOW), found.shown.stop + WINDOW)
     stands = found.stands[:, columns]
+    itself = along_itself(plate, found.one, found.x, found.rows, columns)
     less = beside((stands - np.minimum(stands, itself)).mean(0), found.across)[found.x - columns.start]
-    return replace(found, one=replace(one, worth=one.worth - float(less)))
+    return replace(found, one=replace(found.one, worth=found.one.worth - float(less)))
+
+
+def along_itself(plate: Plate, one: Sighting, x: int, rows: slice, columns: slice) -> np.ndarray:
+    """How unlike a plate is to itself where the street's direction leads from what columns around x show in rows as far away as a sighting,
+    `[rows, columns]`; infinite for what is straight ahead, which that leads nowhere."""
+    metres = np.array(ALONG) * one.away / max(abs(x + 0.5 - plate.centre[0]), 1e-3)
+    metres = metres[np.abs(metres) <= FARTHEST_ALONG]
+    part, ways = _cropped(plate, columns), np.outer(metres, [*one.along, one.rise])
+    if not len(metres):
+        return np.full(part.grey[rows].shape, np.inf)
+    return unlike(part, [[(plate, ways)]], rows, one.away).mean(0).numpy()
 
 
 def _cropped(plate: Plate, columns: slice) -> Plate:

@@ -12,7 +12,7 @@ from painted import BOARD, SIZE, Rear, drive
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.going import BEYOND_US
-from recon.movers.sighting import Sighting, facing_us, hiding, outline
+from recon.movers.sighting import Sighting, along_itself, facing_us, hiding, outline
 from recon.movers.traffic import around, believed, boxes, spaced, traffic
 from recon.seeds import stereo
 from recon.views.frames import load_frames
@@ -140,11 +140,16 @@ def sighted(time_us: int, x: float, speed: float, y: float = 0.0, cut: bool = Fa
     return Sighting(time_us, np.array([x, y]), np.array([1.0, 0.0]), x, speed, 0.0, 0.3, 0.2, cut)
 
 
+def plate_showing(grey: torch.Tensor) -> stereo.Plate:
+    """Grey levels `[90, 160]`, 53 degrees wide, 1.5 metres above the ground, looking along x."""
+    cam_from_world = (CAM_FROM_FLU @ translation(z=-1.5)).numpy()
+    return stereo.Plate(grey, (160.0, 160.0), (80.0, 45.0), cam_from_world, torch.zeros(90, 160, 2), np.ones((90, 160)))
+
+
 def tracked_all(seen: Sequence[list[Sighting]]) -> list[Track]:
     """The boxes of what pictures show that a camera takes on the spot 0.1 seconds apart, 53 degrees wide, 1.5 metres above a straight
     street."""
-    cam_from_world = (CAM_FROM_FLU @ translation(z=-1.5)).numpy()
-    plate = stereo.Plate(torch.zeros(90, 160), (160.0, 160.0), (80.0, 45.0), cam_from_world, torch.zeros(90, 160, 2), np.ones((90, 160)))
+    plate = plate_showing(torch.zeros(90, 160))
     lane = Lane(Trajectory(torch.tensor([0, 10**6]), torch.stack([translation(), translation(x=10.0)])))
     return boxes(list(seen), np.arange(len(seen)) * 100_000, [plate] * len(seen), lane, FLAT)
 
@@ -162,6 +167,24 @@ def test_what_does_not_go_where_it_seems_to_is_not_believed():
     assert not believed([sighted(t, 12.0, 6.0) for t in times], times)
     assert not believed([sighted(t, 12 - 6 * t / 1e6, 6.0) for t in times], times)
     assert not believed([sighted(t, 12 + 6 * t / 1e6, 6.0) for t in times[::2]], times)  # half of the pictures do not show it
+
+
+def test_what_comes_aslant_is_not_believed():
+    times = np.arange(12) * 100_000
+    slow, fast = [sighted(t, 30 - 8 * t / 1e6, -8.0) for t in times], [sighted(t, 12 + 25 * t / 1e6, 25.0) for t in times]
+    assert not believed([replace(s, aside=-0.8) for s in slow], times) and not believed([replace(s, aside=0.8) for s in slow], times)
+    assert believed([replace(s, aside=0.4) for s in slow], times) and believed([replace(s, aside=1.2) for s in fast], times)
+
+
+def test_a_rail_along_the_street_looks_like_itself_and_a_car_does_not():
+    """What a rail shows depends on the direction from the vanishing point alone."""
+    blotches = 60 * torch.randn(90, 160, generator=torch.Generator().manual_seed(3))
+    y, x = torch.meshgrid(torch.arange(90) - 44.5, torch.arange(160) - 79.5, indexing="ij")
+    rail = 60 * torch.sin(25 * torch.atan2(y, x))
+    beside, rows, columns = sighted(0, 12.0, 6.0), slice(50, 66), slice(115, 135)
+    assert along_itself(plate_showing(rail), beside, 125, rows, columns).mean() < 0.1
+    assert along_itself(plate_showing(blotches), beside, 125, rows, columns).mean() > 0.8
+    assert np.isinf(along_itself(plate_showing(rail), beside, 80, rows, slice(70, 90))).all()
 
 
 @pytest.mark.parametrize("part", ["worth", "grounded"])
