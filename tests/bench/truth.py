@@ -1,13 +1,13 @@
 """How near a reconstruction comes to the truth beside the path: of places that are made up, and so can be seen from anywhere.
 
     python -m tests.bench.truth PLACE FOLDER [--meshes ../shared/data/meshes] [--without lidar boxes] [--steps 1000]
-        [--splats 80000] [--camera front | left | rolling | fisheye] [--look OUT]
+        [--splats 80000] [--camera front | left | rolling | fisheye] [--sensor noisy | night] [--look OUT]
 
 FOLDER keeps what was traced of each place, for the next run; rooms have the first two cameras. Of frames that no fit saw, at the recorded
 place and beside it: PSNR of all, of all with the fit's photos (as `render --enhance` makes each frame by itself), of the ground, and of
 what moves; how sharp both are, in parts of the truth's variance of the Laplacian; median relative error of depth; pixels drawn at less than
 0.8 ("in the way") and at more than 1.25 times ("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look
-writes pictures there: what was rendered, that enhanced, and the truth.
+writes pictures there: what was rendered, that enhanced, and the truth. With a sensor the drive's pictures have noise, and the truth none.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ from tests.bench.worlds.lights import lights
 from tests.bench.worlds.place import UNSEEN, Level, Place
 from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
+from tests.bench.worlds.sensor import SENSORS, lit, taken
 from tests.bench.worlds.street import street
 from tests.bench.worlds.underpass import underpass
 
@@ -103,6 +104,7 @@ def main() -> None:
     parser.add_argument("--meshes", type=Path, default=Path("../shared/data/meshes"))
     parser.add_argument("--without", nargs="+", default=[], choices=("lidar", "boxes"))
     parser.add_argument("--camera", default="front")
+    parser.add_argument("--sensor", choices=tuple(SENSORS))
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--splats", type=int, default=80_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -110,7 +112,9 @@ def main() -> None:
     asked = parser.parse_args()
     place = PLACES[asked.place](asked.meshes)
     folder = asked.folder / asked.place.replace(" ", "_")
-    log = without(without_held_out(recorded(place, [asked.camera], folder), HELD_OUT), asked.without)
+    sensor, log = SENSORS.get(asked.sensor), recorded(place, [asked.camera], folder)
+    log = log if sensor is None else taken(log, sensor, folder / asked.sensor)
+    log = without(without_held_out(log, HELD_OUT), asked.without)
     camera, began = place.rig[asked.camera], time.time()
     config = replace(fit_config(log, [asked.camera]), steps=asked.steps, budget=asked.splats, seed=asked.seed)
     scene, frames, rig, *_ = fitted(log, config, [asked.camera], (camera.width, camera.height))
@@ -124,6 +128,7 @@ def main() -> None:
         references = References(shots_in(Path(album), scene), scene)
         for aside, index, truth in looks(place, asked.camera, folder, held_out):
             path = scene.ego.shifted(lateral=aside[0], vertical=aside[1])
+            truth = truth if sensor is None else lit(truth, sensor)
             view = scene.camera(asked.camera, int(scene.frame_times(asked.camera)[index]), path)
             row, shown = figures(scene, references, enhancer, view, truth, place.level)
             rows.setdefault(aside, []).append(row)

@@ -12,6 +12,7 @@ from scenes.sky import linear_from_srgb
 from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, fisheye, gone, looking
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
+from tests.bench.worlds.sensor import Sensor, lit, taken
 from tests.bench.worlds.solids import box, joined, panel, plain
 from tests.bench.worlds.underpass import DEEP, DIP, height, over
 
@@ -34,6 +35,17 @@ def place() -> Place:
         ((-10.0, 0.0, 5.0), (0.0, 0.0, 1.5)),
         ((0.0, 0.0), (1.0, 0.0)),
     )
+
+
+def test_a_noisy_camera_gets_less_light_and_the_truth_no_noise(place, tmp_path):
+    log = recorded(place, ["front"], tmp_path)
+    sensor = Sensor(0.25, 1e-4, 1e-3, None)
+    _, _, truth = next(looks(place, "front", tmp_path, [0]))
+    dim = lit(truth, sensor)
+    noisy = torch.from_numpy(taken(log, sensor, tmp_path / "night").camera("front").image(0).copy()) / 255
+    assert torch.allclose(dim.rgb**2.2, 0.25 * truth.rgb**2.2, atol=1e-6) and torch.equal(dim.depth, truth.depth)
+    off = (noisy**2.2 - dim.rgb**2.2)[dim.rgb.amin(-1) > 0.2]
+    assert abs(float(off.mean())) < 2e-3 and 0.01 < float(off.std()) < 0.02
 
 
 def pixel(camera, point) -> tuple[int, int]:
