@@ -173,7 +173,7 @@ def _at(plate: Plate, time_us: int, sides: Sides, z: float, base: float, stands:
     if not len(hope):
         return []
     columns = slice(max(0, hope[0] - across - WINDOW), hope[-1] + across + WINDOW + 1)
-    part = replace(plate, grey=plate.grey[:, columns], centre=(plate.centre[0] - columns.start, plate.centre[1]))
+    part = plate.columns(columns)
     step = _step(plate, time_us, sides, z)
     speeds = np.arange(step * np.ceil(SLOWEST / step), FASTEST, step)
     speeds = np.concatenate([-speeds[::-1], speeds])
@@ -211,7 +211,7 @@ def _on_its_foot(found: _Found, columns: slice, stands: np.ndarray, bases: np.nd
 def _sighting(plate: Plate, time_us: int, sides: Sides, found: _Found, columns: slice, stands: np.ndarray) -> Sighting:
     """A thing that columns show, at the speed that fits these best, and as high as it looks more alike so. stands: what it costs in each
     pixel that something stands still."""
-    part = replace(plate, grey=plate.grey[:, columns], centre=(plate.centre[0] - columns.start, plate.centre[1]))
+    part = plate.columns(columns)
     speeds = found.speed + _step(plate, time_us, sides, found.away) * np.linspace(-1, 1, 2 * FINER + 1)
     costs = unlike(part, _moved(plate, time_us, sides, speeds), found.rows, found.away).mean((1, 2)).numpy()
     speed, above = float(speeds[costs.argmin()]), slice(0, found.rows.stop)

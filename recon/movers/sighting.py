@@ -196,22 +196,17 @@ def along_itself(plate: Plate, one: Sighting, x: int, rows: slice, columns: slic
     `[rows, columns]`; infinite for what is straight ahead, which that leads nowhere."""
     metres = np.array(ALONG) * one.away / max(abs(x + 0.5 - plate.centre[0]), 1e-3)
     metres = metres[np.abs(metres) <= FARTHEST_ALONG]
-    part, ways = _cropped(plate, columns), np.outer(metres, [*one.along, one.rise])
+    part, ways = plate.columns(columns), np.outer(metres, [*one.along, one.rise])
     if not len(metres):
         return np.full(part.grey[rows].shape, np.inf)
     return unlike(part, [[(plate, ways)]], rows, one.away).mean(0).numpy()
-
-
-def _cropped(plate: Plate, columns: slice) -> Plate:
-    """A plate's columns, for `unlike`."""
-    return replace(plate, grey=plate.grey[:, columns], centre=(plate.centre[0] - columns.start, plate.centre[1]))
 
 
 def _refined(plate: Plate, sides: Sequence[Sequence[tuple[Plate, int]]], found: _Found) -> Sighting:
     """A sighting at the place that its outline tells, with its speeds along the street and across it."""
     one, shown = found.one, found.shown
     seen = [one.axes @ shown_at(plate, x, one.away) for x in (found.x, *outline(found.worths, shown))]
-    part = _cropped(plate, shown)
+    part = plate.columns(shown)
     speeds = np.stack(np.meshgrid(one.speed + DRIFTS[0], DRIFTS[1]), -1).reshape(-1, 2)
     each = np.column_stack([speeds @ one.axes, one.rise * speeds[:, 0]])
     ways = [[(other, each * (t - one.time_us) / 1e6) for other, t in side] for side in sides]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -53,6 +53,10 @@ class Plate:
         h, w = self.grey.shape
         y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
         return torch.stack([(x - self.centre[0]) / self.focal[0], (y - self.centre[1]) / self.focal[1], torch.ones_like(x)], -1)
+
+    def columns(self, part: slice) -> Plate:
+        """Its grey levels in some columns alone, as `unlike` takes them."""
+        return replace(self, grey=self.grey[:, part], centre=(self.centre[0] - part.start, self.centre[1]))
 
     def points(self, depth: np.ndarray) -> np.ndarray:
         """Where its pixels are in the world at a depth z `[h, w]`, `[h, w, 3]`."""
