@@ -1,11 +1,12 @@
 """What the photos of a drive know of a rendered view: detail that splats blur, brought there by the render's own depth.
 
-A photo and the render at its place differ by what the splats do not explain. That difference is moved into the view, not the photo
-itself: it has hardly any low frequencies, so nothing jumps where a photo ends, and exposures, edits and shadows of inserted objects stay
-as they were rendered. An actor's difference moves with the actor; where another instance, or nothing that a photo shows, is drawn, there is
-none. Photos are chosen and faded in and out as views of an unstructured lumigraph (Buehler et al. 2001) and summed as a Wiener filter sums
-estimates of known noise, which grows with parallax: it was measured on drive 002's side cameras, on frames that no fit had seen. Of what
-was put in, the photos that its asset was cut out of say as much (`render/portraits.py`).
+A photo and the render at its place differ by what the splats do not explain. That difference is moved into the view, not the photo itself:
+it has hardly any low frequencies, so nothing jumps where a photo ends, and exposures, edits and shadows of inserted objects stay as they
+were rendered. An actor's difference moves with the actor; where another instance, or nothing that a photo shows, is drawn, there is none;
+nor is there any of a photo's noise (`render/photo_noise.py`). Photos are chosen and faded in and out as views of an unstructured lumigraph
+(Buehler et al. 2001) and summed as a Wiener filter sums estimates of known noise, which grows with parallax: it was measured on drive 002's
+side cameras, on frames that no fit had seen. Of what was put in, the photos that its asset was cut out of say as much
+(`render/portraits.py`).
 """
 
 from __future__ import annotations
