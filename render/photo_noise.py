@@ -45,17 +45,16 @@ def noise_of(difference: torch.Tensor, photo: torch.Tensor) -> torch.Tensor | No
     differs, shown = _squares(difference), _squares(photo)
     if len(differs) < FEWEST:
         return None
-    black, white = (shown < CLIPPED).any(1).all(1), (shown > 1 - CLIPPED).any(1).any(1)
-    spread, level = differs.var(1).mean(1), shown.mean((1, 2)) * BRIGHTNESSES
-    known, last = [], None
+    clipped = (shown < CLIPPED).any(1).all(1) | (shown > 1 - CLIPPED).any(1).any(1)
+    spread, level = differs.var(1).mean(1)[~clipped], (shown.mean((1, 2)) * BRIGHTNESSES)[~clipped].long()
+    told = spread.new_full((BRIGHTNESSES,), torch.inf)
     for k in range(BRIGHTNESSES):
-        own = spread[(level >= k) & (level < k + 1) & ~black & ~white]
+        own = spread[level == k]
         if len(own) >= FEWEST:
-            told = own.quantile(FLATTEST)
-            last = told if last is None else torch.minimum(last, told)
-        known.append(last)
-    first = next((told for told in known if told is not None), None)
-    return None if first is None else torch.stack([first if told is None else told for told in known])
+            told[k] = own.quantile(FLATTEST)
+    least = told.cummin(0).values
+    known = least[least.isfinite()]
+    return torch.where(least.isfinite(), least, known[0]) if len(known) else None
 
 
 def _squares(picture: torch.Tensor) -> torch.Tensor:

@@ -28,7 +28,7 @@ class Sensor:
 
 
 SENSORS = {"noisy": Sensor(1.0, 4e-4, 1.5e-3, 75), "night": Sensor(0.08, 2e-5, 4e-4, None)}
-"""Noise of 5 levels of 255 in the bright to 13 in the dark; and 4 stops less light, with 2 to 7."""
+"""Noise of 5 levels of 255 in the bright to 13 in the dark; and a twelfth of the light, with 2 to 7."""
 
 
 def taken(log: Log, sensor: Sensor, folder: Path) -> Log:
@@ -43,8 +43,8 @@ def taken(log: Log, sensor: Sensor, folder: Path) -> Log:
             shown = np.clip(linear + noise, 0, 1) ** (1 / GAMMA)
             files.append(folder / f"{name}_{i:03d}.{'jpg' if sensor.quality else 'png'}")
             with atomic_file(files[-1]) as part:
-                kind = {"format": "JPEG", "quality": sensor.quality} if sensor.quality else {"format": "PNG"}
-                Image.fromarray((shown * 255).round().astype(np.uint8)).save(part, **kind)  # type: ignore[arg-type] - a format or a number
+                picture = Image.fromarray((shown * 255).round().astype(np.uint8))
+                picture.save(part, "JPEG" if sensor.quality else "PNG", quality=sensor.quality)
         cameras[name] = replace(camera, files=tuple(files))
     return replace(log, cameras=cameras)
 
