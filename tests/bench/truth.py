@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -47,7 +48,11 @@ from tests.bench.worlds.record import Truth, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.sensor import SENSORS, lit, taken
 from tests.bench.worlds.street import street
+from tests.bench.worlds.town import town
 from tests.bench.worlds.underpass import underpass
+
+TOWNS = 20
+"""Streets by lot."""
 
 PLACES: dict[str, Callable[[Path], Place]] = {
     "street": street,
@@ -55,6 +60,7 @@ PLACES: dict[str, Callable[[Path], Place]] = {
     "highway": highway,
     "lights": lights,
     "underpass": underpass,
+    **{f"town {seed}": partial(town, seed=seed) for seed in range(TOWNS)},
     "room": lambda _: room(False),
     "room with people": lambda _: room(True),
 }

@@ -13,8 +13,9 @@ from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, f
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.sensor import Sensor, lit, taken
+from tests.bench.worlds.slopes import over
 from tests.bench.worlds.solids import box, joined, panel, plain
-from tests.bench.worlds.underpass import DEEP, DIP, height, over
+from tests.bench.worlds.underpass import DEEP, DIP, height
 
 TIMES = 1_700_000_000_000_000 + 100_000 * torch.arange(6)
 SUN = (0.0, -0.6, 0.8)
@@ -177,7 +178,7 @@ def test_who_waits_stands_and_faces_where_he_goes():
 
 def test_what_drives_into_a_dip_goes_down_and_up_with_it():
     middle = sum(DIP) / 2
-    path = over(along([(DIP[0] + 10.0, 0.0), (200.0, 0.0)], 100.0, TIMES))
+    path = over(along([(DIP[0] + 10.0, 0.0), (200.0, 0.0)], 100.0, TIMES), height)
     places = path.world_from_body[:, :3, 3]
     assert np.allclose(places[:, 2].numpy(), height(places[:, 0].numpy())) and height(np.array(middle)) == -DEEP
     ahead = path.world_from_body[:, :3, 0]

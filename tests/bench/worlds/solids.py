@@ -79,8 +79,15 @@ def crown(
 
 def moved(mesh: Mesh, at: Sequence[float], yaw: float = 0.0) -> Mesh:
     """Turned about z by `yaw` radians, then moved."""
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    return replace(mesh, vertices=(mesh.vertices @ turn.T + np.asarray(at)).astype(np.float32), normals=mesh.normals @ turn.T)
+    pose = np.eye(4)
+    pose[:2, :2], pose[:3, 3] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]], at
+    return posed(mesh, pose)
+
+
+def posed(mesh: Mesh, pose: np.ndarray) -> Mesh:
+    """Moved rigidly by world_from_mesh `[4, 4]`."""
+    turn = pose[:3, :3]
+    return replace(mesh, vertices=(mesh.vertices @ turn.T + pose[:3, 3]).astype(np.float32), normals=mesh.normals @ turn.T)
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:

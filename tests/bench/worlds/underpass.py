@@ -8,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from render.tracer import Mesh
-from scenes.poses import translation
 from scenes.trajectory import Trajectory
 from tests.bench.worlds.people import walker
 from tests.bench.worlds.place import Light, Place, along, clock
+from tests.bench.worlds.slopes import level, over, strip
 from tests.bench.worlds.solids import box, crown, facade, grain, joined, painted, panel, plain
 from tests.bench.worlds.street import FRAMES, LIDAR, STEP_US, car, models_in, plaster, rig
 
@@ -47,32 +46,19 @@ def underpass(meshes: Path, seed: int = 4) -> Place:
         car("coming", models["pickup"], [(105.0, 1.8), (-60.0, 1.8)], 8.5, times),
         walker("along", [(30.0, -4.6), (60.0, -4.6)], 1.4, times, 20),
     )
-    ego = over(along([(x, 0.15 * math.sin(x / 15) - 1.8) for x in np.arange(-2.0, 90.0)], SPEED, times))
+    ego = over(along([(x, 0.15 * math.sin(x / 15) - 1.8) for x in np.arange(-2.0, 90.0)], SPEED, times), height)
     return Place(
         "underpass",
         joined([*_road(seed), *_walls(chance), *_bridge(chance), *_country(chance)]),
-        tuple(replace(m, trajectory=over(m.trajectory)) for m in movers),
+        tuple(replace(m, trajectory=over(m.trajectory, height)) for m in movers),
         Light((0.3, -0.62, 0.72), (1.0, 0.94, 0.84), (0.24, 0.29, 0.36), 25.0, 0.14),
         ego,
         rig(times),
         LIDAR,
         ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (-1.0, 0.0), (-2.0, 0.0)),
-        level=lambda x, y: torch.from_numpy(height(x.numpy())).to(x.dtype),
+        level=level(height),
         stops=_stops(ego),
     )
-
-
-def over(trajectory: Trajectory) -> Trajectory:
-    """A level one laid on the road."""
-    poses = []
-    for pose in trajectory.world_from_body:
-        x, ahead = float(pose[0, 3]), float(pose[0, 0])
-        slope = math.atan(float(height(x + 0.5) - height(x - 0.5)) * ahead)
-        climb = torch.eye(4, dtype=torch.float64)
-        climb[0, 0] = climb[2, 2] = math.cos(slope)
-        climb[2, 0], climb[0, 2] = math.sin(slope), -math.sin(slope)
-        poses.append(translation(0, 0, float(height(x))) @ pose @ climb)
-    return replace(trajectory, world_from_body=torch.stack(poses))
 
 
 def _stops(ego: Trajectory) -> np.ndarray:
@@ -89,20 +75,8 @@ def _stops(ego: Trajectory) -> np.ndarray:
 
 def _strip(low: float, high: float, ends: Sequence[tuple[float, float]], texture: np.ndarray, tile: float) -> Mesh:
     """A band along the road between two places `(y, z)` above it, the right one first."""
-    (y0, z0), (y1, z1) = ends
-    out = []
-    for x in np.arange(low, high - 1e-6, PIECE):
-        end = min(x + PIECE, high)
-        piece = panel((x, y0, 0), (end - x, 0, 0), (0, y1 - y0, z1 - z0), texture, tile)
-        rise = float(height(end) - height(x))
-        corners = np.array([(x, y0, z0), (end, y0, z0 + rise), (end, y1, z1 + rise), (x, y1, z1)]) + [0, 0, float(height(x))]
-        normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
-        uvs = piece.uvs + [(x - low) / tile, 0]
-        out.append(replace(
-            piece, vertices=corners.astype(np.float32), uvs=uvs,
-            normals=np.broadcast_to(normal / np.linalg.norm(normal), (2, 3, 3)).astype(np.float32),
-        ))  # fmt: skip
-    return joined(out)
+    marks = np.append(np.arange(low, high - 1e-6, PIECE), high)
+    return strip(np.stack([marks, np.zeros(len(marks))], 1), ends, texture, tile, height)
 
 
 def _road(seed: int) -> list[Mesh]:
