@@ -13,8 +13,9 @@ from tests.bench.worlds.place import UNSEEN, Light, Mover, Part, Place, along, f
 from tests.bench.worlds.record import LOOKS, looks, recorded
 from tests.bench.worlds.room import room
 from tests.bench.worlds.sensor import Sensor, lit, taken
-from tests.bench.worlds.slopes import over
+from tests.bench.worlds.slopes import over, strip
 from tests.bench.worlds.solids import box, joined, panel, plain
+from tests.bench.worlds.town import KERB, Street, town
 from tests.bench.worlds.underpass import DEEP, DIP, height
 
 TIMES = 1_700_000_000_000_000 + 100_000 * torch.arange(6)
@@ -184,3 +185,34 @@ def test_what_drives_into_a_dip_goes_down_and_up_with_it():
     ahead = path.world_from_body[:, :3, 0]
     assert ahead[0, 2] < -0.1 and ahead[-1, 2] > 0.05, "it looks down into it, and up out of it"
     assert float(path.world_from_body[0, :3, 2] @ ahead[0]) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_strip_follows_its_way_over_the_ground():
+    angle = np.linspace(0, 1.0, 40)
+    way = 30 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)
+    band = strip(way, ((-2.0, 0.1), (3.0, 0.1)), plain((1, 1, 1)), 1.0, lambda x: 0.05 * x)
+    radii = np.linalg.norm(band.vertices[:, :2] - [0, 30.0], axis=1)
+    assert set(radii.round(1)) == {32.0, 27.0}, "2 m to the right of it, which is the outside, and 3 m to the left"
+    assert np.allclose(band.vertices[:, 2], 0.1 + 0.05 * band.vertices[:, 0], atol=1e-5)
+    assert (band.normals @ np.array([-0.05, 0, 1]) > 0.999).all(), "it looks up from the slope"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_in_any_town_wheels_and_feet_are_on_the_ground(shared, seed):
+    """Whoever moves, and the recorder, stands on the road or the pavement, upright from it, within a kerb's height."""
+    place = town(shared / "meshes", seed)
+    down = torch.tensor([[0.0, 0.0, -1.0]])
+    for path in (place.ego, *(m.trajectory for m in place.movers)):
+        for pose in path.world_from_body[::20]:
+            x, y, z = pose[:3, 3].tolist()
+            metres, who = replace(place, movers=()).distances(torch.tensor([[x, y, z + 0.4]]), down, int(path.times_us[0]))
+            assert who.item() == 0 and metres.item() - 0.4 == pytest.approx(0, abs=KERB + 0.03)
+            assert float(place.level(torch.tensor([x]), torch.tensor([y]))) == pytest.approx(z, abs=1e-5)
+    assert np.array_equal(town(shared / "meshes", seed).still.vertices, place.still.vertices)
+
+
+def test_streets_by_lot_are_told_along_their_way():
+    street = Street.by_lot(np.random.default_rng(3))
+    here, there = street.at(10.0, 0.0), street.at(12.0, 1.5)
+    assert torch.allclose((inverse(here) @ there)[:3, 3], torch.tensor([2.0, 1.5, 0.0]).double(), atol=0.15)
+    assert len(street.points(10.0, 2.0, 1.0)) == 9

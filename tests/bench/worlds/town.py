@@ -181,7 +181,7 @@ def _green(street: Street, chance: np.random.Generator) -> list[Mesh]:
                 out.append(street.upright(joined(lamp), at, left))
             elif chance.random() < 0.5:
                 hedge = box((0, 0, 0), (chance.uniform(2, 6), 0.8, chance.uniform(0.7, 1.5)), leaves, 1.5)
-                out.append(street.upright(hedge, at, left + side))
+                out.append(street.upright(hedge, at, left))
     return out
 
 
