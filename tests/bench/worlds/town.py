@@ -74,11 +74,15 @@ def town(meshes: Path, seed: int) -> Place:
     chance = np.random.default_rng([seed, 77])
     models, times, street = models_in(meshes), clock(FRAMES + 1, STEP_US), Street.by_lot(chance)
     metres, lane = _drive(chance, times), street.side * min(LANE, street.half - 2.3) / 2
-    still = joined([*_ground(street, seed), *_built(street, chance), *_green(street, chance), *_parked(street, chance, models, lane)])
+    crossing = float(metres[-1]) + chance.uniform(5, 15)
+    cars = _parked(street, chance, models, lane, crossing)
+    still = joined([*_ground(street, seed), *_built(street, chance), *_green(street, chance), *cars])
     return Place(
         f"town {seed}",
         still,
-        tuple(replace(m, trajectory=over(m.trajectory, street.height)) for m in _movers(street, chance, models, metres, lane, times)),
+        tuple(
+            replace(m, trajectory=over(m.trajectory, street.height)) for m in _movers(street, chance, models, metres, lane, crossing, times)
+        ),
         _light(chance),
         over(gone(street.points(-2.0, HIGH - 10.0, lane), metres + 2.0, times), street.height),
         {"front": _camera(chance, times)},
@@ -185,8 +189,8 @@ def _green(street: Street, chance: np.random.Generator) -> list[Mesh]:
     return out
 
 
-def _parked(street: Street, chance: np.random.Generator, models: dict[str, Mesh], lane: float) -> list[Mesh]:
-    """Cars along those kerbs that leave the lanes room."""
+def _parked(street: Street, chance: np.random.Generator, models: dict[str, Mesh], lane: float, crossing: float) -> list[Mesh]:
+    """Cars along those kerbs that leave the lanes room, and not where people cross."""
     out, dense = [], chance.uniform(0, 0.8)
     for side in (-1, 1):
         left = side * (street.half - 1.1)
@@ -195,14 +199,20 @@ def _parked(street: Street, chance: np.random.Generator, models: dict[str, Mesh]
         s = LOW + 10
         while s < HIGH - 20:
             s += chance.uniform(5.6, 8.0)
-            if chance.random() < dense:
+            if chance.random() < dense and abs(s - crossing) > 4.0:
                 pose = street.at(s, left) @ turn(math.pi * (side != street.side) + chance.uniform(-0.03, 0.03))
                 out.append(posed(models[CARS[chance.integers(len(CARS))]], pose.numpy()))
     return out
 
 
 def _movers(
-    street: Street, chance: np.random.Generator, models: dict[str, Mesh], metres: np.ndarray, lane: float, times: torch.Tensor
+    street: Street,
+    chance: np.random.Generator,
+    models: dict[str, Mesh],
+    metres: np.ndarray,
+    lane: float,
+    crossing: float,
+    times: torch.Tensor,
 ) -> list[Mover]:
     """Cars ahead and coming, and people on the pavements and across the street."""
     seconds, out = float(times[-1] - times[0]) * 1e-6, []
@@ -222,7 +232,6 @@ def _movers(
         last = first + chance.choice([-1, 1]) * 12.0
         out.append(walker(f"walks {k}", street.points(first, last, side * (street.half + chance.uniform(1.6, 2.6))), 1.4, times, 20 + k))
     if chance.random() < 0.5:
-        at = float(metres[-1]) + chance.uniform(5, 15)
-        across = [tuple(street.at(at, left)[:2, 3].tolist()) for left in (-street.half - 1, street.half + 1)]
+        across = [tuple(street.at(crossing, left)[:2, 3].tolist()) for left in (-street.half - 1, street.half + 1)]
         out.append(walker("crosses", across, 1.3, times, 30))
     return out
