@@ -224,9 +224,10 @@ def _movers(
         ahead, faster = chance.uniform(10, 25), chance.uniform(0, 1.5)
         path = gone(street.points(ahead, HIGH - 10, lane), metres + faster * np.linspace(0, seconds, len(metres)), times)
         out.append(replace(car("ahead", model(), street.points(0, 2, lane), 1.0, times), trajectory=path))
+    slowest = math.inf  # nobody drives into the one before
     for k in range(int(chance.integers(0, 4))):
-        first = 40.0 + 30.0 * k + chance.uniform(0, 15)
-        out.append(car(f"coming {k}", model(), street.points(first, LOW + 2, -lane), chance.uniform(5, 10), times))
+        first, slowest = 40.0 + 30.0 * k + chance.uniform(0, 15), min(slowest, chance.uniform(5, 10))
+        out.append(car(f"coming {k}", model(), street.points(first, LOW + 2, -lane), slowest, times))
     for k in range(int(chance.integers(0, 5))):
         first, side = chance.uniform(10, float(metres[-1]) + 20), chance.choice([-1, 1])
         last = first + chance.choice([-1, 1]) * 12.0
