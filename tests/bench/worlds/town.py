@@ -46,7 +46,7 @@ class Street:
         way = np.cumsum(PIECE * np.stack([np.cos(heading), np.sin(heading)], 1), 0)
 
         def height(x: np.ndarray) -> np.ndarray:
-            return climb * lengths[2] / (2 * np.pi) * np.sin(2 * np.pi * np.asarray(x, np.float64) / lengths[2] + phases[2])
+            return climb * lengths[2] / (2 * np.pi) * np.sin(2 * np.pi * np.clip(x, -1e4, 1e4) / lengths[2] + phases[2])
 
         return Street(way, chance.uniform(4.2, 7.0), height, -1 if chance.random() < 0.7 else 1)
 
