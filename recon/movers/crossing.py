@@ -16,7 +16,8 @@ import torch
 
 from recon.movers.sighting import BEFORE, DISTANCES, STANDING, Sighting, base_row, beside, outline, shown_at
 from recon.seeds.dense import FARTHEST, ground_depth
-from recon.seeds.stereo import WINDOW, Plate, box_means, unlike
+from recon.seeds.stereo import WINDOW, Plate, box_means
+from recon.seeds.ways import unlike
 from scenes.ground import Ground
 
 Sides = Sequence[Sequence[tuple[Plate, int]]]
@@ -77,9 +78,9 @@ def crossings(plate: Plate, time_us: int, sides: Sides, ground: Ground) -> list[
     still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
     deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
     of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0]
-    stands = of_ground.clone()
-    for inverse_depth in np.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0]):
-        stands = torch.minimum(stands, box_means(unlike(plate, still, slice(None), float(1 / inverse_depth)))[0])
+    depths = [[(other, np.zeros((STANDING[0], 3))) for other, _ in side] for side in sides]
+    inverse_depths = np.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0])
+    stands = torch.minimum(of_ground, box_means(unlike(plate, depths, slice(None), 1 / inverse_depths)).amin(0))
     bases = np.array([base_row(plate, ground, z) for z in DISTANCES])
     costs = stands.numpy(), of_ground.numpy()
     found = [new for z, base in zip(DISTANCES[:-1], bases, strict=False) for new in _at(plate, time_us, sides, float(z), base, *costs)]

@@ -19,7 +19,8 @@ from scipy import ndimage
 
 from recon.movers.boxing import CAR
 from recon.seeds.dense import FARTHEST, ground_depth
-from recon.seeds.stereo import WINDOW, Plate, box_means, unlike
+from recon.seeds.stereo import WINDOW, Plate, box_means
+from recon.seeds.ways import unlike
 from scenes.ground import Ground
 
 DISTANCES = 4.5 * 1.09 ** np.arange(27)
@@ -143,7 +144,8 @@ def sightings(
     still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
     deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
     inverse_depths = torch.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0])
-    standing = torch.cat([box_means(unlike(plate, still, slice(None), 1 / float(w))) for w in inverse_depths])
+    depths = [[(other, np.zeros((STANDING[0], 3))) for other, _ in side] for side in sides]
+    standing = box_means(unlike(plate, depths, slice(None), 1 / inverse_depths.double().numpy()))
     of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0].numpy()
     found = []
     for z in DISTANCES:

@@ -1,8 +1,7 @@
-"""Pictures as pinhole cameras see them, and how alike they look at a depth, by normalised cross-correlation."""
+"""Pictures as pinhole cameras see them, and what they are compared by: normalised cross-correlation in squares."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,6 +46,11 @@ class Plate:
         """Standard deviation `[h, w]` of the grey levels in the squares that are compared, noise taken off, in parts of their mean."""
         mean, spread = moments_of(self.grey[None])
         return ((spread.square() - FLAT * FLAT).clamp_min(0).sqrt() / (mean + GREY).clamp_min(1))[0].numpy()
+
+    def pixels_from_cam(self) -> np.ndarray:
+        """`[3, 3]`, 0 the middle of the first pixel."""
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
 
     def rays(self) -> torch.Tensor:
         """Directions `[h, w, 3]` of its pixels, z = 1."""
@@ -96,41 +100,6 @@ def plate_of(image: torch.Tensor, camera: Camera) -> Plate:
     shown = F.grid_sample(grey, grid.nan_to_num(9.0)[None], mode="bilinear", padding_mode="border", align_corners=False)[0, 0]
     scale = torch.tensor([camera.width / w, camera.height / h])
     return Plate(shown, plate.focal, plate.centre, plate.cam_from_world, at * scale, inside.numpy())
-
-
-def unlike(plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], rows: slice, depth: float | torch.Tensor) -> torch.Tensor:
-    """1 - correlation `[N, rows, w]` of a plate's rows, at a depth z or depths `[h, w]`, with others' where what they show has moved by any
-    of N ways `[N, 3]` in the world; the mean of each side, of the better one, since the other may not see it."""
-    own = plate.grey[None, rows]
-    local = plate.rays()[rows].movedim(-1, 0) * (depth if isinstance(depth, float) else depth[rows])
-    moments = moments_of(own)
-    of_sides = []
-    for side in sides:
-        total = count = torch.zeros(())
-        for other, ways in side:
-            there = torch.from_numpy(other.cam_from_world @ np.linalg.inv(plate.cam_from_world)).float()
-            moved = torch.from_numpy(ways @ other.cam_from_world[:3, :3].T).float() + there[:3, 3]
-            x, y, z = (there[:3, :3] @ local.flatten(1)).reshape(local.shape)[:, None] + moved.T[:, :, None, None]
-            cost, inside = _compared(own, moments, other, x, y, z)
-            seen = inside & (z > 0.5)
-            total, count = total + torch.where(seen, cost, 0.0), count + seen
-        of_sides.append(torch.where(count > 0, total / count.clamp_min(1), UNSEEN))
-    return torch.stack(of_sides).amin(0)
-
-
-def _compared(
-    own: torch.Tensor, moments: tuple[torch.Tensor, torch.Tensor], other: Plate, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """1 - correlation, in squares, of grey levels `own`, of these moments, with what another plate shows at places `[N, rows, w]` before
-    it, and whether these are in its view."""
-    h, w = other.grey.shape
-    behind = 1 / z.clamp_min(1e-3)
-    u = (x * behind).mul_(2 * other.focal[0] / w).add_(2 * other.centre[0] / w - 1)
-    v = (y * behind).mul_(2 * other.focal[1] / h).add_(2 * other.centre[1] / h - 1)
-    grid = torch.stack([u, v], -1).clamp_(-3, 3)
-    shown = F.grid_sample(other.grey[None, None].expand(len(grid), -1, -1, -1), grid, align_corners=False)[:, 0]
-    (mean, spread), (their_mean, their_spread) = moments, moments_of(shown)
-    return 1 - (box_means(shown * own) - mean * their_mean) / (spread * their_spread), torch.maximum(u.abs(), v.abs()) < 1
 
 
 def box_means(maps: torch.Tensor, window: int = WINDOW) -> torch.Tensor:

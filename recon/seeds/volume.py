@@ -36,12 +36,12 @@ class Volume:
         self.plate, device = plate, plate.grey.device
         h, w = plate.grey.shape
         self.others = F.pad(torch.stack([other.grey for other in others]), (1, 2, 1, 2))
-        pixels, back = _pixels_from_cam(plate), np.linalg.inv(plate.cam_from_world)
+        pixels, back = plate.pixels_from_cam(), np.linalg.inv(plate.cam_from_world)
         motion = np.zeros((len(others), 3, 4))
         for of, other in zip(motion, others, strict=True):
             there = other.cam_from_world @ back
-            of[:, :3] = _pixels_from_cam(other) @ there[:3, :3] @ np.linalg.inv(pixels)
-            of[:, 3] = _pixels_from_cam(other) @ there[:3, 3]
+            of[:, :3] = other.pixels_from_cam() @ there[:3, :3] @ np.linalg.inv(pixels)
+            of[:, 3] = other.pixels_from_cam() @ there[:3, 3]
         self.motion = upload(torch.from_numpy(motion).float(), device)
         self.cost, self.total = torch.empty(h, w, PLANES, device=device), torch.zeros(h, w, PLANES, device=device)
         self.shown = torch.empty(len(others), h, w, TILE, device=device)
@@ -104,9 +104,3 @@ class Volume:
         told = [view(t, float) for t in (step, bounds, lowest)]
         run_pixels(choose, step.numel(), [*costs, *told, UNSEEN, view(least, float), view(inverse_depth, float)], step.device)
         return found
-
-
-def _pixels_from_cam(plate: Plate) -> np.ndarray:
-    """`[3, 3]`, 0 the middle of the first pixel."""
-    (fx, fy), (cx, cy) = plate.focal, plate.centre
-    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])

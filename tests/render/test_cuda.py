@@ -16,6 +16,7 @@ from recon.kernels import press as press_kernels
 from recon.kernels import scanlines as scanlines_kernels
 from recon.kernels import shutter as shutter_kernels
 from recon.kernels import sight as sight_kernels
+from recon.kernels import ways as ways_kernels
 from recon.kernels.agreement import look_kernel
 from recon.kernels.similarity import similar_kernel
 from render import block_compositing, rasterize
@@ -71,6 +72,8 @@ KERNELS = {
     "march": lambda: ground_kernels.march,
     "look": lambda: planes_kernels.look,
     "compare": lambda: planes_kernels.compare_kernel(3),
+    "look along": lambda: ways_kernels.look_along,
+    "unlike": lambda: ways_kernels.unlike_kernel(2),
     "scanlines": lambda: scanlines_kernels.add_paths,
     "behind": lambda: behind_kernels.find_corners,
     "frames": lambda: canonical_kernels.make_frames,
