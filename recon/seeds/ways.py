@@ -26,9 +26,10 @@ def unlike(
     `[h, w]` of each pixel. All plates are on the host."""
     own = plate.grey[None, rows]
     (h, w), ways = own.shape[1:], len(sides[0][0][1])
-    of_pixels = isinstance(depth, torch.Tensor)
-    closer = 1 / depth[rows].float() if of_pixels else torch.ones(h, w)
-    inverse = np.broadcast_to(1.0 if of_pixels else 1 / np.asarray(depth, np.float64), ways)
+    if isinstance(depth, torch.Tensor):
+        closer, inverse = 1 / depth[rows].float(), np.ones(ways)
+    else:
+        closer, inverse = torch.ones(h, w), np.broadcast_to(1 / np.asarray(depth, np.float64), ways)
     flat = [(side, *of) for side, others in enumerate(sides) for of in others]
     first_row = np.array([[1, 0, 0], [0, 1, rows.indices(len(plate.grey))[0]], [0, 0, 1]])
     rays, back = np.linalg.inv(plate.pixels_from_cam()) @ first_row, np.linalg.inv(plate.cam_from_world)
@@ -60,7 +61,7 @@ def _compared(own: torch.Tensor, greys: torch.Tensor, others: Others, chunks: in
     return cost
 
 
-def _in_lanes(numbers: np.ndarray, chunks: int) -> wp.array:
+def _in_lanes(numbers: np.ndarray, chunks: int) -> object:
     """`[..., N]` as lane vectors `[..., chunks]`, the last number again in lanes that are left over."""
     filled = torch.from_numpy(numbers[..., np.minimum(np.arange(chunks * TILE), numbers.shape[-1] - 1)])
     return wp.from_torch(filled.float().contiguous().unflatten(-1, (chunks, TILE)), dtype=lanes)
