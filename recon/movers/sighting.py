@@ -72,6 +72,11 @@ APART = 0.6
 """Of a rear's width: two things in a picture are that far apart at least."""
 
 
+CLEAR, ALIKE, ONE = 0.5, 5.0, 1.3
+"""Two sightings are of one car where the nearer one looks at least so many times as much more alike as the other, their speeds differ by so
+many m/s at most, and they are so many of its lengths and widths apart."""
+
+
 @dataclass(frozen=True)
 class Sighting:
     """Something that moves, in a picture at `time_us`: where the middle of its end that looks at us stands `[2]`, the street's direction
@@ -180,7 +185,21 @@ def sightings(
         if all(abs(new.x - old.x) > APART * max(new.across, old.across) for old in kept):
             kept.append(new)
     kept = [_no_rail(plate, new) for new in kept if new.one.away < DISTANCES[-1]]
-    return [_refined(plate, sides, new) for new in kept if new.one.worth > WORTH]
+    return nearest_of_each([_refined(plate, sides, new) for new in kept if new.one.worth > WORTH])
+
+
+def nearest_of_each(seen: Sequence[Sighting]) -> list[Sighting]:
+    """Of sightings of one picture those that are no other's flank: what is behind the end that looks at us, within a car's length of it, is
+    of the same car, whose flank seems to be another one that goes as fast."""
+    return [s for i, s in enumerate(seen) if not any(_flank(s, other) for k, other in enumerate(seen) if k != i)]
+
+
+def _flank(one: Sighting, other: Sighting) -> bool:
+    """Whether a sighting is farther off than another one and of the same car."""
+    if other.away > one.away or other.worth < CLEAR * one.worth or abs(one.speed - other.speed) > ALIKE:
+        return False
+    off = np.abs(other.axes @ (one.place - other.place)) / CAR[:2]
+    return bool((off < ONE).all()) and (other.away, -other.worth) < (one.away, -one.worth)
 
 
 def _no_rail(plate: Plate, found: _Found) -> _Found:

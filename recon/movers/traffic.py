@@ -55,6 +55,10 @@ FEWEST, SHARE = 6, 0.6
 CLEARLY = 0.12, 0.08
 """By how much it must look more alike than what stands still, and the ground before it than if it went on there, in half of them."""
 
+ENOUGH = 0.4
+"""Seconds for which it must look more alike than what stands still, and the ground before it than if it went on there, times both together:
+what stands looks a little so for a moment."""
+
 WENT = 3.0
 """Metres that it must go."""
 
@@ -124,9 +128,19 @@ def way_of(places: np.ndarray) -> np.ndarray:
 
 def boxes(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], lane: Lane, ground: Ground) -> list[Track]:
     """Tracks of what was `seen` going along a lane, at the `times` `[T]` of pictures, `plates`: those that were looked at and any others.
-    What is clearest comes first."""
-    things = sorted((f for f in follow(seen) if believed(f, times)), key=lambda f: -sum(s.worth for s in f))
-    return apart([boxed(thing, times, plates, lane, ground) for thing in things])
+    What is clearest comes first, and is told more of by what else was followed of it."""
+    made: list[tuple[list[Sighting], Track]] = []
+    for thing in sorted((f for f in follow(seen) if believed(f, times)), key=lambda f: -sum(s.worth for s in f)):
+        track = boxed(thing, times, plates, lane, ground)
+        same = next((k for k, (_, other) in enumerate(made) if _within(track, other) > SAME[1]), None)
+        if same is None:
+            made.append((thing, track))
+            continue
+        own = made[same][0]
+        told = {s.time_us for s in own}
+        whole = sorted([*own, *(s for s in thing if s.time_us not in told)], key=lambda s: s.time_us)
+        made[same] = whole, boxed(whole, times, plates, lane, ground)
+    return [track for _, track in made]
 
 
 def crossed(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], ground: Ground) -> list[Track]:
@@ -187,6 +201,8 @@ def believed(thing: list[Sighting], times: np.ndarray) -> bool:
     """Whether it is seen often enough, goes far enough, and goes where its speed takes it."""
     between = ((times >= thing[0].time_us) & (times <= thing[-1].time_us)).sum()
     if len(thing) < max(FEWEST, SHARE * between) or (np.median([(s.worth, s.grounded) for s in thing], axis=0) < CLEARLY).any():
+        return False
+    if sum(s.worth + s.grounded for s in thing) * float(np.median(np.diff(times))) / 1e6 < ENOUGH:
         return False
     seconds = np.array([s.time_us for s in thing]) / 1e6
     seconds -= seconds.mean()
