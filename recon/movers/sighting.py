@@ -191,15 +191,18 @@ def sightings(
 def nearest_of_each(seen: Sequence[Sighting]) -> list[Sighting]:
     """Of sightings of one picture those that are no other's flank: what is behind the end that looks at us, within a car's length of it, is
     of the same car, whose flank seems to be another one that goes as fast."""
-    return [s for i, s in enumerate(seen) if not any(_flank(s, other) for k, other in enumerate(seen) if k != i)]
+    ends: list[Sighting] = []
+    for one in sorted(seen, key=lambda s: (s.away, -s.worth)):
+        if not any(_flank(one, end) for end in ends):
+            ends.append(one)
+    return sorted(ends, key=lambda s: -s.worth)
 
 
-def _flank(one: Sighting, other: Sighting) -> bool:
-    """Whether a sighting is farther off than another one and of the same car."""
-    if other.away > one.away or other.worth < CLEAR * one.worth or abs(one.speed - other.speed) > ALIKE:
+def _flank(one: Sighting, end: Sighting) -> bool:
+    """Whether a sighting is of the car whose end another one, no farther off, is."""
+    if end.worth < CLEAR * one.worth or abs(one.speed - end.speed) > ALIKE:
         return False
-    off = np.abs(other.axes @ (one.place - other.place)) / CAR[:2]
-    return bool((off < ONE).all()) and (other.away, -other.worth) < (one.away, -one.worth)
+    return bool((np.abs(end.axes @ (one.place - end.place)) < ONE * np.array(CAR)).all())
 
 
 def _no_rail(plate: Plate, found: _Found) -> _Found:

@@ -55,9 +55,9 @@ FEWEST, SHARE = 6, 0.6
 CLEARLY = 0.12, 0.08
 """By how much it must look more alike than what stands still, and the ground before it than if it went on there, in half of them."""
 
-ENOUGH = 0.4
-"""Seconds for which it must look more alike than what stands still, and the ground before it than if it went on there, times both together:
-what stands looks a little so for a moment."""
+ENOUGH = 0.4, 2.5
+"""Seconds for which it must look more alike than what stands still, and the ground before it than if it went on there, times both together;
+or metres that it has come meanwhile, times the same: what stands looks a little so for a moment, and what comes fast is soon gone."""
 
 WENT = 3.0
 """Metres that it must go."""
@@ -202,13 +202,12 @@ def believed(thing: list[Sighting], times: np.ndarray) -> bool:
     between = ((times >= thing[0].time_us) & (times <= thing[-1].time_us)).sum()
     if len(thing) < max(FEWEST, SHARE * between) or (np.median([(s.worth, s.grounded) for s in thing], axis=0) < CLEARLY).any():
         return False
-    if sum(s.worth + s.grounded for s in thing) * float(np.median(np.diff(times))) / 1e6 < ENOUGH:
-        return False
     seconds = np.array([s.time_us for s in thing]) / 1e6
     seconds -= seconds.mean()
     steps = np.array([(s.place - thing[0].place) @ thing[0].along for s in thing])
     told, aside = np.median([(s.speed, s.aside) for s in thing], axis=0)
-    if abs(aside) > max(ASIDE[0], ASIDE[1] * abs(told)):
+    clear = sum(s.worth + s.grounded for s in thing) * float(np.median(np.diff(times))) / 1e6
+    if abs(aside) > max(ASIDE[0], ASIDE[1] * abs(told)) or (clear < ENOUGH[0] and -told * clear < ENOUGH[1]):
         return False
     went = float(np.polyfit(seconds, steps, 1)[0])
     return bool(abs(told) * np.ptp(seconds) > WENT and abs(went - told) < max(KEPT * abs(told), AT_LEAST))
