@@ -55,7 +55,7 @@ FEWEST, SHARE = 6, 0.6
 CLEARLY = 0.12, 0.08
 """By how much it must look more alike than what stands still, and the ground before it than if it went on there, in half of them."""
 
-ENOUGH = 0.4, 2.5
+ENOUGH = 0.5, 2.5
 """Seconds for which it must look more alike than what stands still, and the ground before it than if it went on there, times both together;
 or metres that it has come meanwhile, times the same: what stands looks a little so for a moment, and what comes fast is soon gone."""
 
@@ -66,7 +66,7 @@ KEPT, AT_LEAST = 0.5, 1.0
 """Part of the speed that pictures tell, and metres a second at least, by which its places may have it go otherwise: what does not go where
 it seems to is something else."""
 
-ASIDE = 0.55, 0.06
+ASIDE = 0.55, 0.08
 """Metres a second, and parts of its speed, by which it may go to a side in the median, the more of both: what stands and is taken for
 something that comes seems to come aslant."""
 

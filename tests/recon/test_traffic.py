@@ -12,8 +12,8 @@ from painted import BOARD, SIZE, Rear, drive
 from recon.log import Track
 from recon.movers.boxing import CAR, smoothed
 from recon.movers.going import BEYOND_US
-from recon.movers.sighting import Sighting, along_itself, facing_us, hiding, outline
-from recon.movers.traffic import around, believed, boxes, spaced, traffic
+from recon.movers.sighting import ALIKE, Sighting, along_itself, facing_us, hiding, nearest_of_each, outline
+from recon.movers.traffic import ENOUGH, around, believed, boxes, spaced, traffic
 from recon.seeds import stereo
 from recon.views.frames import load_frames
 from scenes.ground import Ground
@@ -185,6 +185,36 @@ def test_a_rail_along_the_street_looks_like_itself_and_a_car_does_not():
     assert along_itself(plate_showing(rail), beside, 125, rows, columns).mean() < 0.1
     assert along_itself(plate_showing(blotches), beside, 125, rows, columns).mean() > 0.8
     assert np.isinf(along_itself(plate_showing(rail), beside, 80, rows, slice(70, 90))).all()
+
+
+def test_what_is_behind_the_end_of_a_car_is_its_flank():
+    end, flank, next_one = (sighted(0, x, -6.0, y) for x, y in ((18.0, 3.0), (22.0, 2.4), (26.5, 3.0)))
+    assert [s.away for s in nearest_of_each([flank, end, next_one])] == [18.0, 26.5], "a second car is farther off than the first is long"
+    beside, faster = sighted(0, 22.0, -6.0, 6.0), replace(flank, speed=-6.0 - ALIKE - 0.1)
+    assert len(nearest_of_each([end, beside])) == len(nearest_of_each([end, faster])) == 2
+    assert len(nearest_of_each([replace(end, worth=0.1), flank])) == 2, "what is hardly seen hides nothing"
+    assert len(nearest_of_each([end, replace(end, worth=0.2)])) == 1
+
+
+def test_what_stands_looks_only_for_a_moment_as_if_it_moved():
+    def seen(count: int, speed: float) -> bool:
+        """Whether it is believed where so many pictures show it."""
+        times = np.arange(count) * 100_000
+        return believed([sighted(t, 40 + speed * t / 1e6, speed) for t in times], times)  # 0.5 more alike, with the ground
+
+    along = int(10 * ENOUGH[0] / 0.5)
+    assert seen(along + 1, 6.0) and not seen(along - 1, 6.0)
+    coming = int(10 * ENOUGH[1] / 14 / 0.5) + 1
+    assert coming < along - 1 and seen(max(coming, 6), -14.0) and not seen(max(coming, 6), 14.0)
+
+
+def test_what_was_followed_in_pieces_has_one_box():
+    """Nothing showed it for longer than it is followed."""
+    times = range(0, 4_000_000, 100_000)
+    (whole,) = tracked_all([[sighted(t, 20 + 5 * t / 1e6, 5.0)] for t in times])
+    (track,) = tracked_all([[sighted(t, 20 + 5 * t / 1e6, 5.0)] if t // 100_000 not in (18, 19, 20, 21, 22, 23) else [] for t in times])
+    assert track.times_us.tolist() == whole.times_us.tolist()
+    assert np.abs(track.world_from_box[:, 0, 3].numpy() - whole.world_from_box[:, 0, 3].numpy()).max() < 0.2
 
 
 @pytest.mark.parametrize("part", ["worth", "grounded"])
