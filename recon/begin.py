@@ -20,6 +20,7 @@ from recon.fit.motion import Motion
 from recon.fit.population import Population
 from recon.fit.reach import nearest_of
 from recon.fit.strides import stride_of
+from recon.fit.veils import Veils
 from recon.log import Log
 from recon.objects.tracks import LIMBED
 from recon.ready import moving_things
@@ -59,7 +60,9 @@ def begin(
     else:
         told = zip(frames.views, start.gains, start.skies, strict=True)
         frames = replace(frames, views=[replace(v, gain=gain, sky=sky) for v, gain, sky in told])
-    return start, _fit(frames, start, Clear.of(log, span, start.ground), config, device, exposed or {})
+    seen = [] if log.sweeps_within(span) else [frames.camera(log, view) for view in frames.training()]
+    veils = Veils.of(seen, start.tracks, start.ground)
+    return start, _fit(frames, start, Clear.of(log, span, start.ground), veils, config, device, exposed or {})
 
 
 def _prepared(
@@ -91,7 +94,7 @@ def _prepared(
     return frames, start
 
 
-def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: str, exposed: Mapping[str, RigCamera]) -> Fit:
+def _fit(frames: Frames, start: Start, clear: Clear, veils: Veils, config: FitConfig, device: str, exposed: Mapping[str, RigCamera]) -> Fit:
     """The fit of prepared splats, with all that constrains it."""
     trained = torch.tensor([v.time_us for v in frames.of(0)])
     motion = Motion(frames, start.rig, Knots(start.ego, trained), start.tracks)
@@ -100,7 +103,7 @@ def _fit(frames: Frames, start: Start, clear: Clear, config: FitConfig, device: 
     times = [v.time_us for v in frames.views]
     limbs = Limbs(strides, start.tracks, (min(times), max(times)), device)
     ground = FlatGround(start.ground, start.ground_shown, torch.device(device))
-    population = Population(start.splats.to(device), motion, config, ground, start.swept, clear, nearest_of(start.measured))
+    population = Population(start.splats.to(device), motion, config, ground, start.swept, clear, veils, nearest_of(start.measured))
     fields = [_flat_field(start.rig[name], exposed.get(name), population.device) for name in frames.names]
     return Fit(frames, population, start.sky, start.exposures, limbs, start.measured, fields)
 

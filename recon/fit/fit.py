@@ -324,7 +324,7 @@ class Fit:
     def _refill(self) -> None:
         """Add splats where the sky stands in for what pictures show, once what stands where lidar looked through is gone."""
         there = self.population
-        there.drop(there.clear.holds(there.splats))
+        there.drop(there.clear.holds(there.splats) | there.veils.holds(there.splats))
         path, sh_count = self.motion.path(), there.splats.fields["sh"].shape[1]
         for c in range(len(self.frames.names)):
             views, gain = self.frames.of(c), self.exposures[c].diagonal().cpu().numpy()

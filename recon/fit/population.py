@@ -17,6 +17,7 @@ from recon.fit.motion import Motion
 from recon.fit.reach import reach_of
 from recon.fit.swept import Swept
 from recon.fit.unseen import LOW, SEEN, Shown, as_neighbours, curtains, off_ground, pennants, swollen
+from recon.fit.veils import Veils
 from recon.seeds.points import fewer
 from scenes.gaussians import Gaussians
 from scenes.trajectory import Trajectory
@@ -29,10 +30,21 @@ class Population:
     movers' all that it is; None before any is. nearest: metres of the path within which nothing is seen sharper.
     """
 
-    def __init__(self, splats: Splats, motion: Motion, config: FitConfig, ground: FlatGround, swept: Swept, clear: Clear, nearest: float):
+    def __init__(
+        self,
+        splats: Splats,
+        motion: Motion,
+        config: FitConfig,
+        ground: FlatGround,
+        swept: Swept,
+        clear: Clear,
+        veils: Veils,
+        nearest: float,
+    ):
         self.device = splats.reach.device
         self.splats, self.motion, self.config = splats, motion, config
         self.nearest = nearest
+        self.veils = veils
         self.swept, self.clear, self.flat_ground, self.ground = swept.to(self.device), clear, ground, ground.ground
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.guessed: torch.Tensor | None = None
@@ -40,7 +52,7 @@ class Population:
     def grow(self, progress: float) -> None:
         """Split where most is wrong and pictures pull, drop what does not show. progress: the part of the fit that is done."""
         left = max(1, int((self.config.grow_span[1] - progress) * self.config.steps / self.config.grow_every) + 1)
-        carried, astray = self.descent.tensors(), self.swept.holds(self.splats)
+        carried, astray = self.descent.tensors(), self.swept.holds(self.splats) | self.veils.holds(self.splats)
         budget = round(self.config.budget * (1 - ROOM)) if self.motion.tracks else self.config.budget
         self._renew(*grow(self.splats, carried, self.growth, budget, left, self.motion.boxes, astray))
 
@@ -58,7 +70,7 @@ class Population:
     def guess(self, shown: Callable[[], Shown]) -> None:
         """Complete vehicles, and give what pictures hardly show its neighbours' colours, to keep, once what went astray, hangs or swelled
         is gone; of movers it rests from then on. shown: what pictures show of the splats there are by then."""
-        self.drop(self.swept.holds(self.splats) | self.clear.holds(self.splats))
+        self.drop(self.swept.holds(self.splats) | self.clear.holds(self.splats) | self.veils.holds(self.splats))
         seen = shown()
         hang = curtains(self.splats, seen.inside, self.descent.coloured(), self.ground) | pennants(self.splats, seen, self.ground)
         hang |= swollen(self.splats, seen.part)
