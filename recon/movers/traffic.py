@@ -71,7 +71,8 @@ ASIDE = 0.55, 0.08
 something that comes seems to come aslant."""
 
 SAME = (1.3, 1.3), 0.4
-"""Lengths and widths of a box within which another's middle belongs to the same thing, and the part of its time in which that must be."""
+"""Lengths and widths of a box within which another's middle belongs to the same thing, and the part of its time, or of that which both
+have, in which that must be."""
 
 
 def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
@@ -132,7 +133,8 @@ def boxes(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate]
     made: list[tuple[list[Sighting], Track]] = []
     for thing in sorted((f for f in follow(seen) if believed(f, times)), key=lambda f: -sum(s.worth for s in f)):
         track = boxed(thing, times, plates, lane, ground)
-        same = next((k for k, (_, other) in enumerate(made) if _within(track, other) > SAME[1]), None)
+        meets = [_beside(track, other) for _, other in made]
+        same = next((k for k, met in enumerate(meets) if len(met) and met.mean() > SAME[1]), None)
         if same is None:
             made.append((thing, track))
             continue
@@ -153,7 +155,7 @@ def apart(tracks: Sequence[Track]) -> list[Track]:
     """Those of tracks that are no other, earlier one's."""
     made: list[Track] = []
     for track in tracks:
-        if not any(_within(track, other) > SAME[1] for other in made):
+        if not any(_beside(track, other).sum() > SAME[1] * len(track.times_us) for other in made):
             made.append(track)
     return made
 
@@ -213,10 +215,10 @@ def believed(thing: list[Sighting], times: np.ndarray) -> bool:
     return bool(abs(told) * np.ptp(seconds) > WENT and abs(went - told) < max(KEPT * abs(told), AT_LEAST))
 
 
-def _within(track: Track, other: Track) -> float:
-    """Part of a track's time in which its middle lies in or beside the other's box."""
+def _beside(track: Track, other: Track) -> np.ndarray:
+    """Whether a track's middle lies in or beside the other's box, bool `[T]`, at the times that both have."""
     _, mine, its = np.intersect1d(track.times_us, other.times_us, return_indices=True)
     back = torch.linalg.inv(other.world_from_box[its]).numpy()
     place = track.world_from_box[mine, :3, 3].numpy()
     local = np.einsum("nij,nj->ni", back[:, :2, :3], place) + back[:, :2, 3]
-    return float((np.abs(local) < other.size[:2] * SAME[0]).all(1).sum()) / len(track.times_us)
+    return (np.abs(local) < other.size[:2] * SAME[0]).all(1)

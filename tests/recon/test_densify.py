@@ -150,7 +150,7 @@ def test_what_is_added_to_the_background_takes_no_more_room_than_there_is(budget
     standing = Trajectory(torch.zeros(1, dtype=torch.int64), torch.eye(4, dtype=torch.float64)[None])
     motion = SimpleNamespace(rig=[RigCamera(Pinhole(100.0, 100.0, 50.0, 50.0), 100, 100, torch.eye(4))], tracks=[])
     nobody = SimpleNamespace(to=lambda device: None)
-    there = Population(splats(), motion, FitConfig(budget=budget), SimpleNamespace(ground=None), nobody, None, NEAREST)
+    there = Population(splats(), motion, FitConfig(budget=budget), SimpleNamespace(ground=None), nobody, None, None, NEAREST)
     more = some(30, 4)
     there.add(more, standing)
     assert there.splats.sizes == [50 + room, 20, 10] and len(there.growth.errors) == len(there.splats) == 80 + room

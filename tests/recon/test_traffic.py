@@ -84,7 +84,7 @@ def test_what_drifts_towards_us_comes_as_fast_as_it_is():
     path = track.trajectory()
     went = (path.at(1_000_000)[:2, 3] - path.at(400_000)[:2, 3]).numpy() / 0.6
     assert abs(went[0] + 9) < 1.0
-    assert np.median(np.abs(misses(track, front, CAR[0] / 2)[:, 1])) < 0.5
+    assert np.median(np.abs(misses(track, front, CAR[0] / 2)[:, 1])) < 0.8  # a board has no flank
 
 
 def test_a_car_is_where_its_outline_says_whatever_of_it_is_seen():
