@@ -3,11 +3,12 @@
     python -m tests.bench.truth PLACE FOLDER [--meshes ../shared/data/meshes] [--without lidar boxes] [--steps 1000]
         [--splats 80000] [--camera front | left | rolling | fisheye] [--sensor noisy | night] [--look OUT]
 
-FOLDER keeps what was traced of each place, for the next run; rooms have the first two cameras. Of frames that no fit saw, at the recorded
-place and beside it: PSNR of all, of all with the fit's photos (as `render --enhance` makes each frame by itself), of the ground, and of
-what moves; how sharp both are, in parts of the truth's variance of the Laplacian; median relative error of depth; pixels drawn at less than
-0.8 ("in the way") and at more than 1.25 times ("beyond") their true depth, or as sky ("open"), of those that are no sky in truth. --look
-writes pictures there: what was rendered, that enhanced, and the truth. With a sensor the drive's pictures have noise, and the truth none.
+FOLDER keeps what was traced of each place, for the next run; rooms have the first two cameras, and each "town 0" to "town 19", a street by
+lot, the first. Of frames that no fit saw, at the recorded place and beside it: PSNR of all, of all with the fit's photos (as `render
+--enhance` makes each frame by itself), of the ground, and of what moves; how sharp both are, in parts of the truth's variance of the
+Laplacian; median relative error of depth; pixels drawn at less than 0.8 ("in the way") and at more than 1.25 times ("beyond") their true
+depth, or as sky ("open"), of those that are no sky in truth. --look writes pictures there: what was rendered, that enhanced, and the truth.
+With a sensor the drive's pictures have noise, and the truth none.
 """
 
 from __future__ import annotations
