@@ -25,7 +25,7 @@ AHEAD = 0.5, 0.05
 ABOVE = 0.3
 """Metres above the ground from which on something hangs."""
 
-PART = 0.5
+PART = 0.3
 """Part of the pictures that show it, each by how large it is there, in which it hangs before a box: what stands there is seen before other
 things, too."""
 
