@@ -62,19 +62,17 @@ class Veils:
         points = means[high]
         shown, before = torch.zeros(2, len(points), device=points.device)
         for picture in self.pictures:
-            back = inverse(picture.camera.world_from_cam).to(points)
+            camera, back = picture.camera, inverse(picture.camera.world_from_cam).to(points)
             local = points @ back[:3, :3].T + back[:3, 3]
-            near = ((local[:, 2] > 0) & (local[:, 2] < 2 * FAR)).nonzero()[:, 0]
-            local = local[near]
-            pixels, z = picture.camera.lens.project(local), local[:, 2]
-            x, y = pixels.unbind(1)
-            inside = (x > 0) & (y > 0) & (x < picture.camera.width) & (y < picture.camera.height)
-            large = inside / z.clamp_min(0.5).square()
+            asked = ((local[:, 2] > 0) & (local[:, 2] < 2 * FAR)).nonzero()[:, 0]  # from farther off it is hardly seen
+            (x, y), z = camera.lens.project(local[asked]).unbind(1), local[asked, 2]
+            inside = (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)
             veils = torch.zeros_like(inside)
             for (left, top, right, bottom), away in zip(picture.rectangles.tolist(), picture.near.tolist(), strict=True):
                 veils |= (x > left) & (x < right) & (y > top) & (y < bottom) & (z < away - AHEAD[0] - AHEAD[1] * away)
-            shown[near] += large
-            before[near] += large * veils
+            large = inside / z.clamp_min(AHEAD[0]).square()
+            shown[asked] += large
+            before[asked] += large * veils
         mask[high] = before > PART * shown
         return mask
 
