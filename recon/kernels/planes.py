@@ -105,8 +105,46 @@ class Prices:
 
 
 @cache
+def squares_of(half: int) -> tuple[wp.Function, wp.Function]:
+    """What squares of 2 half + 1 pixels are compared by: sums over a column of one, and the correlation that its columns' sums give. Their
+    sides are unrolled, since a sum that goes round a loop is no vector."""
+
+    @wp.func
+    def of_column(own: wp.array3d[float], shown: wp.array3d[lanes], o: int, y: int, x: int):
+        """Of what another shows, of its square, and of its product with `own`."""
+        s = lanes(0.0)
+        squares = lanes(0.0)
+        products = lanes(0.0)
+        for k in range(wp.static(-half), wp.static(half + 1)):
+            r = wp.clamp(y + k, 0, own.shape[1] - 1)
+            v = shown[o, r, x]
+            s = s + v
+            squares = squares + wp.cw_mul(v, v)
+            products = products + v * own[0, r, x]
+        return s, squares, products
+
+    @wp.func
+    def correlation(own: wp.array3d[float], sums: wp.array3d[lanes], i: int, first: int, y: int, x: int, noise: float):
+        """Of the square around a pixel, whose first column's sums are `first` of item i's."""
+        s = lanes(0.0)
+        squares = lanes(0.0)
+        products = lanes(0.0)
+        for k in range(wp.static(2 * half + 1)):
+            s = s + sums[i, first + k, 0]
+            squares = squares + sums[i, first + k, 1]
+            products = products + sums[i, first + k, 2]
+        part = wp.static(1 / (2 * half + 1) ** 2)
+        mean = s * part
+        spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
+        return wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
+
+    return of_column, correlation
+
+
+@cache
 def compare_kernel(half: int) -> wp.Kernel:
-    """For squares of 2 half + 1 pixels: their sides are unrolled, since a sum that goes round a loop is no vector."""
+    """For squares of 2 half + 1 pixels."""
+    of_column, correlation = squares_of(half)
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def compare(
@@ -126,7 +164,6 @@ def compare_kernel(half: int) -> wp.Kernel:
         h = cost.shape[0]
         w = cost.shape[1]
         y, left, right = part_of_row(i, stretch, w)
-        part = wp.static(1 / (2 * half + 1) ** 2)
         number = numbers(chunk)
         for x in range(left, right):
             cost[y, x, chunk] = lanes(2.0)
@@ -135,30 +172,13 @@ def compare_kernel(half: int) -> wp.Kernel:
             for column in range(left - half, right + half):
                 x = wp.clamp(column, 0, w - 1)
                 if matters(near, y, x, chunk):
-                    s = lanes(0.0)
-                    squares = lanes(0.0)
-                    products = lanes(0.0)
-                    for k in range(wp.static(-half), wp.static(half + 1)):
-                        r = wp.clamp(y + k, 0, h - 1)
-                        v = shown[o, r, x]
-                        s = s + v
-                        squares = squares + wp.cw_mul(v, v)
-                        products = products + v * own[0, r, x]
+                    s, squares, products = of_column(own, shown, o, y, x)
                     sums[i, column - left + half, 0] = s
                     sums[i, column - left + half, 1] = squares
                     sums[i, column - left + half, 2] = products
             for x in range(left, right):
                 if matters(bounds, y, x, chunk):
-                    s = lanes(0.0)
-                    squares = lanes(0.0)
-                    products = lanes(0.0)
-                    for k in range(wp.static(2 * half + 1)):
-                        s = s + sums[i, x - left + k, 0]
-                        squares = squares + sums[i, x - left + k, 1]
-                        products = products + sums[i, x - left + k, 2]
-                    mean = s * part
-                    spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
-                    alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
+                    alike = correlation(own, sums, i, x - left, y, x, noise)
                     inverse_depths = number * step[y, x]
                     z = on_axis(motion, o, 2, x, y, inverse_depths)
                     u = on_axis(motion, o, 0, x, y, inverse_depths) + 0.5 * z

@@ -5,8 +5,8 @@ from functools import cache
 
 import warp as wp
 
-from recon.kernels.planes import BEHIND, between_pixels, part_of_row
-from render.kernels.lanewise import cut, greater_of, lesser_of, roots
+from recon.kernels.planes import BEHIND, between_pixels, part_of_row, squares_of
+from render.kernels.lanewise import cut, greater_of, lesser_of
 from render.kernels.types import OPTIONS, lanes
 
 wp.set_module_options(OPTIONS)
@@ -53,7 +53,8 @@ def look_along(greys: wp.array3d[float], others: Others, chunk: int, shown: wp.a
 
 @cache
 def unlike_kernel(half: int) -> wp.Kernel:
-    """For squares of 2 half + 1 pixels: their sides are unrolled, since a sum that goes round a loop is no vector."""
+    """For squares of 2 half + 1 pixels."""
+    of_column, correlation = squares_of(half)
 
     @wp.kernel(module="unique", module_options=OPTIONS, enable_backward=False)
     def unlike_along(
@@ -68,10 +69,8 @@ def unlike_kernel(half: int) -> wp.Kernel:
         `[items, stretch + 2 half, 5]`: to work in.
         """
         i = first + wp.tid()
-        h = cost.shape[0]
         w = cost.shape[1]
         y, left, right = part_of_row(i, stretch, w)
-        part = wp.static(1 / (2 * half + 1) ** 2)
         for x in range(left, right):
             cost[y, x] = lanes(DEAR)
         for o in range(shown.shape[0]):
@@ -81,30 +80,13 @@ def unlike_kernel(half: int) -> wp.Kernel:
                     sums[i, x - left, 4] = lanes(0.0)
             for column in range(left - half, right + half):
                 x = wp.clamp(column, 0, w - 1)
-                s = lanes(0.0)
-                squares = lanes(0.0)
-                products = lanes(0.0)
-                for k in range(wp.static(-half), wp.static(half + 1)):
-                    r = wp.clamp(y + k, 0, h - 1)
-                    v = shown[o, r, x]
-                    s = s + v
-                    squares = squares + wp.cw_mul(v, v)
-                    products = products + v * own[0, r, x]
+                s, squares, products = of_column(own, shown, o, y, x)
                 sums[i, column - left + half, 0] = s
                 sums[i, column - left + half, 1] = squares
                 sums[i, column - left + half, 2] = products
             last = o + 1 == shown.shape[0] or others.sides[o] != others.sides[wp.min(o + 1, shown.shape[0] - 1)]
             for x in range(left, right):
-                s = lanes(0.0)
-                squares = lanes(0.0)
-                products = lanes(0.0)
-                for k in range(wp.static(2 * half + 1)):
-                    s = s + sums[i, x - left + k, 0]
-                    squares = squares + sums[i, x - left + k, 1]
-                    products = products + sums[i, x - left + k, 2]
-                mean = s * part
-                spread = roots(greater_of(squares * part - wp.cw_mul(mean, mean), lanes(0.0)) + lanes(noise * noise))
-                alike = wp.cw_div(products * part - mean * own[1, y, x], spread * own[2, y, x])
+                alike = correlation(own, sums, i, x - left, y, x, noise)
                 z = on_axis(others, o, 2, x, y, chunk)
                 u = on_axis(others, o, 0, x, y, chunk) + 0.5 * z
                 v = on_axis(others, o, 1, x, y, chunk) + 0.5 * z
