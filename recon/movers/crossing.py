@@ -17,7 +17,7 @@ import torch
 from recon.movers.sighting import BEFORE, DISTANCES, STANDING, Sighting, base_row, beside, outline, shown_at
 from recon.seeds.dense import FARTHEST, ground_depth
 from recon.seeds.stereo import WINDOW, Plate, box_means
-from recon.seeds.ways import unlike
+from recon.seeds.ways import at_rest, unlike
 from scenes.ground import Ground
 
 Sides = Sequence[Sequence[tuple[Plate, int]]]
@@ -75,12 +75,10 @@ def crossings(plate: Plate, time_us: int, sides: Sides, ground: Ground) -> list[
     sides = [side[:1] for side in sides]
     if not sides or np.linalg.norm(plate.axis()[:2]) < LEVEL:
         return []
-    still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
     deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
-    of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0]
-    depths = [[(other, np.zeros((STANDING[0], 3))) for other, _ in side] for side in sides]
+    of_ground = box_means(unlike(plate, at_rest(sides), slice(None), torch.from_numpy(deepest).float()))[0]
     inverse_depths = np.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0])
-    stands = torch.minimum(of_ground, box_means(unlike(plate, depths, slice(None), 1 / inverse_depths)).amin(0))
+    stands = torch.minimum(of_ground, box_means(unlike(plate, at_rest(sides, STANDING[0]), slice(None), 1 / inverse_depths)).amin(0))
     bases = np.array([base_row(plate, ground, z) for z in DISTANCES])
     costs = stands.numpy(), of_ground.numpy()
     found = [new for z, base in zip(DISTANCES[:-1], bases, strict=False) for new in _at(plate, time_us, sides, float(z), base, *costs)]

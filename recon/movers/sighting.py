@@ -20,7 +20,7 @@ from scipy import ndimage
 from recon.movers.boxing import CAR
 from recon.seeds.dense import FARTHEST, ground_depth
 from recon.seeds.stereo import WINDOW, Plate, box_means
-from recon.seeds.ways import unlike
+from recon.seeds.ways import at_rest, unlike
 from scenes.ground import Ground
 
 DISTANCES = 4.5 * 1.09 ** np.arange(27)
@@ -146,12 +146,10 @@ def sightings(
     if not sides:
         return []
     eye, speeds = plate.eye(), np.arange(-ONCOMING, pace + PASSING, 1.0)
-    still = [[(other, np.zeros((1, 3))) for other, _ in side] for side in sides]
     deepest = np.minimum(ground_depth(plate, ground, 0.0), FARTHEST)
     inverse_depths = torch.linspace(1 / STANDING[1][1], 1 / STANDING[1][0], STANDING[0])
-    depths = [[(other, np.zeros((STANDING[0], 3))) for other, _ in side] for side in sides]
-    standing = box_means(unlike(plate, depths, slice(None), 1 / inverse_depths.double().numpy()))
-    of_ground = box_means(unlike(plate, still, slice(None), torch.from_numpy(deepest).float()))[0].numpy()
+    standing = box_means(unlike(plate, at_rest(sides, STANDING[0]), slice(None), 1 / inverse_depths.double().numpy()))
+    of_ground = box_means(unlike(plate, at_rest(sides), slice(None), torch.from_numpy(deepest).float()))[0].numpy()
     found = []
     for z in DISTANCES:
         base = base_row(plate, ground, z)

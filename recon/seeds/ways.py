@@ -18,6 +18,11 @@ NEAREST = 0.5
 """Metres before another picture from which on it may show a place."""
 
 
+def at_rest(sides: Sequence[Sequence[tuple[Plate, int]]], count: int = 1) -> list[list[tuple[Plate, np.ndarray]]]:
+    """Others and when they were taken, as `unlike` takes them for what stands still, at so many depths."""
+    return [[(other, np.zeros((count, 3))) for other, _ in side] for side in sides]
+
+
 def unlike(
     plate: Plate, sides: Sequence[Sequence[tuple[Plate, np.ndarray]]], rows: slice, depth: float | np.ndarray | torch.Tensor
 ) -> torch.Tensor:
