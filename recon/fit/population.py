@@ -44,8 +44,8 @@ class Population:
         self.device = splats.reach.device
         self.splats, self.motion, self.config = splats, motion, config
         self.nearest = nearest
-        self.veils = veils
-        self.swept, self.clear, self.flat_ground, self.ground = swept.to(self.device), clear, ground, ground.ground
+        self.swept, self.clear, self.veils = swept.to(self.device), clear, veils
+        self.flat_ground, self.ground = ground, ground.ground
         self.growth, self.descent = Growth.none(len(splats), self.device), Descent.begin(splats)
         self.guessed: torch.Tensor | None = None
 

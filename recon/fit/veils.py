@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from recon.fit.model import Splats
 from recon.ground import above_ground
 from recon.log import Track
-from recon.objects.actors import CORNERS
+from recon.seeds.points import nearest_box
+from recon.views.project import project
 from scenes.camera import Camera
 from scenes.ground import Ground
 from scenes.poses import inverse
@@ -31,63 +33,44 @@ things, too."""
 
 
 @dataclass(frozen=True)
-class Veiled:
-    """A picture's camera, and of boxes that it shows the rectangles `[B, 4]` in its pixels, left, top, right and bottom, and how near
-    `[B]` they are, in metres."""
-
-    camera: Camera
-    rectangles: torch.Tensor
-    near: torch.Tensor
-
-
-@dataclass(frozen=True)
 class Veils:
-    """Pictures of what moves over a ground."""
+    """Pictures' cameras, those that show `tracks` of what moves within `FAR` and the others, and a ground."""
 
-    pictures: Sequence[Veiled]
+    showing: Sequence[Camera]
+    others: Sequence[Camera]
+    tracks: list[Track]
     ground: Ground
 
     @staticmethod
     def of(cameras: Sequence[Camera], tracks: Sequence[Track], ground: Ground) -> Veils:
         """Of pictures' cameras, and what moves."""
-        pictures = [_veiled(camera, [t for t in tracks if t.moving]) for camera in cameras]
-        return Veils(pictures if any(len(p.near) for p in pictures) else [], ground)
+        moving = [track for track in tracks if track.moving]
+        shows = [bool((nearest_box(camera, moving) < FAR).any()) for camera in cameras]
+        showing, others = ([c for c, there in zip(cameras, shows, strict=True) if there == asked] for asked in (True, False))
+        return Veils(showing, others, moving, ground)
 
     def holds(self, splats: Splats) -> torch.Tensor:
         """Mask `[N]` of the splats of the background that hang before boxes."""
-        mask, means = torch.zeros_like(splats.reach, dtype=torch.bool), splats.fields["means"][: splats.sizes[0]].detach()
-        if not self.pictures:
+        mask = torch.zeros_like(splats.reach, dtype=torch.bool)
+        if not self.showing:
             return mask
-        high = torch.from_numpy(above_ground(means.double().cpu().numpy(), self.ground) > ABOVE).to(means.device).nonzero()[:, 0]
-        points = means[high]
-        shown, before = torch.zeros(2, len(points), device=points.device)
-        for picture in self.pictures:
-            camera, back = picture.camera, inverse(picture.camera.world_from_cam).to(points)
-            local = points @ back[:3, :3].T + back[:3, 3]
-            asked = ((local[:, 2] > 0) & (local[:, 2] < 2 * FAR)).nonzero()[:, 0]  # from farther off it is hardly seen
-            (x, y), z = camera.lens.project(local[asked]).unbind(1), local[asked, 2]
-            inside = (x > 0) & (y > 0) & (x < camera.width) & (y < camera.height)
-            veils = torch.zeros_like(inside)
-            for (left, top, right, bottom), away in zip(picture.rectangles.tolist(), picture.near.tolist(), strict=True):
-                veils |= (x > left) & (x < right) & (y > top) & (y < bottom) & (z < away - AHEAD[0] - AHEAD[1] * away)
-            large = inside / z.clamp_min(AHEAD[0]).square()
-            shown[asked] += large
-            before[asked] += large * veils
-        mask[high] = before > PART * shown
+        means = splats.fields["means"][: splats.sizes[0]].detach().double().cpu().numpy()
+        high = np.flatnonzero(above_ground(means, self.ground) > ABOVE)
+        shown, before = np.zeros((2, len(high)))
+        for camera in self.showing:
+            row, column, away, large = _seen(means[high], camera)
+            near = nearest_box(camera, self.tracks)[row, column]
+            shown += large
+            before += large * ((near < FAR) & (away < near * (1 - AHEAD[1]) - AHEAD[0]))
+        some = before > 0
+        high, shown, before = high[some], shown[some], before[some]
+        for camera in self.others:
+            shown += _seen(means[high], camera)[3]
+        mask[torch.from_numpy(high[before > PART * shown]).to(mask.device)] = True
         return mask
 
 
-def _veiled(camera: Camera, tracks: Sequence[Track]) -> Veiled:
-    rectangles, near = [], []
-    back = inverse(camera.world_from_cam)
-    for track in tracks:
-        path = track.trajectory()
-        if not path.covers(camera.time_us):
-            continue
-        pose = (back @ path.at(camera.time_us)).numpy()
-        corners = torch.from_numpy(CORNERS * track.size @ pose[:3, :3].T + pose[:3, 3])
-        if 0 < corners[:, 2].min() < FAR:
-            pixels = camera.lens.project(corners)
-            rectangles.append(torch.cat([pixels.amin(0), pixels.amax(0)]))
-            near.append(float(corners[:, 2].min()))
-    return Veiled(camera, torch.stack(rectangles) if rectangles else torch.zeros(0, 4), torch.tensor(near))
+def _seen(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column and depth of points `[N, 3]` in a picture, and how large each is there, by its nearness squared; 0 where hardly seen."""
+    row, column, away, inside = project(points, inverse(camera.world_from_cam).numpy(), camera)
+    return row, column, away, (inside & (away < 2 * FAR)) / np.maximum(away, AHEAD[0]) ** 2

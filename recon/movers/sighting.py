@@ -71,7 +71,6 @@ CLIMB = 3
 APART = 0.6
 """Of a rear's width: two things in a picture are that far apart at least."""
 
-
 CLEAR, ALIKE, ONE = 0.5, 5.0, 1.3
 """Two sightings are of one car where the nearer one looks at least so many times as much more alike as the other, their speeds differ by so
 many m/s at most, and they are so many of its lengths and widths apart."""

@@ -70,4 +70,4 @@ def test_near_pictures_say_more_than_far_ones():
 
 
 def test_without_movers_nothing_is_asked():
-    assert Veils.of(cameras(0.0, 1.0), [], FLAT).pictures == []
+    assert Veils.of(cameras(0.0, 1.0), [], FLAT).showing == []

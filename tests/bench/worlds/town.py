@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -51,12 +52,14 @@ class Street:
 
         return Street(way, chance.uniform(4.2, 7.0), height, -1 if chance.random() < 0.7 else 1)
 
+    @cached_property
+    def _forth(self) -> np.ndarray:
+        return np.gradient(self.way, axis=0)
+
     def at(self, metres: float, left: float) -> torch.Tensor:
         """The pose on the ground that looks along the way, so far along it and to its left, `[4, 4]`."""
         k = (metres - LOW) / PIECE
-        (x, y), (dx, dy) = (
-            [float(np.interp(k, np.arange(len(self.way)), v[:, i])) for i in (0, 1)] for v in (self.way, np.gradient(self.way, axis=0))
-        )
+        (x, y), (dx, dy) = ([float(np.interp(k, np.arange(len(self.way)), v[:, i])) for i in (0, 1)] for v in (self.way, self._forth))
         return stood(translation(x, y) @ turn(math.atan2(dy, dx)) @ translation(0, left), self.height)
 
     def points(self, first: float, last: float, left: float) -> list[tuple[float, float]]:
