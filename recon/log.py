@@ -104,12 +104,17 @@ class Sweep:
     read: Callable[[], LidarPoints] = field(repr=False)
 
 
+ANNOTATED = 0.05
+"""Metres by which boxes are off that somebody drew, or lidar tells."""
+
+
 @dataclass(frozen=True)
 class Track:
     """An annotated box over time. The box frame has its origin at the base centre, x forward, z up; `size` is length, width, height.
 
     `name` is `veh_3`, `ped_1`, ...: numbered by nearness to the ego; `label` is the class as a slug ("car"); `sensor` `[T]` is the
-    lidar that saw it, -1 where the log does not say; `sources` are the log's own identifiers of the tracks merged here.
+    lidar that saw it, -1 where the log does not say; `sources` are the log's own identifiers of the tracks merged here; `off` are the
+    metres by which its places may be wrong.
     """
 
     name: str
@@ -120,6 +125,7 @@ class Track:
     world_from_box: torch.Tensor
     sensor: np.ndarray
     sources: tuple[str, ...]
+    off: float = ANNOTATED
 
     def part(self, kept: np.ndarray) -> Track:
         """The track with these of its boxes only: indices, or bool `[T]`."""

@@ -20,8 +20,9 @@ from scenes.lenses import OpenCV, Pinhole
 from scenes.poses import inverse, small_poses
 from scenes.trajectory import Trajectory
 
-EGO, EXTRINSIC, ACTOR = (1e-3, 1e-2), (1e-3, 1e-3), (1e-2, 5e-2)
-"""Radians and metres of one unit of a correction of the body's poses, a camera's mount, an actor's poses: the errors of recorded logs."""
+EGO, EXTRINSIC, TURNED = (1e-3, 1e-2), (1e-3, 1e-3), 1e-2
+"""Radians and metres of one unit of a correction of the body's poses and a camera's mount, and radians of one of an actor's poses, whose
+metres its track tells: the errors of recorded logs."""
 
 REFINED = ("body", "mounts", "clocks", "actors")
 """What can be corrected: the body's path, how cameras are fixed to it, when they took their pictures, and the actors' paths."""
@@ -110,7 +111,8 @@ class Motion:
         first, last = torch.from_numpy(self._first[:-1]), torch.from_numpy(self._first[1:] - 1)
         knots, shares = torch.stack([first + knot, torch.minimum(first + knot + 1, last)], 1), share.float()[..., None]
         drifts = torch.stack([drift(knots, times) for knots in all_knots], 1)
-        units = torch.tensor([[unit[0]] * 3 + [unit[1]] * 3 for unit in (EGO, *[ACTOR] * len(actors))])
+        self.units = [(TURNED, t.off) for t in tracks]
+        units = torch.tensor([[turn] * 3 + [metres] * 3 for turn, metres in (EGO, *self.units)])
         radii = np.array([0.0, *(np.linalg.norm(box) for box in boxes)])
         self._speeds = drifts[:, 0, 3:].norm(dim=1) * (1e6 / CLOCK_US)
         self._around = []
@@ -213,7 +215,7 @@ class Motion:
         """An actor's corrected trajectory."""
         first, last = self._first[actor + 1 : actor + 3] - self._first[1]
         self.actors[actor].deltas = self.paths[first:last].detach()
-        return self.actors[actor].corrected(*ACTOR)
+        return self.actors[actor].corrected(*self.units[actor])
 
     def mounted(self, camera: int, times_us: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
         """A camera's corrected `body_from_cam`, and when it took its pictures of these times, int64 us."""

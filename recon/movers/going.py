@@ -32,6 +32,10 @@ BEYOND_US = 700_000
 LONGEST_US = 3_000_000
 """How long at most, where it is beside us or a border cuts it."""
 
+TOLD = 0.25
+"""Metres by which a fit takes places to be off that pictures alone tell: places are off by several times that, but each picture of a fit
+moves them by as much as all do in tenths of it."""
+
 HIGH = 1.55
 """Metres up of a car, whose sizes all are taken to have: before a street that is far away nobody sees where its roof ends."""
 
@@ -66,7 +70,7 @@ def while_there(label: str, size: np.ndarray, stamps: np.ndarray, poses: torch.T
     gone = np.flatnonzero(~there)
     kept = slice(gone[gone < first].max(initial=-1) + 1, gone[gone > last].min(initial=len(stamps)))
     where = f"seen at {poses[kept][0, :3, 3].numpy().round(1).tolist()}"
-    return Track("", label, True, size, stamps[kept], poses[kept], np.full(len(stamps[kept]), -1), (where,))
+    return Track("", label, True, size, stamps[kept], poses[kept], np.full(len(stamps[kept]), -1), (where,), TOLD)
 
 
 def _in_lane(thing: Sequence[Sighting], eyes: np.ndarray, stamps: np.ndarray, lane: Lane) -> np.ndarray:

@@ -28,6 +28,9 @@ REACH = 100.0
 LOOKS = 8
 """Moments at which the truth is looked at, evenly along the drive, or up to twice as many."""
 
+CLOSED_IN = 3.0
+"""Metres within which half of a picture shows something where the camera is in it: in a car that comes, say, on whose lane we are then."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -63,7 +66,7 @@ def recorded(place: Place, names: Sequence[str], folder: Path) -> Log:
 
 def looks(place: Place, name: str, folder: Path, held_out: list[int]) -> Iterator[tuple[tuple[float, float], int, Truth]]:
     """How far aside and up, the frame's index, and what a camera would see from there, at `LOOKS` of the frames that no fit sees: all at
-    once, at the middle row's moment, as scenes' cameras do."""
+    once, at the middle row's moment, as scenes' cameras do. From within something nothing is looked at."""
     camera = replace(place.rig[name], shutter="global", readout_us=0)
     moments = camera.times_us + place.rig[name].readout_us // 2
     some = held_out[:: max(1, len(held_out) // LOOKS)]
@@ -71,7 +74,9 @@ def looks(place: Place, name: str, folder: Path, held_out: list[int]) -> Iterato
         path = place.ego.shifted(lateral=left, vertical=up)
         for i in some:
             view = camera.along(path, int(moments[i]))
-            yield (left, up), i, _truth(place, view, folder / f"{name}_{i:03d}_{left:+g}_{up:+g}")
+            truth = _truth(place, view, folder / f"{name}_{i:03d}_{left:+g}_{up:+g}")
+            if truth.depth.median() > CLOSED_IN:
+                yield (left, up), i, truth
 
 
 def _picture(place: Place, view: Camera, file: Path) -> Path:
