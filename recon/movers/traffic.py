@@ -76,8 +76,7 @@ have, in which that must be."""
 
 
 def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
-    """What moves along the street, or crosses it, in the training pictures of the first camera of `frames`, as tracks at their moments,
-    and at those of pictures before the first and after the last of them.
+    """What moves along the street, or crosses it, in the training pictures of the first camera of `frames`, as tracks at their moments.
 
     Nothing where pictures do not follow one another soon (`GAPS_US`), or the recording car never goes, and nobody knows where the street
     leads.
@@ -86,12 +85,7 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
     path = way_of(log.ego.world_from_body[:, :3, 3].numpy())
     if len(path) < 2 or len(views) < FEWEST:
         return ()
-    # what is there in the first picture that is fitted is there in those before it, too, and is not to pop up in a clip
-    ends = [v for v in frames.of(0, held_out=True) if not views[0].time_us < v.time_us < views[-1].time_us]
-    every = sorted([*views, *ends], key=lambda v: v.time_us)
-    stamps, of_every = np.array([v.time_us for v in every]), [plate_of(v.image, frames.camera(log, v)) for v in every]
-    fitted = [i for i, v in enumerate(every) if not v.held_out]
-    times, plates = stamps[fitted], [of_every[i] for i in fitted]
+    times, plates = np.array([v.time_us for v in views]), [plate_of(v.image, frames.camera(log, v)) for v in views]
     eyes = np.array([p.eye()[:2] for p in plates])
     paces = np.linalg.norm(np.gradient(eyes, times / 1e6, axis=0), axis=1)
 
@@ -105,8 +99,8 @@ def traffic(log: Log, frames: Frames, ground: Ground) -> tuple[Track, ...]:
             seen.append(found)
             steps.step()
     going, across = ([found[kind] for found in seen] for kind in (0, 1))
-    along_lane = boxes(going, stamps, of_every, Lane(log.ego), ground)
-    return named(apart([*along_lane, *crossed(across, stamps, of_every, ground)]), log.ego)
+    along_lane = boxes(going, times, plates, Lane(log.ego), ground)
+    return named(apart([*along_lane, *crossed(across, times, plates, ground)]), log.ego)
 
 
 def spaced(views: Sequence[View]) -> list[View]:
@@ -128,8 +122,8 @@ def way_of(places: np.ndarray) -> np.ndarray:
 
 
 def boxes(seen: list[list[Sighting]], times: np.ndarray, plates: Sequence[Plate], lane: Lane, ground: Ground) -> list[Track]:
-    """Tracks of what was `seen` going along a lane, at the `times` `[T]` of pictures, `plates`: those that were looked at and any others.
-    What is clearest comes first, and is told more of by what else was followed of it."""
+    """Tracks of what was `seen` going along a lane, at the `times` `[T]` of pictures, `plates`. What is clearest comes first, and is told
+    more of by what else was followed of it."""
     made: list[tuple[list[Sighting], Track]] = []
     for thing in sorted((f for f in follow(seen) if believed(f, times)), key=lambda f: -sum(s.worth for s in f)):
         track = boxed(thing, times, plates, lane, ground)

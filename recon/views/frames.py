@@ -35,8 +35,8 @@ def check_size(size: tuple[int, int]) -> None:
 class Frames:
     """The views of a fit, those of camera `names[c]` of width and height `sizes[c]`. Every `held_out`th of each takes no part.
 
-    From the first on (0, 8, ...), or, where poses come from the pictures, from the middle of the eight (4, 12, ...): what the first one
-    shows at its edges, no other one does.
+    Those are 8, 16, ..., or, where poses come from the pictures, 4, 12, ..., but neither the first nor the last of a span: what these show
+    at their edges, no other one does, and a clip begins and ends with them. Of a span that has none of those it is the middle one.
     """
 
     names: list[str]
@@ -92,7 +92,7 @@ def load_frames(
 
     `report` is called after each. Photos of a log without lidar are brought to one exposure (`balanced`); where lidar tells that a
     camera's exposure follows the light, its views say their `gain`, if `gains` are asked for. Raises ValueError where a camera has no
-    frame left to train on, or a file does not decode.
+    frame in the span, or a file does not decode.
     """
     first = held_out // 2 if log.points is not None else 0
     sizes = [size_like(log.camera(name), log.camera(names[0]), size) for name in names]
@@ -105,11 +105,13 @@ def load_frames(
             images[i] = torch.from_numpy(camera.image(i, *sizes[c]).copy())
             report()
         ego = _ego(log, camera, images, sizes[c])
+        if not chosen:
+            raise ValueError(f"camera {name} has no frame in the chosen span: none of its {len(camera)} lies there; choose a longer one")
+        unseen = [i for i in chosen[1:-1] if i % held_out == first] if held_out > 0 else []
+        if 0 < held_out <= len(chosen) and not unseen:
+            unseen = [chosen[len(chosen) // 2]]
         for i, image in images.items():
-            views.append(View(c, i, int(camera.times_us[i]), image, held_out > 0 and i % held_out == first, coarse_sky(image, ego), ego))
-        if not any(v.camera == c and not v.held_out for v in views):
-            there = f"{len(chosen)} of its {len(camera)} lie there" + (f", held out as one of every {held_out}" if chosen else "")
-            raise ValueError(f"camera {name} has no frame to train on in the chosen span: {there}; choose a longer one")
+            views.append(View(c, i, int(camera.times_us[i]), image, i in unseen, coarse_sky(image, ego), ego))
     views = under_their_sky(log, names, views, log.points)
     if log.points is not None:
         views = balanced(log, names, views)

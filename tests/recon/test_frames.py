@@ -173,11 +173,21 @@ def test_a_camera_of_sixteen_bits_of_grey_is_seen_as_one_of_eight():
     assert np.array_equal(camera.image(0), np.repeat(eight[..., None], 3, 2))
 
 
-def test_a_span_of_one_frame_that_is_held_out_is_refused_saying_so(drive):
+@pytest.mark.parametrize(
+    ("every", "frames", "unseen"),
+    [(4, 8, [4]), (2, 8, [2, 4, 6]), (8, 8, [4]), (4, 5, [2]), (4, 4, [2]), (4, 3, []), (4, 1, []), (0, 8, [])],
+)
+def test_a_clip_begins_and_ends_with_frames_that_are_fitted(drive, every, frames, unseen):
     log = open_log(drive)
-    time = int(log.camera("front_camera").times_us[0])
-    with pytest.raises(ValueError, match="1 of its 8 lie there, held out as one of every 8; choose a longer one"):
-        load_frames(log, ["front_camera"], (time, time), (96, 54), 8)
+    times = log.camera("front_camera").times_us
+    views = load_frames(log, ["front_camera"], (int(times[0]), int(times[frames - 1])), (96, 54), every).views
+    assert len(views) == frames and [v.index for v in views if v.held_out] == unseen
+
+
+def test_a_span_without_a_frame_is_refused_saying_so(drive):
+    log = open_log(drive)
+    with pytest.raises(ValueError, match="front_camera has no frame in the chosen span: none of its 8 lies there; choose a longer one"):
+        load_frames(log, ["front_camera"], (-9, -1), (96, 54), 8)
 
 
 def test_cameras_of_other_proportions_keep_them():

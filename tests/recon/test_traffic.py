@@ -283,14 +283,3 @@ def test_a_way_is_as_fast_as_it_is_told_where_places_are_unsure():
     speeds = np.tile([5.0, 0.0], (11, 1)), np.array([0.3, 0.3])
     assert np.abs(smoothed(times, seen, times, told, speeds) - true).max() < 0.1
     assert np.abs(smoothed(times, seen, times, told) - true).max() > 0.8
-
-
-def test_what_the_first_fitted_picture_shows_is_there_in_the_one_before_it():
-    """Every eighth picture is held out, the first among them: a clip begins with it, and cars would pop up in its second one."""
-    (track,) = found(lambda seconds: (9 + 7.5 * seconds, -0.5 + seconds * 7.5 / 12))
-    log = drive(STEPS, ("front",), rears=())
-    frames = load_frames(log, ["front"], (0, 10**18), SIZE, 8)
-    first = min(v.time_us for v in frames.views)
-    assert first < min(v.time_us for v in frames.of(0)) and track.times_us[0] == first
-    went = (track.world_from_box[1, 0, 3] - track.world_from_box[0, 0, 3]) / ((track.times_us[1] - track.times_us[0]) * 1e-6)
-    assert abs(float(went) - 7.5) < 2.0
