@@ -32,9 +32,9 @@ BEYOND_US = 700_000
 LONGEST_US = 3_000_000
 """How long at most, where it is beside us or a border cuts it."""
 
-TOLD = 0.25
-"""Metres by which a fit takes places to be off that pictures alone tell: places are off by several times that, but each picture of a fit
-moves them by as much as all do in tenths of it."""
+TOLD = 0.12
+"""Metres by which a fit takes places to be off that pictures alone tell. They are off by several times that along the line of sight, where
+nothing shows it but a car that does not look the same in all pictures; twice as far cars looked more alike, but lost their shape."""
 
 HIGH = 1.55
 """Metres up of a car, whose sizes all are taken to have: before a street that is far away nobody sees where its roof ends."""
