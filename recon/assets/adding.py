@@ -8,6 +8,7 @@ from shlex import quote
 
 import torch
 
+from recon.assets.backwards import backwards
 from recon.assets.extract import moved, thumbnail
 from recon.assets.mesh_files import read_mesh, turn_to_asset
 from recon.assets.meshes import MeshFit, asset_of_mesh
@@ -34,6 +35,9 @@ THINNEST = 1e-3
 OFF = 0.12
 """Part of an asset's size by which its splats' box may differ from it before it counts as misplaced."""
 
+BACKWARDS = "has red lamps in front and none behind: it seems to face backwards"
+"""What is said of an asset that does."""
+
 
 def add_mesh(
     databank: Path, file: Path, label: str, scale: float | None, up: str | None, forward: str | None, share: dict, force: bool = False,
@@ -51,7 +55,7 @@ def add_mesh(
         asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
     id = bank.add(asset, thumbnail(asset))
     likeness = f"{asset.meta['psnr_unseen_whole_picture']:.1f} dB (over its own pixels {asset.meta['psnr_unseen']:.1f} dB)"
-    return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views"
+    return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views{_facing(asset, forward or 'z')}"
 
 
 def add_splats(
@@ -84,7 +88,7 @@ def add_splats(
     )
     _check_size(file, label, asset.size.tolist(), scale or metres, force)
     _check_upright(file, label, _solid(asset), up, force)
-    return Databank(databank).add(asset, thumbnail(asset)), _told(asset)
+    return Databank(databank).add(asset, thumbnail(asset)), _told(asset) + _facing(asset, forward)
 
 
 def own_axes(file: Path) -> tuple[str, str, float]:
@@ -149,6 +153,8 @@ def check_databank(path: Path) -> list[str]:
             continue  # said above
         if misplaced := _misplaced(asset):
             problems.append(f"{entry.id} {misplaced}")
+        if backwards(asset):
+            problems.append(f"{entry.id} {BACKWARDS}: add it anew with the other --forward, if it does")
     return problems
 
 
@@ -184,10 +190,18 @@ def _check_size(file: Path, label: str, size: list[float], scale: float, force: 
 
 def _check_upright(file: Path, label: str, points: torch.Tensor, up: str, force: bool) -> None:
     if not force and overturned(label, points):
-        other = up[1:] if up.startswith("-") else f"-{up}"
         raise ValueError(
-            f"{file} is longer above than below, so it seems to stand on its head; give --up={other}, or --force to keep it so"
+            f"{file} is longer above than below, so it seems to stand on its head; give --up={_opposite(up)}, or --force to keep it so"
         )
+
+
+def _opposite(axis: str) -> str:
+    return axis[1:] if axis.startswith("-") else f"-{axis}"
+
+
+def _facing(asset: Asset, forward: str) -> str:
+    """What to do about an asset, made with that axis of its file ahead, that seems to face backwards; '' of others."""
+    return f"; it {BACKWARDS}; if it does, add it with --forward={_opposite(forward)}" if backwards(asset) else ""
 
 
 def _told(asset: Asset) -> str:

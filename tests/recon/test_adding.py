@@ -8,8 +8,10 @@ from street import box, car, street
 
 from recon.assets import adding
 from recon.assets.adding import add_splats, check_databank, holds_splats, turned_upright
+from recon.assets.backwards import backwards
 from recon.assets.overturned import overturned
 from scenes import Asset, Databank, Gaussians, save
+from scenes.harmonics import sh_from_rgb
 from scenes.poses import matrix_from_quat
 from scenes.sizes import SIZES, odd_size
 
@@ -203,3 +205,34 @@ def test_what_is_longer_above_than_below_is_overturned_however_large(metres):
     turned = cone * torch.tensor([1.0, 1.0, -1.0])
     assert overturned("cone", turned) and not overturned("cone", cone) and not overturned("truck", turned)
     assert not overturned("cone", cone[:0])
+
+
+def lamped(body=(0.7, 0.7, 0.7), rear=1.0) -> Gaussians:
+    """A car's sides and ends, with two red lamps at the end behind, or, where `rear` is -1, in front."""
+    points = torch.rand(8000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.2, 1.8, 1.5]) - torch.tensor([2.1, 0.9, 0.0])
+    rgb = torch.tensor(body).repeat(len(points), 1)
+    lamps = (points[:, 0] * -rear > 1.95) & (points[:, 1].abs() > 0.6) & ((points[:, 2] - 0.8).abs() < 0.15)
+    rgb[lamps] = torch.tensor([0.7, 0.05, 0.05])
+    splats = gaussians(len(points))
+    return replace(splats, means=points, sh=sh_from_rgb(rgb)[:, None], logit_opacities=torch.full((len(points),), 3.0))
+
+
+def test_a_vehicle_with_red_lamps_in_front_is_told_to_face_backwards(tmp_path):
+    bank = Databank(tmp_path / "bank")
+    for name, rear in (("ahead", 1.0), ("back", -1.0)):
+        save(lamped(rear=rear), tmp_path / f"{name}.ply")
+    _, said = add_splats(bank.path, tmp_path / "ahead.ply", "car", None, "z", "x", {})
+    assert "backwards" not in said and check_databank(bank.path) == []
+    id, said = add_splats(bank.path, tmp_path / "back.ply", "car", None, "z", "x", {})
+    assert "it seems to face backwards; if it does, add it with --forward=-x" in said
+    assert len(problems := check_databank(bank.path)) == 1 and problems[0].startswith(f"{id} has red lamps in front and none behind")
+    _, said = add_splats(bank.path, tmp_path / "back.ply", "car", None, "z", "-x", {})
+    assert "backwards" not in said
+
+
+def test_of_a_red_car_or_of_no_car_nobody_knows_which_way_it_faces():
+    size = torch.tensor([4.2, 1.8, 1.5])
+    assert backwards(Asset(lamped(rear=-1.0), size, "van"))
+    assert not backwards(Asset(lamped((0.6, 0.05, 0.05), rear=-1.0), size, "car"))
+    assert not backwards(Asset(lamped(rear=-1.0), size, "hydrant"))
+    assert not backwards(Asset(lamped(rear=-1.0).select(torch.arange(300)), size, "car"))
