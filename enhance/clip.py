@@ -114,7 +114,7 @@ def enhance_video(
     if like is not None:
         grade = Grade.read(like, clip.width)
         if grade.grey:
-            warn([f"{like} holds grey photos alone, so {out} is grey, too; give photos in colour to keep its own"])
+            warn([f"{like} holds grey photos alone, so {out} loses most of its colour; give photos in colour to keep its own"])
         enhancer = Graded(enhancer, grade)
     memory: Any = None
     done, changed, told = 0, 0, False

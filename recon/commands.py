@@ -115,7 +115,7 @@ class List:
         for e in entries:
             size = " x ".join(f"{v:.2f}" for v in e.size)
             print(f"{e.id:<20} {size:>18} m  {e.splats:>7} splats  {'?' if e.views is None else e.views:>4} views  {e.licence}")
-        print(f"{len(entries)} assets in {self.databank}")
+        print(f"{len(entries)} asset{'s' * (len(entries) != 1)} in {self.databank}")
 
 
 @dataclass

@@ -23,6 +23,9 @@ ELEVATION = math.radians(15)
 AWAY = 4.0
 """Distance of the camera from the middle, in halves of the diagonal of the splats' box."""
 
+REACH = 2.0
+"""Standard deviations that a splat in the middle of them takes up, on either side: a few large ones are larger than that box."""
+
 STRAY = 2.0
 """Percent of the splats, at either end of each axis, that the box leaves out."""
 
@@ -38,7 +41,8 @@ def around(thing: Asset | Gaussians, path: str, up: str = "z", model: SplatModel
     if not len(gaussians):
         raise ValueError(f"{path} is empty: it has no splats")
     low, high = np.percentile(gaussians.means.numpy().astype(np.float64) @ turn.T, [STRAY, 100 - STRAY], axis=0)
-    away = AWAY * max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    thick = REACH * float(gaussians.log_scales.max(1).values.double().median().exp())
+    away = AWAY * max(float(np.linalg.norm(high - low)) / 2, thick, 1e-3)
     turns = 2 * math.pi * np.arange(FRAMES + 1) / FRAMES
     level, height = away * math.cos(ELEVATION), away * math.sin(ELEVATION)
     places = (low + high) / 2 + np.stack([level * np.cos(turns), level * np.sin(turns), np.full_like(turns, height)], 1)

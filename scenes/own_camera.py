@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,9 @@ class Numbers:
         if (self.counts and (not isinstance(value, list) or len(value) not in self.counts)) or not all(map(self._right, values)):
             kind = "whole number" if self.whole else "number"
             what = f"a list of {' or '.join(map(str, self.counts))} {kind}s" if self.counts else f"a {kind}"
-            raise ValueError(f"{said} is {json.dumps(value)}, but it takes {what}, without units; write it as {self.example}")
+            meant = re.match(r"\s*(-?\d+(\.\d+)?)", value) if isinstance(value, str) and not self.counts else None
+            fix = meant[1] if meant else self.example
+            raise ValueError(f"{said} is {json.dumps(value)}, but it takes {what}, without units; write it as {fix}")
         if bad := [v for v in values if not self.least <= v <= self.most]:
             near = min(max(bad[0], self.least), self.most)
             raise ValueError(f"{said} is {json.dumps(value)}, but it can be from {self.least:g} to {self.most:g}; the nearest is {near:g}")

@@ -46,7 +46,7 @@ def parse_at(text: str) -> tuple[float, float]:
     """ "20m,-3.5m" as metres forward and left. ValueError with the fix otherwise."""
     parts = text.split(",")
     if len(parts) != 2:
-        raise ValueError(f'"{text}" is not a place; write metres forward and left of the recording car, as 20m,-3.5m')
+        raise ValueError(f'"{text}" is not a place; write metres forward and left, as 20m,-3.5m')
     return length(parts[0]), length(parts[1])
 
 

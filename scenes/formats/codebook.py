@@ -9,6 +9,9 @@ import numpy as np
 _ROUNDS = 12
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / the golden ratio, as Fibonacci hashing takes
 
+_NOTHING = 1e-12
+"""Below which a vector's value is 0: turned harmonics leave such for what was 0, and their squares would be, too."""
+
 
 def codebook(values: np.ndarray) -> np.ndarray:
     """float32 `[256]`, ascending: the numbers that stand for float32 `values` of any shape with little squared error (Lloyd 1982).
@@ -41,7 +44,7 @@ def palette(vectors: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
     widest axis until there are `largest` parts, and each part's mean stands for it (Wan, Wong and Prusinkiewicz 1988): about
     n d log(n) steps, where k-means takes n d times the number of parts, again and again.
     """
-    n = len(vectors)
+    vectors, n = np.where(np.abs(vectors) < _NOTHING, 0, vectors), len(vectors)
     keys = np.zeros(n, np.uint64)
     for column in np.ascontiguousarray(vectors, np.float32).view(np.uint32).T:  # alike vectors have alike sums, wrapping around
         keys = (keys ^ keys >> np.uint64(29)) * _ODD + column
@@ -49,7 +52,7 @@ def palette(vectors: np.ndarray, largest: int) -> tuple[np.ndarray, np.ndarray]:
     if len(first) <= largest:
         return vectors[first], labels
     heap = [_part(vectors, np.arange(n), 0)]
-    while len(heap) < largest:
+    while len(heap) < largest and heap[0][0] < 0:  # the others are alike, each in itself
         _, born, part, axis = heapq.heappop(heap)
         values = vectors[part, axis]
         above = values > values.mean(dtype=np.float64)

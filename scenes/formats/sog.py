@@ -113,7 +113,7 @@ def save_sog(path: str | os.PathLike, gaussians: Gaussians, antialias: bool = Fa
     with atomic_file(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
         for name, data in files.items():
             bundle.writestr(f"{name}.webp", data)
-        bundle.writestr("meta.json", json.dumps(meta))
+        bundle.writestr("meta.json", json.dumps(meta, allow_nan=False))
 
 
 def _read(path: Path, fetch: Callable[[str], bytes]) -> Gaussians:
@@ -183,6 +183,8 @@ def _table(path: Path, meta: dict, field: str) -> np.ndarray:
         values = [float(v) for v in about["codebook"]]
         if len(values) > 256:
             raise ValueError(f"{path} is corrupt: its {field} table has {len(values)} entries, a byte has 256")
+        if np.isnan(values).any():
+            raise ValueError(f"{path} is corrupt: entry {int(np.isnan(values).argmax())} of its {field} table is no number")
         with np.errstate(over="ignore"):
             return np.pad(np.array(values, np.float64), (0, 256 - len(values)), constant_values=np.nan).astype(np.float32)[:, None]
     ends = [about[end] if isinstance(about[end], list) else [about[end]] for end in ("mins", "maxs")]

@@ -14,7 +14,7 @@ from pxr import Sdf, Usd, UsdVol, Vt
 
 from scenes.alone import alone
 from scenes.asset import Actor
-from scenes.atomic import atomic_folder
+from scenes.atomic import atomic_folder, made_folder
 from scenes.deformation import Deformation
 from scenes.edit import Edit, bared, check_edit, ghosts
 from scenes.scene import Scene
@@ -148,7 +148,7 @@ def _write(scene: Path, name: str, meta: dict, files: Callable[[Path], None], au
     layer, folder = scene / "edits" / f"{name}.usda", scene / "edits" / name
     if layer.exists():
         raise FileExistsError(f"{scene} already has an edit {name}; choose another name")
-    layer.parent.mkdir(exist_ok=True)
+    made_folder(layer.parent)
     try:
         with atomic_folder(folder, replace=True) as partial:  # what stands there is left of an edit whose layer was deleted
             files(partial)

@@ -46,7 +46,7 @@ def test_what_goes_along_the_street_is_found_where_it_is(start, speed, left):
         return start + speed * seconds, left + seconds * speed / 12
 
     (track,) = found(rear)
-    off = misses(track, rear, CAR[0] / 2)[track.times_us > 0]  # the first picture is held out
+    off = misses(track, rear, CAR[0] / 2)
     path = track.trajectory()
     went = (path.at(1_000_000)[:2, 3] - path.at(500_000)[:2, 3]).numpy() / 0.5
     assert track.moving and track.label == "car" and len(track.times_us) > 8
@@ -84,7 +84,8 @@ def test_what_drifts_towards_us_comes_as_fast_as_it_is():
     path = track.trajectory()
     went = (path.at(1_000_000)[:2, 3] - path.at(400_000)[:2, 3]).numpy() / 0.6
     assert abs(went[0] + 9) < 1.0
-    assert np.median(np.abs(misses(track, front, CAR[0] / 2)[:, 1])) < 0.8  # a board has no flank
+    # a board has no flank, which is taken for the half of it that is farther from us
+    assert np.median(np.abs(misses(track, front, CAR[0] / 2)[:, 1])) < CAR[1] / 2
 
 
 def test_a_car_is_where_its_outline_says_whatever_of_it_is_seen():

@@ -1,8 +1,10 @@
 """Edits of actors: what they do to a scene in memory, and that their layers say the same to Sidestep and to USD."""
 
 import math
+import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -372,3 +374,10 @@ def test_a_replaced_actor_whose_unseen_side_recorded_cameras_see_is_said():
     told = meeting(Edit(replace={"veh_2": guessed}), busy())
     assert any("van/0001 is shown from its" in line and "is a guess" in line for line in told)
     assert not any("is a guess" in line for line in meeting(Edit(replace={"veh_2": VAN}), busy()))
+
+
+def test_putting_in_where_no_files_are_taken_says_so(saved, monkeypatch):
+    with monkeypatch.context() as context, pytest.raises(PermissionError, match="cannot write .*edits is not writable; give a folder"):
+        context.setattr(os, "access", lambda path, mode: Path(path) != saved / "edits")  # root may write anywhere
+        add_edit(saved, "new", [Actor(VAN, Trajectory(torch.tensor([0]), translation(9.0)[None]), "new")], {})
+    assert not list((saved / "edits").iterdir())

@@ -55,3 +55,13 @@ def test_whichever_axis_points_up_stands_upright_in_the_picture(up):
 def test_an_axis_that_is_none_is_refused():
     with pytest.raises(ValueError, match='--up "w" is not an axis'):
         around(gaussians(10), "a.ply", "w")
+
+
+@pytest.mark.parametrize("sigma", [0.01, 1.0])
+def test_one_splat_is_seen_from_outside_it(sigma):
+    one = Gaussians(
+        torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma).log(), torch.ones(1), torch.ones(1, 1, 3)
+    )
+    scene = around(one, "a.ply")
+    eye = scene.camera(CAMERA, 0).world_from_cam[:3, 3]
+    assert 3 * sigma < (eye - one.means[0]).norm() < 20 * sigma

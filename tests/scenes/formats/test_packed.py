@@ -4,6 +4,7 @@ import gzip
 import json
 import math
 import struct
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -200,6 +201,30 @@ def test_a_palette_stands_for_its_vectors_better_than_chance():
     repeated = vectors[dice.integers(200, size=5000)]
     sets, labels = palette(repeated, 256)
     assert len(sets) <= 200 and np.array_equal(sets[labels], repeated)
+
+
+def test_what_is_next_to_nothing_does_not_split_a_palette():
+    """Turned harmonics leave 1e-17 to 1e-40 for what was 0, no two alike: float32 squares of that are 0, and parts were split to none."""
+    chance = np.random.default_rng(0)
+    vectors = np.zeros((3000, 9), np.float32)
+    vectors[:, :3] = chance.normal(size=(60, 3))[chance.integers(0, 60, 3000)]
+    vectors[:, 3:] = 10.0 ** chance.uniform(-40, -17, (3000, 6)) * chance.choice([-1, 1], (3000, 6))
+    sets, labels = palette(vectors, 256)
+    assert len(sets) <= 256 and np.isfinite(sets).all() and np.abs(sets[labels] - vectors).max() < 1e-6
+
+
+def test_a_sog_whose_table_has_no_number_is_refused(tmp_path):
+    save(gaussians(50, 4), tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as whole, zipfile.ZipFile(tmp_path / "b.sog", "w") as damaged:
+        for name in whole.namelist():
+            data = whole.read(name)
+            meta = json.loads(data) if name == "meta.json" else {}
+            if meta:
+                meta["shN"]["codebook"][3] = math.nan
+                data = json.dumps(meta).encode()
+            damaged.writestr(name, data)
+    with pytest.raises(ValueError, match=r"b\.sog is corrupt: entry 3 of its shN table is no number"):
+        load(tmp_path / "b.sog")
 
 
 def test_a_codebook_holds_few_values_exactly_and_many_nearly():
