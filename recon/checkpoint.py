@@ -21,7 +21,7 @@ from scenes.lenses import LENSES
 from scenes.state import load_state, save_state
 from scenes.trajectory import Trajectory
 
-VERSION = 18
+VERSION = 19
 
 
 def checkpoint_path(output: Path) -> Path:
@@ -93,6 +93,7 @@ def plain_tracks(tracks: Sequence[Track]) -> list[dict]:
             "name": t.name, "label": t.label, "moving": t.moving,
             "size": torch.from_numpy(t.size), "times_us": torch.from_numpy(t.times_us),
             "world_from_box": t.world_from_box, "sensor": torch.from_numpy(np.asarray(t.sensor)), "sources": list(t.sources),
+            "off": t.off,
         }
         for t in tracks
     ]  # fmt: skip
@@ -103,7 +104,7 @@ def tracks_of(plain: Sequence[dict]) -> list[Track]:
     return [
         Track(
             t["name"], t["label"], t["moving"], t["size"].numpy(), t["times_us"].numpy(),
-            t["world_from_box"], t["sensor"].numpy(), tuple(t["sources"]),
+            t["world_from_box"], t["sensor"].numpy(), tuple(t["sources"]), t["off"],
         )
         for t in plain
     ]  # fmt: skip

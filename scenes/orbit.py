@@ -26,6 +26,9 @@ AWAY = 4.0
 REACH = 2.0
 """Standard deviations that a splat in the middle of them takes up, on either side: a few large ones are larger than that box."""
 
+HUGE = 60.0
+"""Logarithm of a size from which on nothing is taken for larger: a camera must have a place."""
+
 STRAY = 2.0
 """Percent of the splats, at either end of each axis, that the box leaves out."""
 
@@ -41,7 +44,7 @@ def around(thing: Asset | Gaussians, path: str, up: str = "z", model: SplatModel
     if not len(gaussians):
         raise ValueError(f"{path} is empty: it has no splats")
     low, high = np.percentile(gaussians.means.numpy().astype(np.float64) @ turn.T, [STRAY, 100 - STRAY], axis=0)
-    thick = REACH * float(gaussians.log_scales.max(1).values.double().median().exp())
+    thick = REACH * float(gaussians.log_scales.max(1).values.double().median().clamp_max(HUGE).exp())
     away = AWAY * max(float(np.linalg.norm(high - low)) / 2, thick, 1e-3)
     turns = 2 * math.pi * np.arange(FRAMES + 1) / FRAMES
     level, height = away * math.cos(ELEVATION), away * math.sin(ELEVATION)

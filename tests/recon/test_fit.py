@@ -102,6 +102,20 @@ def test_a_start_measures_what_moves_too_and_is_what_a_checkpoint_keeps(drive, t
     assert all(torch.equal(m.nan_to_num(), kept.measured[0].views[w].nan_to_num()) for w, m in depths.items())
 
 
+def test_a_fit_moves_boxes_by_what_they_may_be_off_and_goes_on_so(drive, tmp_path):
+    log = open_log(drive)
+    names, span = choose(log)
+    log = replace(log, tracks=tuple(replace(t, off=0.2) for t in log.tracks))
+    start, fit = begin(log, names, span, SIZE, CONFIG, 4)
+    assert [t.off for t in start.tracks] == [0.2]
+    before = fit.motion.trajectory(0).world_from_body
+    fit.motion.paths[:, 3] = 1.0  # forward
+    went = (before.inverse() @ fit.motion.trajectory(0).world_from_body)[:, :3, 3]
+    assert torch.allclose(went, torch.tensor([0.2, 0, 0], dtype=went.dtype).expand_as(went), atol=1e-6)
+    save_checkpoint(tmp_path / "scene.fit", {}, start, fit.tensors())
+    assert [t.off for t in load_checkpoint(tmp_path / "scene.fit", {})[0].tracks] == [0.2]
+
+
 def test_a_fit_goes_on_under_the_sky_that_it_began_with(drive, tmp_path):
     """What points of pictures told of it is not sought again."""
     log = open_log(drive)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from randomized import asset, gaussians
@@ -65,3 +67,5 @@ def test_one_splat_is_seen_from_outside_it(sigma):
     scene = around(one, "a.ply")
     eye = scene.camera(CAMERA, 0).world_from_cam[:3, 3]
     assert 3 * sigma < (eye - one.means[0]).norm() < 20 * sigma
+    endless = around(replace(one, log_scales=torch.full((1, 3), 800.0)), "a.ply")
+    assert endless.ego.world_from_body.isfinite().all()
