@@ -109,7 +109,7 @@ def test_a_fit_moves_boxes_by_what_they_may_be_off_and_goes_on_so(drive, tmp_pat
     start, fit = begin(log, names, span, SIZE, CONFIG, 4)
     assert [t.off for t in start.tracks] == [0.2]
     before = fit.motion.trajectory(0).world_from_body
-    fit.motion.paths[:, 3] = 1.0  # forward
+    fit.motion.paths.data[:, 3] = 1.0  # forward
     went = (before.inverse() @ fit.motion.trajectory(0).world_from_body)[:, :3, 3]
     assert torch.allclose(went, torch.tensor([0.2, 0, 0], dtype=went.dtype).expand_as(went), atol=1e-6)
     save_checkpoint(tmp_path / "scene.fit", {}, start, fit.tensors())
