@@ -37,7 +37,7 @@ class Fidelity:
     """The degree of harmonics before, where it is less now."""
 
     def __str__(self) -> str:
-        size = f"{self.splats} splats, {self.bytes / max(1, self.splats):.1f} bytes each"
+        size = f"{self.splats} splat{'s' * (self.splats != 1)}, {self.bytes / max(1, self.splats):.1f} bytes each"
         most = (
             f"{self.position:.2g} m, {self.rotation:.2g} deg, {self.scale:.2g} of scale, {self.opacity:.2g} of opacity, {self.sh:.2g} of SH"
         )
