@@ -36,10 +36,10 @@ SMALLEST, FEWEST = 20.0, 12
 AROUND_US = 600_000
 """Half the time whose mean is taken out of what a place shows: what is slower than a stride is no walk."""
 
-CLEAR, CHANCE = 1.25, 2.9
+CLEAR, CHANCE = 1.33, 2.9
 """How much more than the middle candidate the best must explain, and how much more than waves do of noise, to be believed; and it must
 not be at an end. Walkers of the tests come to 1.4 to 2.7 and 3.4 to 4.4, one of drive 002, behind cars and a hedge most of the time, to 1.7
-and 3.0, and who goes with stiff legs to 1.2 to 2.0 and 1.7 to 2.8."""
+and 3.0, and who goes with stiff legs to 1.2 to 2.2 and 1.7 to 3.3, but to one of both alone."""
 
 GRID = (10, 12)
 """Columns and rows of the places that are looked at, on a metre across and the lower `LEGS` of the height."""

@@ -18,7 +18,7 @@ SIZE = (96, 54)
 
 def made(drive, config=CONFIG):
     log = open_log(drive)
-    return begin(log, *choose(log), SIZE, config, held_out=4)[1]
+    return begin(log, *choose(log), SIZE, config, held_out=3)[1]
 
 
 def test_who_looks_changes_nothing(drive):
