@@ -36,7 +36,7 @@ class Frames:
     """The views of a fit, those of camera `names[c]` of width and height `sizes[c]`. Every `held_out`th of each takes no part.
 
     Those are 8, 16, ..., or, where poses come from the pictures, 4, 12, ..., but neither the first nor the last of a span: what these show
-    at their edges, no other one does, and a clip begins and ends with them. Of as many or more that have none of those it is the middle one.
+    at their edges, no other one does, and a clip begins and ends with them. Where a long one has none so, the middle one is.
     """
 
     names: list[str]
