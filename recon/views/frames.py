@@ -100,16 +100,14 @@ def load_frames(
     for c, name in enumerate(names):
         camera = log.camera(name)
         chosen = [i for i, t in enumerate(camera.times_us.tolist()) if span_us[0] <= t <= span_us[1]]
+        if not chosen:
+            raise ValueError(f"camera {name} has no frame in the chosen span: none of its {len(camera)} lies there; choose a longer one")
         images = {}
         for i in chosen:
             images[i] = torch.from_numpy(camera.image(i, *sizes[c]).copy())
             report()
         ego = _ego(log, camera, images, sizes[c])
-        if not chosen:
-            raise ValueError(f"camera {name} has no frame in the chosen span: none of its {len(camera)} lies there; choose a longer one")
-        unseen = [i for i in chosen[1:-1] if i % held_out == first] if held_out > 0 else []
-        if 0 < held_out <= len(chosen) and not unseen:
-            unseen = [chosen[len(chosen) // 2]]
+        unseen = _unseen(chosen, held_out, first)
         for i, image in images.items():
             views.append(View(c, i, int(camera.times_us[i]), image, i in unseen, coarse_sky(image, ego), ego))
     views = under_their_sky(log, names, views, log.points)
@@ -118,6 +116,14 @@ def load_frames(
     elif gains:
         views = exposed(log, names, views)
     return Frames(names, sizes, views)
+
+
+def _unseen(chosen: list[int], held_out: int, first: int) -> set[int]:
+    """Which of a camera's frames, rising indices, take no part (`Frames`): from `first` on every `held_out`th of those between the ends."""
+    if held_out <= 0:
+        return set()
+    middle = {chosen[len(chosen) // 2]} if len(chosen) >= held_out else set()
+    return {i for i in chosen[1:-1] if i % held_out == first} or middle
 
 
 def size_like(camera: LogCamera, first: LogCamera, size: tuple[int, int]) -> tuple[int, int]:
