@@ -45,14 +45,15 @@ def reconstruct(
     config: FitConfig | None = None,
     overwrite: bool = False,
     device: str = "cpu",
+    effort: float = 1.0,
 ) -> Scene:
     """Fit a scene to a log's images and write it to the folder `output`.
 
-    cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the first camera's
-    pictures that are fitted (`size_like` has the others'), `fit_size` where None; config: `fit_config` where None. Every `held_out`th
-    frame takes no part and is reported in `meta["held_out"]` and on stderr; neither does every `held_out`th lidar sweep, against which
-    the scene is measured on the path and beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a minute old;
-    `resume` goes on from it, with the same result as if it had never stopped.
+    cameras: the front ones where None. start_us, duration_us: the part of the drive. size: width and height of the first camera's pictures
+    that are fitted (`size_like` has the others'), `fit_size` where None; config: `fit_config` for that `effort` where None. Every
+    `held_out`th frame takes no part and is reported in `meta["held_out"]` and on stderr; neither does every `held_out`th lidar sweep,
+    against which the scene is measured on the path and beside it (`meta["off_path"]`). An interrupted fit leaves `<output>.fit`, at most a
+    minute old; `resume` goes on from it, with the same result as if it had never stopped.
     overwrite: an existing scene is replaced once the new one is whole. device: where the fit runs and what is reported is rendered; an
     interrupted fit may go on on another device.
 
@@ -65,7 +66,7 @@ def reconstruct(
     began = time.monotonic()
     names, span = choose(log, cameras, start_us, duration_us)
     check_path(log, span)
-    size, config = size or fit_size(log, names), config or fit_config(log, names, span)
+    size, config = size or fit_size(log, names), config or fit_config(log, names, span, effort)
     _check_fit_size(log, names[0], size)
     options = {"log": log.name, "cameras": names, "span_us": list(span), "size": list(size), "held_out": held_out}
     options["config"] = plain_config(config)

@@ -58,6 +58,8 @@ def _other(name: str, saved: Any, value: Any) -> str:
         if saved["scale"] == value["scale"]:
             return "another model of its pictures"
         return f"{saved['scale']:g} metres per unit of its model, not {value['scale']:g}"
+    if name == "config" and saved and saved | {key: value[key] for key in ("steps", "budget")} == value:
+        return "an --effort of {steps:,} steps and {budget:,} splats".format(**saved) + ", not {steps:,} and {budget:,}".format(**value)
     if name != "span_us" or saved is None:
         return f"{name} {saved!r}, not {value!r}"
     lasted, lasts = ((end - start) / 1e6 for start, end in (saved, value))

@@ -14,6 +14,7 @@ from scenes.opening import check_device
 from scenes.options import (
     AngleOrNone,
     Axis,
+    Effort,
     FitSize,
     Flag,
     FrontNames,
@@ -56,6 +57,8 @@ class Recon:
     """The scale of such a model instead: metres per unit."""
     angle_of_view: AngleOrNone = None
     """For photos or a video: horizontal field of view of the camera, as 58deg; estimated by default, which fails on a straight road."""
+    effort: Effort = 1.0
+    """Steps and splats, in multiples of what a drive of so many pictures gets by default: 0.3 for a quick look, 3 for a better scene."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     resume: Flag = False
@@ -81,7 +84,7 @@ class Recon:
             with stopped_saying(partial(resumed, checkpoint_path(self.output))):
                 reconstruct(
                     log, self.output, cameras=self.cameras, start_us=self.start, duration_us=self.duration,
-                    size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device,
+                    size=self.size, resume=self.resume, overwrite=self.overwrite, device=self.device, effort=self.effort,
                 )  # fmt: skip
 
 

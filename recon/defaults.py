@@ -21,7 +21,8 @@ steps and 338,000 splats, the 400 of five 4,800 and 450,000. With two fifths few
 as much in the fitted pictures as in those held out."""
 
 MOST = 6500, 650_000
-"""Steps and splats of any drive at most: a third more than five cameras of drive 002 get, whose fit takes twenty minutes."""
+"""Steps and splats of any drive at most, unless more effort is asked for: a third more than five cameras of drive 002 get, whose fit takes
+twenty minutes."""
 
 FEW, PER_PHOTO = (500, 30_000), (25, 2500)
 """Base and increment as `SHARED` and `PER_PICTURE`, for photos that were taken steps apart (`APART`), few of which show the same. Without
@@ -70,8 +71,8 @@ def fit_size(log: Log, names: Sequence[str]) -> tuple[int, int]:
     return round(camera.width * shrink), round(camera.height * shrink)
 
 
-def fit_config(log: Log, names: Sequence[str], span: tuple[int, int] | None = None) -> FitConfig:
-    """Steps and splats for the pictures of `span`, all where None: more for more pictures.
+def fit_config(log: Log, names: Sequence[str], span: tuple[int, int] | None = None, effort: float = 1.0) -> FitConfig:
+    """Steps and splats for the pictures of `span`, all where None: more for more pictures, and `effort` times as many of both.
 
     Photos that were taken steps apart (`APART`) are overfitted long before a drive's pictures are: view-dependent colours, and many more
     steps and splats than `PER_PHOTO` each, improve the photos and nothing between them. Leaving splats out by lot (`DROP`) does the
@@ -79,11 +80,10 @@ def fit_config(log: Log, names: Sequence[str], span: tuple[int, int] | None = No
     """
     first, last = span or choose(log, names)[1]
     pictures = sum(int(((t >= first) & (t <= last)).sum()) for t in (log.camera(name).times_us for name in names))
-    if _apart(log, names[0]) > APART:
-        steps, splats = (min(base + n * pictures, most) for base, n, most in zip(FEW, PER_PHOTO, MOST, strict=True))
-        return FitConfig(steps=steps, budget=splats, sh_degree=0, drop=DROP)
-    steps, splats = (min(base + n * pictures, most) for base, n, most in zip(SHARED, PER_PICTURE, MOST, strict=True))
-    return FitConfig(steps=steps, budget=splats)
+    apart = _apart(log, names[0]) > APART
+    bases, each = (FEW, PER_PHOTO) if apart else (SHARED, PER_PICTURE)
+    steps, splats = (round(effort * min(base + n * pictures, most)) for base, n, most in zip(bases, each, MOST, strict=True))
+    return FitConfig(steps=steps, budget=splats, sh_degree=0, drop=DROP) if apart else FitConfig(steps=steps, budget=splats)
 
 
 def _apart(log: Log, name: str) -> float:

@@ -62,6 +62,16 @@ def _ratio(text: str) -> float:
     return ratio
 
 
+def _effort(text: str) -> float:
+    try:
+        effort = float(text)
+    except ValueError:
+        effort = 0.0
+    if not 0.1 <= effort <= 100:
+        raise ValueError(f'"{text}" is not an effort; write a number from 0.1 to 100, where 1 is the default, as 2')
+    return effort
+
+
 def _of_track(text: str, parse: Callable[[str], Any], example: str) -> tuple[str, Any]:
     track, equals, value = text.partition("=")
     if not (track and equals and value):
@@ -82,6 +92,7 @@ def names(text: str) -> tuple[str, ...]:
 Lateral = Annotated[float | tuple[Keyframe, ...], written(parse_lateral, "LENGTH[@TIME,...]", "0m")]
 LengthOrNone = Annotated[float | None, written(units.length, "LENGTH", "none")]
 Ratio = Annotated[float | None, written(_ratio, "NUMBER", "none")]
+Effort = Annotated[float, written(_effort, "NUMBER", "1")]
 AngleOrNone = Annotated[float | None, written(units.angle, "ANGLE", "none")]
 Angle = Annotated[float, written(units.angle, "ANGLE", "0deg")]
 Speed = Annotated[float, written(units.speed, "SPEED", "0m/s")]

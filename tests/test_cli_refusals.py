@@ -29,6 +29,8 @@ USAGE = [
     ([*SHOOT, "--outputs", "dept"], "--outputs", "Did you mean depth?"),
     ([*SHOOT, "--insert", "car/0001"], "--insert", "write ID@X,Y"),
     ([*SHOOT, "--size", "100000x9"], "--size", "at most 16384 pixels a side"),
+    (["recon", "drive", "-o", "x", "--effort", "0"], "--effort", "write a number from 0.1 to 100, where 1 is the default, as 2"),
+    (["recon", "drive", "-o", "x", "--effort", "nan"], "--effort", "write a number from 0.1 to 100"),
     ([*SHOOT, "--fps", "0"], "--fps", "write frames a second, above 0 and below 1000, as 10"),
     (["render", "street/background.usdc", *SHOOT[4:], "--insert", "car/1@5m,0m"], "--insert needs a scene", "usdc holds splats only"),
     (["render", "street/background.usdc", *SHOOT[4:], "--trajectory", "t.csv"], "--trajectory needs a scene", "usdc holds splats only"),

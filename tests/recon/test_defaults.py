@@ -1,5 +1,7 @@
 """What a reconstruction takes where nobody says otherwise."""
 
+from dataclasses import replace
+
 import pytest
 from made_colmap import pictures_along, write_colmap
 
@@ -32,6 +34,20 @@ def test_a_fit_is_longer_and_finer_the_more_pictures_it_has(drive):
     one, (first, last) = fit_config(log, ["front_camera"]), (int(t) for t in log.camera("front_camera").times_us[[0, -1]])
     both, half = fit_config(log, ["front_camera", "front_camera"]), fit_config(log, ["front_camera"], (first, (first + last) // 2))
     assert half.steps < one.steps < both.steps <= MOST[0] and half.budget < one.budget < both.budget <= MOST[1]
+
+
+def test_effort_multiplies_steps_and_splats_of_drives_and_photos_also_beyond_what_they_get_at_most(drive, tmp_path, street):
+    log = open_log(drive)
+    many = ["front_camera"] * 100
+    pytest.importorskip("pycolmap", reason=NEEDS)
+    photos = open_log(write_colmap(tmp_path / "far", street, {"": pictures_along(street, count=6, step=4.0)}))
+    for of, names in ((log, ["front_camera"]), (log, many), (photos, ["camera"])):
+        usual = fit_config(of, names)
+        for effort in (0.1, 3):
+            asked = fit_config(of, names, effort=effort)
+            assert (asked.steps, asked.budget) == (round(effort * usual.steps), round(effort * usual.budget))
+            assert asked == replace(usual, steps=asked.steps, budget=asked.budget)
+    assert fit_config(log, many).steps == MOST[0] < fit_config(log, many, effort=3).steps
 
 
 def test_a_span_keeps_the_frames_of_all_cameras_together(drive):
