@@ -31,13 +31,14 @@ COARSER = 3.0
 """Times as large as what is around a splat must be to be a blur there."""
 
 AROUND, NEAR = 12, 3.0
-"""Splats around one, whose middle size is that of what is there, and metres within which the first of them must be."""
+"""Splats around one, whose middle size and colour are those of what is there, and metres within which the first of them must be."""
 
 FILLED, MOST = 1.5, 24
 """Size of its copies together, as a part of a splat's own, and how many these are at most."""
 
 AMONG = 4
-"""Nearest to its own place, of which a copy is any one: of the nearest alone there would be rows of the same."""
+"""Most like the middle colour of the `AROUND` nearest to its own place, of which a copy is any one: of the nearest alone there would be
+rows of the same, and of one that is unlike what it lies among there would be dots."""
 
 WITHIN = 1.6
 """Standard deviations of the splat within which its copies lie."""
@@ -95,8 +96,10 @@ def by_example(splats: Gaussians, hidden: torch.Tensor, known: torch.Tensor, see
     of = which[blurs].repeat_interleave((FILLED * ratio[blurs]).clamp_max(MOST).round().long())
     spread = splats.log_scales[of].exp() * torch.randn(len(of), 3, generator=generator).clamp(-WITHIN, WITHIN)
     means = splats.means[of] + (matrix_from_quat(splats.quats[of]) @ spread[:, :, None])[:, :, 0]
-    _, nearest = tree.query(means.numpy(), range(1, AMONG + 1))
+    nearest = torch.from_numpy(tree.query(means.numpy(), AROUND)[1])
+    looks = splats.sh[examples, 0][nearest]
+    unlike = (looks - looks.median(1, keepdim=True).values).square().sum(2)
     any_one = torch.randint(0, AMONG, (len(of), 1), generator=generator)
-    like = splats.select(examples[torch.from_numpy(nearest).gather(1, any_one)[:, 0]])
+    like = splats.select(examples[nearest.gather(1, unlike.argsort(1).gather(1, any_one))[:, 0]])
     steady = torch.cat([like.sh[:, :1], torch.zeros_like(like.sh[:, 1:])], 1)
     return replace(like, means=means, sh=steady), of

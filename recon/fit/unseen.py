@@ -139,7 +139,8 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
     none. These colours do not turn with the view: how others look from where they were seen says nothing of a place that nobody saw, and a
     mean of harmonics turns white and brown to yellow there.
 
-    What is hidden of the street, pulled at or not, takes the middle colour of the street around, channel by channel, cell by cell.
+    What stands takes the colours of what stands. What is hidden of the street, pulled at or not, takes the middle colour of the street
+    around, channel by channel, cell by cell.
     """
     hidden, known, group = part < SEEN, part >= SEEN, splats.group_of()
     means, sh, off = splats.fields["means"], splats.fields["sh"], off_ground(splats, ground)
@@ -151,6 +152,8 @@ def as_neighbours(splats: Splats, part: torch.Tensor, pulled: torch.Tensor, grou
         _colour(splats, unknown, places, colours, CELLS, lambda found, _: found.median(1).values)
     for i in range(len(splats.sizes)):
         mine = known & (group == i)
+        stands = mine & (off > LOW)
+        mine = stands if stands.sum() >= NEIGHBOURS else mine  # the road is nearer to most walls than what pictures show of walls
         if mine.sum() >= NEIGHBOURS:
             which = pulled & hidden & (group == i) & ~unknown
             steady = torch.cat([sh[mine, :1], torch.zeros_like(sh[mine, 1:])], 1)

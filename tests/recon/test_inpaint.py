@@ -56,6 +56,16 @@ def test_what_pictures_do_not_show_goes_on_like_what_is_beside_it():
     assert not torch.equal(copies.means, by_example(whole, hidden, ~hidden, 1)[0].means)
 
 
+def test_what_is_unlike_all_around_it_is_no_example():
+    """Every sixth splat of the wall is green: where it is the nearest, its copies would be dots in a row."""
+    whole, hidden = half_hidden()
+    odd = ~hidden & (torch.arange(len(whole)) % 6 == 0)
+    sh = whole.sh.clone()
+    sh[odd, 0] = sh_from_rgb(torch.tensor([0.0, 0.6, 0.0]))
+    copies, _ = by_example(replace(whole, sh=sh), hidden, ~hidden, 0)
+    assert len(copies) > 20 and not (copies.sh[:, 0] == sh[0, 0]).all(1).any()
+
+
 def test_what_is_as_fine_as_its_surroundings_or_far_from_all_that_is_known_has_no_copies():
     whole, hidden = half_hidden()
     fine = whole.log_scales.clone()

@@ -187,6 +187,22 @@ def test_the_street_beside_a_parked_car_takes_the_streets_colour_pulled_at_or_no
     torch.testing.assert_close(sh[82, 0], sh[40, 0])
 
 
+def test_a_wall_that_no_picture_shows_takes_the_colour_of_another_not_of_the_road_before_it():
+    flat = Ground(torch.zeros(21, 21), (-10.0, -10.0), 1.0)
+    splats, part = splats_of([[1.0] * 60 + [0.0]], lambda p: [0.3, 0.3, 0.3])
+    means, sh = splats.fields["means"], splats.fields["sh"]
+    generator = torch.Generator().manual_seed(0)
+    means[:40] = torch.cat([torch.rand(40, 2, generator=generator), torch.zeros(40, 1)], 1)
+    means[40:60] = torch.rand(20, 3, generator=generator) + torch.tensor([5.0, 0.0, 0.5])
+    sh[40:60, 0] = sh_from_rgb(torch.tensor([0.7, 0.2, 0.1]))
+    means[60] = torch.tensor([0.5, 0.5, 0.5])
+    assert as_neighbours(splats, part, part >= 0, flat).nonzero()[:, 0].tolist() == [60]
+    torch.testing.assert_close(sh[60, 0], sh[40, 0])
+    part[40 + NEIGHBOURS - 1 :] = 0.0
+    as_neighbours(splats, part, part >= 0, flat)
+    assert (sh[60, 0] < sh[40, 0]).any(), "of too few, all that is known"
+
+
 def test_a_fit_keeps_them_to_its_end(drive):
     log = open_log(drive)
     names, span = choose(log)
