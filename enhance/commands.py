@@ -83,7 +83,8 @@ class Pairs:
                 out = self.output if len(self.scenes) == 1 else self.output / name
                 drives.append((name, scene, log, check_cameras(scene, log, self.cameras), out))
             for name, scene, log, cameras, out in drives:
-                claim_pairs(out, scene, log, self.seed, config, self._made_of())
+                made_of = self._made_of()
+                claim_pairs(out, scene, log, self.seed, config, made_of)
                 relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
                 sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)
                 with Progress(f"pairs {name}") as steps:
@@ -92,7 +93,7 @@ class Pairs:
                         steps.total = total
                         steps.step(done - steps.done, name)
 
-                    make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device)
+                    make_pairs(scene, log, out, sources.kinds, cameras, self.seed, say, sources, config, self.device, made_of)
             make_photo_pairs(self.photos, self.output / "photos", self.seed, self.size)
         print(f"wrote {self.output}")
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from enhance.pictures import in_order
 from render.video import read_image, read_video
 from scenes.pictures import PICTURES
 from scenes.spread import spread
@@ -59,7 +60,7 @@ def photos_of(path: Path, stride: int, width: int) -> Iterator[np.ndarray]:
 def frames_of(path: Path, stride: int, most: int | None = None) -> Iterator[torch.Tensor]:
     """Of a picture that, of a folder its pictures, `most` of them spread over all, of a video every `stride`-th frame: `[H, W, 3]`."""
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
+        files = sorted(in_order(path, PICTURES))
         yield from map(read_image, files if most is None else spread(files, most))
     elif path.suffix.lower() in PICTURES:
         yield read_image(path)

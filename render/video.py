@@ -135,6 +135,9 @@ class Video:
                     if packet.is_corrupt:  # threaded decoding would pass over it in silence
                         raise ValueError(f"{self.path} breaks off after frame {decoded}; fetch the file again")
                     for frame in packet.decode():
+                        if frame.is_corrupt and decoded:  # of a stream that was cut, what comes before its first whole frame is, too
+                            fix = "fetch the file again, or encode it anew, which fills in what is lost"
+                            raise ValueError(f"{self.path} is damaged in frame {decoded}; {fix}")
                         yield frame
                         decoded += 1
             except FFmpegError as error:

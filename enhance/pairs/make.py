@@ -39,12 +39,13 @@ def make_pairs(
     sources: Sources | None = None,
     config: PairConfig | None = None,
     device: str = "cpu",
+    made_of: dict[str, str] | None = None,
 ) -> Path:
     """Make the pairs of a scene in the folder `out`; returns it. Scene and recording may be given loaded.
 
     Every clip of every camera, with each of `kinds` (damage.py), and with flow, visibility, depth and instances of what it shows.
     `sources` is what the damage is made from (`prepare_sources`); without any, the kinds ANYWHERE can be made.
-    Scenes are rendered on `device`.
+    Scenes are rendered on `device`. made_of: what `sources` are, by name (`claim_pairs`): with others the folder is refused.
 
     The same seed makes the same pairs. A run that was broken off goes on where it stopped, and kinds may be added later. `progress` is
     called with clips done, clips in all, and the last one's name. A contact sheet of each kind, `<kind>.png`, stands beside the clips.
@@ -57,7 +58,7 @@ def make_pairs(
     log = of_scene(log_path if isinstance(log_path, Log) else open_recording(log_path, scene), scene)
     kinds = check_kinds(kinds)
     chosen, kept = check_cameras(scene, log, cameras), held_out_camera(scene, log)
-    out = claim_pairs(out, scene, log, seed, config)
+    out = claim_pairs(out, scene, log, seed, config, made_of)
     rights = {k: log.meta[k] for k in ("licence", "attribution") if k in log.meta}
     log = with_ego_masks(log, chosen, config.width)
     starts = [(log.cameras[name], start) for name in chosen for start in _starts(len(log.cameras[name]), config)]

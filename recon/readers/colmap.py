@@ -6,6 +6,7 @@ left, z up.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -29,14 +30,25 @@ APART = 300.0
 """Metres between a picture and the next from which on a model is none of a place: nothing ties its pictures to each other."""
 
 
+WORKSPACE = ".sfm"
+"""How the name of a folder ends that keeps where the photos, or the frames of the video, beside it were taken."""
+
+
 def find_model(folder: Path) -> Path | None:
     """The model's folder in a COLMAP workspace: `folder` itself, its sparse/0, another one up to two levels down, or colmap/sparse/0, as
-    nerfstudio has it; of several equally deep the fullest, as those that are deeper may be of other pictures (distorted/sparse/0)."""
+    nerfstudio has it; of several equally deep the fullest, as those that are deeper may be of other pictures (distorted/sparse/0), as what
+    is kept of photos and videos in the folder is."""
     for level in ("", "*", "*/*", "*/sparse/*"):
-        models = [p for p in (sorted(folder.glob(level)) if level else [folder]) if p.is_dir() and is_model(p)]
+        below = [p for p in sorted(folder.glob(level)) if not kept_of_others(folder, p)] if level else [folder]
+        models = [p for p in below if p.is_dir() and is_model(p)]
         if models:
             return max(models, key=lambda p: sum(f.stat().st_size for f in p.glob("images.*")))
     return None
+
+
+def kept_of_others(folder: Path, path: Path) -> bool:
+    """Whether what lies below a folder was made of photos or a video there, and keeps where they were taken (`WORKSPACE`)."""
+    return any(part.endswith((WORKSPACE, f"{WORKSPACE}.partial")) for part in path.relative_to(folder).parts)
 
 
 def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit: float | None = None, pictures: Path | None = None) -> Log:
@@ -66,7 +78,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     steps = ego.world_from_body[:, :3, 3].diff(dim=0).norm(dim=1)
     if len(steps) and (step := float(steps.median())) > APART:
         fix = "check the scale that was given" if metres_per_unit else "take pictures closer together, of more that stands still"
-        fix += f", and delete {path} to begin again" if path.suffix == ".sfm" else ""
+        fix += f", and delete {path} to begin again" if path.suffix == WORKSPACE else ""
         raise ValueError(f"{where} has its pictures {step:.3g} m from one to the next, which is implausible; {fix}")
     pictures = pictures or _picture_folder(path, where, model.images[0].name)
     cameras, seen = {}, {}
@@ -80,7 +92,8 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         files = tuple(pictures / model.images[k].name for k in chosen)
         for file in files:
             if not file.is_file():
-                raise FileNotFoundError(f"{file} is missing; the model in {where} registers it.{_beside(file, files)}")
+                again = f", which knows nothing of photos that came since: delete {path} to begin again" * (path.suffix == WORKSPACE)
+                raise FileNotFoundError(f"{file} is missing; the model in {where} registers it{again}.{_beside(file, files)}")
         _check_pictures(path, where, files, found := model.cameras[key])
         firsts.append(files[0])
         times = torch.tensor([moments[k] for k in chosen])
@@ -89,7 +102,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
     _tell_masked(firsts, pictures.with_name("masks"))
     about = path.resolve()
     meta: dict = {
-        "name": about.parent.name if about.name in ("images", "sparse") else about.name.removesuffix(".sfm"),
+        "name": about.parent.name if about.name in ("images", "sparse") else about.name.removesuffix(WORKSPACE),
         "source": f"COLMAP model of {len(model.images)} pictures in {about.name}",
         "body": f"camera {names[lead]}, turned to x forward, y left, z up",
         "metric": gauge.metric,
@@ -161,8 +174,10 @@ def _picture_folder(path: Path, where: Path, name: str) -> Path:
 
 
 def _beside(file: Path, registered: tuple[Path, ...]) -> str:
+    """A hint to what a missing picture may be called; "" where there is nothing like it but other numbers of the same series."""
     there = set(file.parent.iterdir()) if file.parent.is_dir() else set()
-    return nearest(file.name, [p.name for p in there.difference(registered)])
+    series = re.sub(r"\d", "", file.name)
+    return nearest(file.name, [p.name for p in there.difference(registered) if re.sub(r"\d", "", p.name) != series])
 
 
 def _tell_masked(files: list[Path], masks: Path) -> None:
@@ -184,7 +199,7 @@ def _check_pictures(path: Path, where: Path, files: tuple[Path, ...], found: Mod
             turned, (width, height) = is_turned(picture), picture.size
         if turned:
             fix = "turn them and make the model anew, or, if they are upright as stored, take the orientation out of their EXIF data"
-            fix = "delete it to begin again" if path.suffix == ".sfm" else fix
+            fix = "delete it to begin again" if path.suffix == WORKSPACE else fix
             raise ValueError(f"{path} was made of photos as they are stored, and {file.name} is not stored upright; {fix}")
         if (width, height) != (found.width, found.height):
             fix = f"put the pictures that the model was made of into {file.parent}, or make a model of these"

@@ -18,7 +18,7 @@ from pathlib import Path
 from PIL import ImageOps
 
 from recon.log import FETCH, Log, is_upright
-from recon.readers.colmap import find_model, read_colmap
+from recon.readers.colmap import WORKSPACE, find_model, kept_of_others, read_colmap
 from recon.readers.footage import RATE, Taken, take_frames
 from recon.readers.order import recorded
 from recon.sfm.solve import solve
@@ -30,6 +30,9 @@ UNREAD = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".nef", ".
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm")
 FEWEST = 3
 """Pictures that a world can be made of."""
+
+ASKED = "photos.json"
+"""Of a workspace: the names of all photos that there were when it was made, placed or not."""
 
 QUALITY = 95
 """Of a JPEG that is written upright."""
@@ -54,9 +57,13 @@ def check_enough(path: Path) -> None:
 
 def in_subfolders(path: Path) -> str:
     """A hint to photos in folders below one that holds none, up to two down; "" where there are none."""
-    if _photos(path):
-        return ""
-    below = [p for level in ("*", "*/*") for p in sorted(path.glob(level)) if p.is_dir() and not p.name.startswith(".")]
+    return "" if _photos(path) else _below(path)
+
+
+def _below(path: Path) -> str:
+    """A hint to photos in folders below one, up to two down, but those that its own poses are kept with; "" where there are none."""
+    there = [p for level in ("*", "*/*") for p in sorted(path.glob(level)) if p.is_dir() and not p.name.startswith(".")]
+    below = [p for p in there if not kept_of_others(path, p)]
     counts = {p: len(photos) for p in below if (photos := _photos(p))}
     if not counts:
         return ""
@@ -100,7 +107,7 @@ def read_photos(
         low, high = (f"{math.degrees(a):.0f}deg" for a in (NARROWEST, WIDEST))
         raise ValueError(f"--angle-of-view must lie from {low} to {high}, got {math.degrees(angle_of_view):g}deg")
     part_us = part_us if is_video(path) else (0, None)
-    workspace = path.with_name(path.name + _called(*part_us) + ".sfm")
+    workspace = path.with_name(path.name + _called(*part_us) + WORKSPACE)
     if find_model(workspace) is None:
         _make(path, workspace, angle_of_view, part_us)
     inside = workspace / "images"
@@ -111,8 +118,23 @@ def read_photos(
         fix = f"delete it to begin again with {math.degrees(angle_of_view):g}deg"
         raise ValueError(f"{workspace} was made with an angle of view of {math.degrees(found):.1f}deg; {fix}")
     if not is_video(path):
+        _tell_newer(path, workspace)
         return log
     return replace(log, name=path.name, meta=log.meta | {"name": path.name, "begun_us": 0, "part_us": list(part_us)})
+
+
+def _tell_newer(path: Path, workspace: Path) -> None:
+    """Say which photos have come since a workspace was made of those that there were."""
+    there, asked = [p.name for p in _photos(path)], workspace / ASKED
+    known = json.loads(asked.read_text()) if asked.is_file() else there  # older workspaces do not say
+    if newer := [name for name in there if name not in known]:
+        told = f"{len(newer)} of its photos came since {workspace} was made, and {'are' if len(newer) > 1 else 'is'} left out"
+        print(f"{path}: {told}: {_some(newer)}; delete {workspace} to place all of them", file=sys.stderr)
+
+
+def _some(names: list[str]) -> str:
+    """The first few of some names."""
+    return ", ".join(names[:5]) + f" and {len(names) - 5} more" * (len(names) > 5)
 
 
 def _called(start_us: int, duration_us: int | None) -> str:
@@ -143,6 +165,9 @@ def _make(path: Path, workspace: Path, angle_of_view: float | None, part_us: tup
             pictures = _upright(path, names, partial / "images")
             found = solve(pictures, names, partial, False, angle_of_view, str(path))
             times = dict.fromkeys(names, 0)
+            (partial / ASKED).write_text(json.dumps([p.name for p in _photos(path)]))
+            if hint := _below(path):
+                print(f"{path}: its own photos were placed;{hint}", file=sys.stderr)
         print(f"placed {found.placed} of {len(times)} pictures", file=sys.stderr)
         if len(found.elsewhere) >= FEWEST:
             print(f"{path}: {_elsewhere(found.elsewhere, times if is_video(path) else None)}", file=sys.stderr)
@@ -193,8 +218,7 @@ def _of_one_size(path: Path) -> list[str]:
         raise ValueError(f"{path} has {len(sizes)} photos, of which no {FEWEST} are of one size in pixels; {fix}")
     others = [name for name, size in sizes.items() if size != most]
     if others:
-        more = f" and {len(others) - 5} more" if len(others) > 5 else ""
-        print(f"left out {', '.join(others[:5])}{more}: not {most[0]}x{most[1]} as most photos", file=sys.stderr)
+        print(f"left out {_some(others)}: not {most[0]}x{most[1]} as most photos", file=sys.stderr)
     if unread := _unread(path):
         print(f"left out {unread}, which are not read; export them as .jpg", file=sys.stderr)
     return [name for name, size in sizes.items() if size == most]
@@ -219,7 +243,6 @@ def _elsewhere(names: frozenset[str], times: dict[str, int] | None) -> str:
     """What to tell of pictures that share nothing with those that were placed; times: microseconds by name, of a video's."""
     told = f"{len(names)} of its pictures share nothing with these"
     if times is None:
-        some = ", ".join(sorted(names, key=recorded)[:5]) + ", ..." * (len(names) > 5)
-        return f"{told}: {some}; put those of another place into another folder"
+        return f"{told}: {_some(sorted(names, key=recorded))}; put those of another place into another folder"
     first, last = (round(which(times[name] for name in names) / 1e6, 1) for which in (min, max))
     return f"{told}, from {first:g} s to {last:g} s, as before or after a cut; --start and --duration take another part"

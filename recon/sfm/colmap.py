@@ -3,6 +3,8 @@ pictures give the same result."""
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,11 @@ def pycolmap():
     try:
         import zlib  # noqa: F401  # first: pycolmap 4.2 brings one of its own, and the interpreter's, loaded after it, crashes
 
+        stop = signal.getsignal(signal.SIGTERM)
         import pycolmap as module
+
+        if stop is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, stop)  # its own, which comes with it, writes a crash report, and nothing is tidied up
     except ModuleNotFoundError:
         raise ValueError(MISSING) from None
     module.logging.minloglevel = module.logging.Level.FATAL.value

@@ -385,6 +385,14 @@ def test_a_clip_that_is_there_is_not_made_again_of_other_things(street, recordin
         claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "['a.hdr']"})
 
 
+def test_what_a_first_run_was_made_of_is_kept(street, recording, tmp_path):
+    made_of = {"skies of relight": "['a.hdr']"}
+    claim_pairs(tmp_path, street, recording, 0, CONFIG, made_of)
+    make_pairs(street, recording, tmp_path, kinds=("relight",), config=CONFIG, made_of=made_of)
+    with pytest.raises(ValueError, match="holds pairs of another skies of relight"):
+        claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of relight": "[]"})
+
+
 def test_a_run_that_made_nothing_leaves_its_folder_free(street, recording, tmp_path):
     """As one that was refused for a sky or a databank that is broken: the mended command must not be refused for that."""
     claim_pairs(tmp_path, street, recording, 0, CONFIG, {"skies of shadow": "['broken.hdr']"})

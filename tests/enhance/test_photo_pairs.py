@@ -9,7 +9,7 @@ import torch
 
 from enhance.pairs.of_photos import make_photo_pairs
 from enhance.pairs.shards import PairSet
-from enhance.photos import photos_of
+from enhance.photos import frames_of, photos_of
 from render.video import write_image
 
 
@@ -61,3 +61,9 @@ def test_pairs_of_photos_hold_one_photo_at_a_time(tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "photos_of", watched)
     assert len(PairSet(make_photo_pairs([tmp_path / "photos"], tmp_path / "made", width=48)).of("isp")) == 5 and len(given) == 10
+
+
+def test_what_a_mac_leaves_among_photos_is_none(tmp_path):
+    write_image(tmp_path / "0.png", torch.rand(32, 48, 3))
+    (tmp_path / "._0.png").write_bytes(b"Mac OS X")
+    assert len(list(frames_of(tmp_path, 1))) == 1

@@ -453,6 +453,42 @@ def test_the_folder_one_is_in_is_read_too(walk, solved, tmp_path, monkeypatch):
     assert open_log("..").name == "walk" and len(solved) == 1 and (tmp_path / "walk.sfm").is_dir()
 
 
+def test_what_is_kept_of_photos_in_a_folder_is_no_model_of_its_own_photos(walk, solved, tmp_path):
+    """Nor of a video's frames, which lie in its workspace."""
+    shutil.copytree(walk / "images", tmp_path / "trip")
+    for inside in ("trip/day.sfm", "trip/clip.mp4.sfm"):
+        shutil.copytree(walk / "sparse", tmp_path / inside / "sparse")
+    shutil.copytree(walk / "images", tmp_path / "trip/clip.mp4.sfm/images")
+    log = open_log(tmp_path / "trip")
+    assert len(solved) == 1 and {f.parent.name for f in log.camera("camera").files} == {"trip"}
+    assert open_log(tmp_path / "trip/clip.mp4.sfm").name == "clip.mp4", "itself it may be given"
+
+
+def test_photos_that_came_or_went_since_are_said(walk, solved, tmp_path, capsys):
+    photos = shutil.copytree(walk / "images", tmp_path / "walk")
+    open_log(photos)
+    assert "came since" not in capsys.readouterr().err
+    for name in ("900.png", "1000.png"):
+        shutil.copy(photos / "000.png", photos / name)
+    open_log(photos)
+    told = f"2 of its photos came since {photos}.sfm was made, and are left out: 900.png, 1000.png; delete {photos}.sfm"
+    assert told in capsys.readouterr().err
+    (photos / "003.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"003.png is missing; .* registers it, .* delete .*walk.sfm to begin again\.$"):
+        open_log(photos)
+    (tmp_path / "walk.sfm/photos.json").unlink()  # as of an older version
+    shutil.copy(photos / "000.png", photos / "003.png")
+    open_log(photos)
+    assert len(solved) == 1 and "came since" not in capsys.readouterr().err
+
+
+def test_photos_below_those_that_are_placed_are_said(walk, solved, tmp_path, capsys):
+    photos = shutil.copytree(walk / "images", tmp_path / "walk")
+    shutil.copytree(walk / "images", photos / "extra")
+    open_log(photos)
+    assert f"its own photos were placed; 6 photos lie in {photos / 'extra'}: give that folder" in capsys.readouterr().err
+
+
 def test_what_else_has_the_workspaces_name_is_left_alone(walk, solved, tmp_path):
     shutil.copytree(walk / "images", tmp_path / "walk")
     (tmp_path / "walk.sfm").write_text("mine")

@@ -1,6 +1,8 @@
 """What structure from motion is asked, and which of its answers is taken."""
 
 import math
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,14 @@ from recon.sfm.colmap import pycolmap
 from recon.sfm.together import together
 
 pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sidestep[colmap]'")
+
+
+def test_who_is_told_to_stop_is_not_shown_where_colmap_was():
+    """It comes with a handler of its own, which writes a crash report and ends the process before anything is tidied up."""
+    stopped = "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143)); pycolmap(); os.kill(os.getpid(), signal.SIGTERM); time.sleep(9)"
+    program = f"import os, signal, sys, time; from recon.sfm.colmap import pycolmap; {stopped}"
+    run = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, timeout=120)
+    assert run.returncode == 143 and not run.stderr
 
 
 def test_a_known_angle_is_that_across_also_of_pictures_that_stand(tmp_path, monkeypatch):

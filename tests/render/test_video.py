@@ -264,3 +264,18 @@ def test_bytes_and_nan_are_refused_and_not_written_as_white_or_black(tmp_path):
     with pytest.raises(ValueError, match="nan in 1 of its 16 pixels"):
         write_image(tmp_path / "a.png", torch.zeros(4, 4, 3).index_put((torch.tensor(1), torch.tensor(2)), torch.tensor(torch.nan)))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_frame_is_named(tmp_path):
+    """FFmpeg conceals it with what was before, and says so of the frame alone."""
+    with VideoWriter(tmp_path / "a.mkv", 10, 64, 48) as video:
+        for seed in range(8):
+            video.write(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(seed)))
+    with av.open(tmp_path / "a.mkv") as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    whole = (tmp_path / "a.mkv").read_bytes()
+    begins = whole.index(packets[4]) + len(packets[4]) // 3
+    hurt = bytes(255 - byte for byte in whole[begins : begins + 40])
+    (tmp_path / "hurt.mkv").write_bytes(whole[:begins] + hurt + whole[begins + 40 :])
+    with pytest.raises(ValueError, match=r"hurt\.mkv is damaged in frame \d; fetch the file again, or encode it anew"):
+        list(read_video(tmp_path / "hurt.mkv"))
