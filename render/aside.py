@@ -12,9 +12,9 @@ import torch
 from render.frame_types import Frame
 from render.rasterize import rasterize
 from render.rays import camera_rays
-from scenes.asset import Actor, Asset
+from scenes.asset import Actor
 from scenes.camera import Camera
-from scenes.collide import into, met
+from scenes.collide import hollow, into, met
 from scenes.ego_path import CAR, nearest
 from scenes.lenses import Pinhole
 from scenes.poses import inverse, yaw_of
@@ -256,8 +256,7 @@ def _times(looks: Sequence[Camera]) -> list[int]:
 def _car(scene: Scene, ego: Trajectory, times: list[int], size: torch.Tensor) -> Actor:
     """What recorded the drive, of a size `[3]`, on the ground along a path."""
     poses = [standing_pose(scene, body[:2, 3], float(yaw_of(body)), size) for body in map(ego.at, times)]
-    nothing = scene.background.gaussians.select(torch.zeros(0, dtype=torch.int64))
-    return Actor(Asset(nothing, size, "Car"), Trajectory(torch.tensor(times), torch.stack(poses)), "")
+    return hollow(scene, size, "Car", Trajectory(torch.tensor(times), torch.stack(poses)))
 
 
 def _struck(scene: Scene, looks: Sequence[Camera], path: float | Trajectory, size: torch.Tensor) -> tuple[str, int] | None:

@@ -1,4 +1,4 @@
-"""What an inserted actor runs into: other actors, and what stands in the background."""
+"""What an inserted actor runs into: other actors, parked vehicles, and what else stands in the background."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import torch
 
-from scenes.asset import Actor
+from scenes.asset import Actor, Asset
+from scenes.edit import parked
 from scenes.poses import inverse
 from scenes.scene import Scene
 from scenes.trajectory import Trajectory
@@ -38,15 +39,17 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
     first, last = int(scene.ego.times_us[0]), int(scene.ego.times_us[-1])
     begin, end = during or (first, last)
     times = [t for t in range(begin, end + 1, STEP_US) if actor.trajectory.covers(t)]
+    hits = met(scene, actor, times)
     found = {
         f"actor {other.track}": f"runs into {other.track} ({other.asset.label}) {(hit - first) / 1e6:.1f}s after the drive's first moment"
-        for other, hit in met(scene, actor, times)
+        for other, hit in hits
     }
     hit = next((t for t in times if driven.covers(t) and _holds(actor, driven.at(t), t)), None)
     if hit is not None:
         found["ego"] = f"is where the recording car drives {(hit - first) / 1e6:.1f}s after the drive's first moment"
     still = len(actor.trajectory) == 1
-    if struck := into(scene, actor, times[:1] if still else times):
+    told = {hit for other, hit in hits if other.track in parked(scene)}  # of what is parked, the splats are the background's
+    if (struck := into(scene, actor, times[:1] if still else times)) and struck[0] not in told:
         hit, count = struck
         when = "" if still else f" {(hit - first) / 1e6:.1f}s after the drive's first moment"
         what = f"{count} solid splats lie in its box; a parked car, a wall, a tree"
@@ -55,13 +58,26 @@ def collisions(scene: Scene, actor: Actor, during: tuple[int, int] | None = None
 
 
 def met(scene: Scene, actor: Actor, times: Sequence[int]) -> list[tuple[Actor, int]]:
-    """Other actors of the scene whose boxes an actor's touches at one of these times, all covered by its path, each with the first."""
+    """Other actors of the scene, and parked vehicles, whose boxes an actor's touches at one of these times, all covered by its path, each
+    with the first."""
     found = []
-    for other in scene.actors:
+    for other in (*scene.actors, *_standing(scene)):
         if other.track != actor.track and _meet(actor, other):
             hit = next((t for t in times if other.trajectory.covers(t) and boxes_touch(actor, other, t)), None)
             found += [(other, hit)] if hit is not None else []
     return found
+
+
+def _standing(scene: Scene) -> list[Actor]:
+    """Parked vehicles, by their boxes: splats may be lacking inside, and on sides that nobody saw."""
+    when, boxes = torch.tensor([int(scene.ego.times_us[0])]), parked(scene)
+    of = [(p["track"], p["label"]) for p in scene.meta.get("parked", []) if p["track"] in boxes]
+    return [hollow(scene, boxes[track][1], label, Trajectory(when, boxes[track][0][None]), track) for track, label in of]
+
+
+def hollow(scene: Scene, size: torch.Tensor, label: str, trajectory: Trajectory, track: str = "") -> Actor:
+    """An actor that is a box of a size `[3]` alone, without splats."""
+    return Actor(Asset(scene.background.gaussians.select(torch.zeros(0, dtype=torch.int64)), size, label), trajectory, track)
 
 
 def into(scene: Scene, actor: Actor, times: Sequence[int]) -> tuple[int, int] | None:

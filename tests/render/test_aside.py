@@ -94,6 +94,13 @@ def test_a_car_below_the_cameras_eye_is_in_the_cars_way(street):
     assert not told(parked, -0.5) and not told(parked, 2.5) and not told(street, -2.5)
 
 
+def test_a_parked_car_is_in_the_cars_way_also_where_few_splats_are_in_it(street):
+    """As of one that stood beside the path's beginning, of which the pictures showed little."""
+    entry = {"track": "veh_3", "label": "Car", "size": [4.5, 1.8, 1.5], "world_from_box": translation(3.0, -2.5, 0.0).tolist()}
+    (said,) = told(replace(street, meta={**street.meta, "parked": [entry]}), -2.5)
+    assert "-2.5m takes the recording car through veh_3 (Car), 0." in said and said.endswith("at -0.5m its way is free")
+
+
 def test_in_a_corridor_that_no_car_fits_into_a_robot_can_go_aside_a_little(street):
     """Walls 0.7 m to either side, from the floor up: what drove between them is narrower than a car."""
     walls = [box((30.0, 0.2, 3.0), (0.3, 0.1, 0.3)) for _ in range(2)]

@@ -122,7 +122,7 @@ def test_it_does_not_matter_in_which_frame_the_background_stands():
     place = torch.tensor([12.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(ground_linear(elsewhere(scene), place), ground_linear(scene, place), atol=1e-3, rtol=0)
     driven = insert(scene, car(), Placement("car/0001", 14.0, -7.0, speed=8.0))
-    assert "stands in something" in driven.warnings[-1]
+    assert "runs into veh_7" in driven.warnings[-1]
     assert insert(elsewhere(scene), car(), Placement("car/0001", 14.0, -7.0, speed=8.0)).warnings == driven.warnings
 
 

@@ -128,6 +128,22 @@ def test_standing_in_a_house_is_said_and_a_kerb_and_a_bridge_above_are_not(stree
     assert collisions(replace(street, background=background), insert(street, car(), Placement("car", 12, -2.5)).actor) == {}
 
 
+def test_what_stands_in_a_parked_car_is_told_by_its_box_and_once(street):
+    """A cone in its middle meets none of its splats, a car all of them."""
+    body = box((3.6, 1.4, 0.6), (0.2, 0.2, 0.2))
+    body = replace(body, means=body.means + torch.tensor([12.0, -2.5, 0.4]))
+    where = translation(12.0, -2.5, 0.0).tolist()
+    meta = {**street.meta, "parked": [{"track": "veh_7", "label": "Car", "size": [4.5, 1.9, 1.6], "world_from_box": where}]}
+    background = Placed(Gaussians.cat([street.background.gaussians, body]), street.background.world_from_local)
+    full = replace(street, background=background, meta=meta)
+    cone = replace(car(), size=torch.tensor([0.3, 0.3, 0.7], dtype=torch.float64), label="cone")
+    for asset in (cone, car()):
+        told = collisions(full, insert(full, asset, Placement(asset.label, 12, -2.5)).actor)
+        assert list(told) == ["actor veh_7"] and "runs into veh_7 (Car) 0.0s after" in told["actor veh_7"]
+    assert collisions(full, insert(full, cone, Placement("cone", 12, 2.5)).actor) == {}
+    assert list(collisions(replace(full, meta=street.meta), insert(full, car(), Placement("car", 12, -2.5)).actor)) == ["background"]
+
+
 def test_relighting_is_a_gain_in_linear_light():
     dice = torch.Generator().manual_seed(0)
     colours = 0.1 + 0.6 * torch.rand(100, 3, generator=dice)
