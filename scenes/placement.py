@@ -13,6 +13,12 @@ KEYS = ("yaw", "speed", "path", "trajectory")
 PATHS = ("straight", "lane")
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_deg")
 
+FARTHEST = 100_000.0
+"""Metres from the body at the clip's first frame: no drive goes farther, and coordinates of a map mostly do."""
+
+FASTEST = 150.0
+"""Metres a second: nothing on a road is faster."""
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -20,7 +26,8 @@ class Placement:
 
     x, y: metres forward and left of the body; yaw: radians to the left of its heading; speed: metres a second along the
     asset's own heading; path: "straight" on, or in a "lane" beside the recorded path, to which yaw then is relative; trajectory: a CSV
-    file of the same frame (see `read_waypoints`), in place of all these.
+    file of the same frame (see `read_waypoints`), in place of all these. ValueError for a place beyond `FARTHEST` and a speed beyond
+    `FASTEST`.
     """
 
     asset: str
@@ -30,6 +37,14 @@ class Placement:
     speed: float = 0.0
     path: str = "straight"
     trajectory: Path | None = None
+
+    def __post_init__(self):
+        if not math.hypot(self.x, self.y) <= FARTHEST:
+            told = f"{self.asset} at {self.x:g}m,{self.y:g}m is more than {FARTHEST / 1000:g} km from the car at the clip's first frame"
+            raise ValueError(f"{told}; a place counts metres from there, not coordinates of a map")
+        if not abs(self.speed) <= FASTEST:
+            told = f"{self.asset} at {self.speed:g}m/s is faster than {FASTEST:g}m/s, as nothing on a road is"
+            raise ValueError(f"{told}; write km/h as 50km/h")
 
 
 @dataclass(frozen=True)
