@@ -115,7 +115,8 @@ def read_waypoints(path: Path) -> list[Waypoint]:
     points: list[Waypoint] = []
     for number, cells in rows[1:]:
         if len(cells) != len(header):
-            raise ValueError(f"{path}, line {number}: {len(cells)} values for {len(header)} columns ({','.join(header)})")
+            count = f"{len(cells)} value{'s' * (len(cells) != 1)}"
+            raise ValueError(f"{path}, line {number}: {count} for {len(header)} columns ({','.join(header)})")
         values = []
         for name, cell in zip(header, cells, strict=True):
             try:
@@ -126,7 +127,8 @@ def read_waypoints(path: Path) -> list[Waypoint]:
                 raise ValueError(f'{path}, line {number}: {name} is "{cell}", which is not a finite number')
         point = Waypoint(round(values[0] * 1e6), values[1], values[2], math.radians(values[3]) if len(values) > 3 else None)
         if points and point.time_us <= points[-1].time_us:
-            raise ValueError(f"{path}, line {number}: time_s must rise, but {cells[0]} follows {points[-1].time_us / 1e6:g}")
+            before = f"{points[-1].time_us / 1e6:g}"
+            raise ValueError(f"{path}, line {number}: time_s must rise by a microsecond or more, but {cells[0]} follows {before}")
         points.append(point)
     if len(points) < 2:
         fix = "what stands has its place in both"

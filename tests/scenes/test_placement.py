@@ -62,7 +62,9 @@ def test_yaw_is_optional(tmp_path):
         ("time_s,x_m,y_m\n0,1,2\n1,2\n", "line 3: 2 values for 3 columns"),
         ("time_s,x_m,y_m\n0,1,2\n1,far,2\n", 'line 3: x_m is "far"'),
         ("time_s,x_m,y_m\n0,1,2\n1,nan,2\n", "line 3: x_m"),
+        ("time_s,x_m,y_m\n0,1,2\n1\n", "line 3: 1 value for 3 columns"),
         ("time_s,x_m,y_m\n1,1,2\n1,2,2\n", "line 3: time_s must rise"),
+        ("time_s,x_m,y_m\n0,1,2\n0.0000001,2,2\n", "line 3: time_s must rise by a microsecond or more, but 0.0000001 follows 0"),
     ],
 )
 def test_a_wrong_csv_names_line_and_fix(tmp_path, text, says):
