@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from numbers import Real
 
 import torch
 
@@ -55,10 +57,17 @@ def clip_cameras(
         raise ValueError("width and height go together; give both or neither")
     if width is not None and height is not None:
         rig_camera = rig_camera.resized(width, height)
-    if not isinstance(shift, Trajectory) and shift != 0:
-        require_metres(scene, "a lateral shift")
-    ego = shift if isinstance(shift, Trajectory) else scene.ego.shifted(lateral=shift)
+    if isinstance(shift, Trajectory):
+        ego = shift
+    elif isinstance(shift, Real | torch.Tensor) and math.isfinite(shift):
+        if shift != 0:
+            require_metres(scene, "a lateral shift")
+        ego = scene.ego.shifted(lateral=shift)
+    else:
+        raise ValueError(f"shift must be a finite number of metres to the left, or a Trajectory, got {shift!r}")
     times = scene.frame_times(camera) if times_us is None else whole_times(times_us)
+    if times.ndim != 1:
+        raise ValueError(f"times_us must be a list of times, as [t] of one, got {times_us!r}")
     if len(times) == 0:
         raise ValueError(f"a clip of {camera} needs at least one frame, got no times")
     return [rig_camera.along(ego, int(t)) for t in times]

@@ -83,8 +83,15 @@ def test_wrong_arguments_are_refused_before_the_first_frame(street):
         render_clip(street, "front_camera", times_us=[0])
     with pytest.raises(ValueError, match="times_us must be whole microseconds, got 0.5; seconds times 1e6"):
         render_clip(street, "front_camera", times_us=[0.5])
+    with pytest.raises(ValueError, match=r"times_us must be a list of times, as \[t\] of one, got 1000"):
+        render_clip(street, "front_camera", times_us=1000)
     with pytest.raises(ValueError, match="go together"):
         render_clip(street, "front_camera", width=64)
+    with pytest.raises(ValueError, match="whole numbers of at least 1x1 pixels, got 0x0"):
+        render_clip(street, "front_camera", width=0, height=0)
+    for shift, said in (("2m", "'2m'"), (float("nan"), "nan"), (-float("inf"), "-inf"), (None, "None")):
+        with pytest.raises(ValueError, match=f"shift must be a finite number of metres to the left, or a Trajectory, got {said}"):
+            render_clip(street, "front_camera", shift=shift)
 
 
 def test_a_clip_can_start_later_and_end_earlier(street):
