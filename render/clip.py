@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from numbers import Real
 
 import torch
 
@@ -55,10 +57,17 @@ def clip_cameras(
         raise ValueError("width and height go together; give both or neither")
     if width is not None and height is not None:
         rig_camera = rig_camera.resized(width, height)
-    if not isinstance(shift, Trajectory) and shift != 0:
-        require_metres(scene, "a lateral shift")
-    ego = shift if isinstance(shift, Trajectory) else scene.ego.shifted(lateral=shift)
+    if isinstance(shift, Trajectory):
+        ego = shift
+    elif isinstance(shift, Real | torch.Tensor) and math.isfinite(shift):
+        if shift != 0:
+            require_metres(scene, "a lateral shift")
+        ego = scene.ego.shifted(lateral=shift)
+    else:
+        raise ValueError(f"shift must be a finite number of metres to the left, or a Trajectory, got {shift!r}")
     times = scene.frame_times(camera) if times_us is None else whole_times(times_us)
+    if times.ndim != 1:
+        raise ValueError(f"times_us must be a list of times, as [t] of one, got {times_us!r}")
     if len(times) == 0:
         raise ValueError(f"a clip of {camera} needs at least one frame, got no times")
     return [rig_camera.along(ego, int(t)) for t in times]
@@ -67,7 +76,8 @@ def clip_cameras(
 def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | None = None, fps: float | None = None) -> torch.Tensor:
     """int64 `[F]`: the camera's frame times from `start_us` after its first one, for `duration_us`; evenly at `fps` where given.
 
-    ValueError where nothing is left, naming what the camera has.
+    Its own frame times are taken from `_slack` before the start until `_slack` before the end: stamps that shake neither add one nor drop
+    one. ValueError where nothing is left, naming what the camera has.
     """
     have = scene.frame_times(camera)
     first, last = int(have[0]), int(have[-1])
@@ -75,8 +85,12 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
     if start_us < 0:
         raise ValueError(f"--start {start_us / 1e6:g}s lies before the first frame: {has}; begin at 0s or later")
     begin = first + start_us
-    end = last if duration_us is None else min(begin + duration_us - 1, last)
-    times = have[(have >= begin) & (have <= end)] if fps is None else _evenly(begin, end, fps)
+    slack = _slack(have)
+    end = last + slack if duration_us is None else begin + duration_us - 1
+    if fps is not None:
+        times = _evenly(begin, min(end, last), fps)
+    else:  # what lasts shorter than the slack has the frame at its start all the same
+        times = have[(have >= begin - slack) & (have <= max(end - slack, min(end, begin + slack))) & (end >= begin)]
     if len(times) == 0:
         asked = f"--start {start_us / 1e6:g}s" + ("" if duration_us is None else f" --duration {duration_us / 1e6:g}s")
         raise ValueError(f"{asked} leaves no frame: {has}; start before that and last at least 100ms")
@@ -86,11 +100,15 @@ def clip_times(scene: Scene, camera: str, start_us: int = 0, duration_us: int | 
 def cut_warning(scene: Scene, camera: str, start_us: int, duration_us: int | None) -> list[str]:
     """What to tell of a clip that would last longer than the recording does: a sentence, or nothing."""
     have = scene.frame_times(camera)
-    step = 1e6 / frame_rate(have)
-    left = int(have[-1]) - int(have[0]) - start_us + step  # its last frame is shown as long as others
-    if duration_us is None or duration_us < left + step / 2:
+    left = int(have[-1]) - int(have[0]) - start_us + 1e6 / frame_rate(have)  # its last frame is shown as long as others
+    if duration_us is None or duration_us <= left + _slack(have):
         return []
     return [f"--duration {duration_us / 1e6:g}s goes beyond the recording: {camera} has {left / 1e6:.1f}s from there, and so the clip"]
+
+
+def _slack(times_us: torch.Tensor) -> int:
+    """Microseconds by which frame times may shake about even ones: a quarter of a step."""
+    return round(250_000 / frame_rate(times_us))
 
 
 def frame_rate(times_us: torch.Tensor) -> float:

@@ -253,20 +253,24 @@ def check_poses(placed: Sequence[Placed], camera: Camera) -> None:
         turn = stacked[:, :3, :3]
         off = np.abs(turn @ turn.transpose(0, 2, 1) - _UNIT).sum((1, 2))
         sunk = np.abs(stacked[:, 3] - _BOTTOM).sum(1)
+        hands = np.linalg.det(turn)
         # one value that is not finite makes the sum so
-        fit = (off + 0 * stacked.sum((1, 2)) < STRETCHED) & (sunk < 1e-6)
+        fit = (off + 0 * stacked.sum((1, 2)) < STRETCHED) & (sunk < 1e-6) & (hands > 0)
     if not fit.all():
         names = [
             f"{which} of {whose}" for whose in ("camera", *(f"instance {p.instance}" for p in placed)) for which in ("pose", "end pose")
         ]
         named = [(name, pose) for name, pose in zip(names, given, strict=True) if pose is not None]
-        for (name, pose), bent, below in zip(named, off.tolist(), sunk.tolist(), strict=True):
+        for (name, pose), bent, below, hand in zip(named, off.tolist(), sunk.tolist(), hands.tolist(), strict=True):
             if not torch.isfinite(pose).all():
                 raise ValueError(f"the {name} is not finite: {pose.tolist()}")
             if below >= 1e-6:
                 raise ValueError(f"the {name} has a bottom row other than 0 0 0 1; transpose it if it is by columns: {pose.tolist()}")
             if bent >= STRETCHED:
                 raise ValueError(f"the {name} scales or shears, and poses only move and turn; scale the splats: {pose.tolist()}")
+            if hand <= 0:
+                fix = "of a camera with OpenGL's axes, turn both y and z round, not one of them"
+                raise ValueError(f"the {name} mirrors, and poses only move and turn; {fix}: {pose.tolist()}")
 
 
 def _check_shared(placed: list[Placed], there: list[Placed]) -> None:

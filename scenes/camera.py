@@ -73,6 +73,7 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view on an image of another size."""
+        check_size(width, height)
         return replace(self, lens=self.lens.scaled(width / self.width, height / self.height), width=width, height=height)
 
     def pixel_centres(self) -> torch.Tensor:
@@ -150,4 +151,5 @@ class RigCamera:
 
     def resized(self, width: int, height: int) -> RigCamera:
         """The same camera with an image of another size."""
+        check_size(width, height)
         return replace(self, lens=self.lens.scaled(width / self.width, height / self.height), width=width, height=height)

@@ -13,6 +13,12 @@ KEYS = ("yaw", "speed", "path", "trajectory")
 PATHS = ("straight", "lane")
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_deg")
 
+FARTHEST = 100_000.0
+"""Metres from the body at the clip's first frame: no drive goes farther, and coordinates of a map mostly do."""
+
+FASTEST = 150.0
+"""Metres a second: nothing on a road is faster."""
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -20,7 +26,8 @@ class Placement:
 
     x, y: metres forward and left of the body; yaw: radians to the left of its heading; speed: metres a second along the
     asset's own heading; path: "straight" on, or in a "lane" beside the recorded path, to which yaw then is relative; trajectory: a CSV
-    file of the same frame (see `read_waypoints`), in place of all these.
+    file of the same frame (see `read_waypoints`), in place of all these. ValueError for a place beyond `FARTHEST` and a speed beyond
+    `FASTEST`.
     """
 
     asset: str
@@ -30,6 +37,14 @@ class Placement:
     speed: float = 0.0
     path: str = "straight"
     trajectory: Path | None = None
+
+    def __post_init__(self):
+        if not math.hypot(self.x, self.y) <= FARTHEST:
+            told = f"{self.asset} at {self.x:g}m,{self.y:g}m is more than {FARTHEST / 1000:g} km from the car at the clip's first frame"
+            raise ValueError(f"{told}; a place counts metres from there, not coordinates of a map")
+        if not abs(self.speed) <= FASTEST:
+            told = f"{self.asset} at {self.speed:g}m/s is faster than {FASTEST:g}m/s, as nothing on a road is"
+            raise ValueError(f"{told}; write km/h as 50km/h")
 
 
 @dataclass(frozen=True)
@@ -100,7 +115,8 @@ def read_waypoints(path: Path) -> list[Waypoint]:
     points: list[Waypoint] = []
     for number, cells in rows[1:]:
         if len(cells) != len(header):
-            raise ValueError(f"{path}, line {number}: {len(cells)} values for {len(header)} columns ({','.join(header)})")
+            count = f"{len(cells)} value{'s' * (len(cells) != 1)}"
+            raise ValueError(f"{path}, line {number}: {count} for {len(header)} columns ({','.join(header)})")
         values = []
         for name, cell in zip(header, cells, strict=True):
             try:
@@ -111,7 +127,8 @@ def read_waypoints(path: Path) -> list[Waypoint]:
                 raise ValueError(f'{path}, line {number}: {name} is "{cell}", which is not a finite number')
         point = Waypoint(round(values[0] * 1e6), values[1], values[2], math.radians(values[3]) if len(values) > 3 else None)
         if points and point.time_us <= points[-1].time_us:
-            raise ValueError(f"{path}, line {number}: time_s must rise, but {cells[0]} follows {points[-1].time_us / 1e6:g}")
+            before = f"{points[-1].time_us / 1e6:g}"
+            raise ValueError(f"{path}, line {number}: time_s must rise by a microsecond or more, but {cells[0]} follows {before}")
         points.append(point)
     if len(points) < 2:
         fix = "what stands has its place in both"

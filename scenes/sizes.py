@@ -27,9 +27,13 @@ SHEET = 0.02
 """Metres below which a side may be where the other two are as they should: what is flat, as a sign, is in no wrong unit for that."""
 
 
-def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
+LYING = ((1, 2, 0), (0, 2, 1), (2, 1, 0), (2, 0, 1))
+"""Which sides of what lies on its side are its length, width and height; first of what has z up and x ahead, read with y up and z ahead."""
+
+
+def odd_size(label: str, size: Sequence[float], scale: float = 1.0, axes: Sequence[str] = ()) -> str:
     """What is odd about the size `[length, width, height]` in metres of a thing of a class, with the likely cause; '' where nothing is.
-    scale: by which the size was multiplied already."""
+    scale: by which the size was multiplied already; axes: those of its file that were taken for up and forward, none where nobody knows."""
     told = " x ".join(f"{v:.3g}" for v in size)
     ranges = SIZES.get(slug(label), (ANYTHING,) * 3)
     if _fits(size, ranges):
@@ -40,11 +44,12 @@ def odd_size(label: str, size: Sequence[float], scale: float = 1.0) -> str:
         if _fits([v * factor for v in size], ranges):
             cause = f"it seems to be in {unit}" if scale == 1 else "the scale is not the file's"
             return f"{said}: {cause}; give --scale {factor * scale:g}"
-    turned = [size[1], size[0], size[2]]
-    if _fits(turned, ranges):
-        return f"{said}: it seems to stand across; give another --forward"
-    if any(_fits([size[i] for i in order], ranges) for order in ((0, 2, 1), (2, 1, 0), (2, 0, 1), (1, 2, 0))):
-        return f"{said}: it seems to lie on its side; give another --up"
+    across, *lying = (_fits([size[i] for i in order], ranges) for order in ((1, 0, 2), *LYING))
+    if across or any(lying):
+        seems = ["stand across"] * across + ["lie on its side"] * any(lying)
+        fixes = ["--forward"] * across + ["--up"] * any(lying)
+        usual = ", as --up z --forward x, which CAD and robots use" if lying[0] and [axis[-1] for axis in axes] == ["y", "z"] else ""
+        return f"{said}: it seems to {', or to '.join(seems)}; give another {' or '.join(fixes)}{usual}"
     middle = [(r[0] * r[1]) ** 0.5 for r in ranges]
     return f"{said}; if it is one, give --scale {scale * max(middle) / max(max(size), 1e-9):.2g} or so"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from scenes.placement import Waypoint, read_waypoints
+from scenes.placement import FARTHEST, Waypoint, read_waypoints
 from scenes.poses import yaw_of
 
 STEP_US = 100_000
@@ -40,7 +40,7 @@ def way_of(file: Path, world_from_body: torch.Tensor, start_us: int) -> Way:
     """The way that a CSV trajectory (`read_waypoints`) describes from a body's pose `[4, 4]` at a time, with poses between its rows at most
     STEP_US apart. ValueError where it is bad; FileNotFoundError."""
     points = read_waypoints(file)
-    _check_times(file, points)
+    _check_near(file, points)
     t = torch.tensor([p.time_us for p in points], dtype=torch.float64)
     xy = torch.tensor([[p.x, p.y] for p in points], dtype=torch.float64)
     yaws = [p.yaw for p in points if p.yaw is not None]
@@ -80,12 +80,16 @@ def sliding_warning(name: str, way: Way, file: Path, start_us: int) -> list[str]
     return [f"{where}; say in {file} by yaw_deg where it faces, or give more points where it turns"]
 
 
-def _check_times(path: Path, points: list[Waypoint]) -> None:
-    """ValueError where a trajectory's times are no seconds of a drive."""
+def _check_near(path: Path, points: list[Waypoint]) -> None:
+    """ValueError where a trajectory's times are no seconds of a drive, or its places no metres of one."""
     far = max(points, key=lambda p: abs(p.time_us))
     if abs(far.time_us) > LONGEST_US:
         told = f"{path} has the time_s {far.time_us / 1e6:g}, which is more than an hour from the clip's first frame"
         raise ValueError(f"{told}; time_s counts seconds from there, no milliseconds, and not since 1970")
+    name, metres = max((pair for p in points for pair in (("x_m", p.x), ("y_m", p.y))), key=lambda pair: abs(pair[1]))
+    if abs(metres) > FARTHEST:
+        told = f"{path} has the {name} {metres:g}, which is more than {FARTHEST / 1000:g} km from the car at the clip's first frame"
+        raise ValueError(f"{told}; {name} counts metres from there, not coordinates of a map")
 
 
 def _unwrapped(angles: torch.Tensor) -> torch.Tensor:

@@ -174,7 +174,7 @@ def test_an_own_asset_is_added_and_the_databank_checked(door, tmp_path):
     body = made.box((1.8, 1.5, 4.2), (0.2, 0.2, 0.8))  # y up, z forward, but standing on z = 0
     save(body, tmp_path / "own.ply")
     add = ["assets", "add", str(tmp_path / "own.ply"), "--label", "car", "--databank", str(tmp_path / "bank")]
-    assert "--forward, or --force" in door([*add, "--up", "y", "--forward", "x"], 1)[1]
+    assert "--forward or --up, or --force" in door([*add, "--up", "y", "--forward", "x"], 1)[1]
     out, _ = door([*add, "--up", "y", "--forward", "z", "--licence", "CC0-1.0"])
     assert "as car/0001: 4.2" in out
     check = ["assets", "check", "--databank", str(tmp_path / "bank")]

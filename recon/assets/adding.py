@@ -47,15 +47,16 @@ def add_mesh(
     `Databank.ready` says."""
     bank = Databank(databank)
     bank.ready()
-    mesh = read_mesh(file, up or "y", forward or "z", scale or 1.0)
-    _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), scale or 1.0, force)
-    _check_upright(file, label, torch.from_numpy(mesh.vertices), up or "y", force)
+    up, forward = up or "y", forward or "z"
+    mesh = read_mesh(file, up, forward, scale or 1.0)
+    _check_size(file, label, (mesh.vertices.max(0) - mesh.vertices.min(0)).tolist(), scale or 1.0, (up, forward), force)
+    _check_upright(file, label, torch.from_numpy(mesh.vertices), up, force)
     with Progress("fit", total=config.steps) as steps:
         meta = {**share, "source": file.name}
         asset = asset_of_mesh(mesh, label, meta, config, lambda _, loss: steps.step(note=f"loss {loss:.4f}"))
     id = bank.add(asset, thumbnail(asset))
     likeness = f"{asset.meta['psnr_unseen_whole_picture']:.1f} dB (over its own pixels {asset.meta['psnr_unseen']:.1f} dB)"
-    return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views{_facing(asset, forward or 'z')}"
+    return id, f"{_told(asset)}; {likeness} to the traced mesh from unseen views{_facing(asset, forward)}"
 
 
 def add_splats(
@@ -86,7 +87,7 @@ def add_splats(
         model_of(file),
         {**share, "source": file.name},
     )
-    _check_size(file, label, asset.size.tolist(), scale or metres, force)
+    _check_size(file, label, asset.size.tolist(), scale or metres, (up, forward), force)
     _check_upright(file, label, _solid(asset), up, force)
     return Databank(databank).add(asset, thumbnail(asset)), _told(asset) + _facing(asset, forward)
 
@@ -183,8 +184,8 @@ def _solid(asset: Asset) -> torch.Tensor:
     return asset.gaussians.means[torch.sigmoid(asset.gaussians.logit_opacities) > 0.3]
 
 
-def _check_size(file: Path, label: str, size: list[float], scale: float, force: bool) -> None:
-    if not force and (odd := odd_size(label, size, scale)):
+def _check_size(file: Path, label: str, size: list[float], scale: float, axes: tuple[str, str], force: bool) -> None:
+    if not force and (odd := odd_size(label, size, scale, axes)):
         raise ValueError(f"{file} {odd}, or --force to keep it so")
 
 

@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from urllib.parse import unquote
 
+from recon.assets.beside import beside
 from scenes.formats.gltf import CHUNK, HEADER, read_glb
 
 SUFFIXES = (".glb", ".gltf")
@@ -42,12 +43,10 @@ def load_gltf(path: Path):
 
 
 def _find_files(tree: dict, folder: Path) -> None:
-    """Write the names of files as they are, of which trimesh knows no %20. ValueError where one of them is not there, which trimesh shows
-    as white."""
+    """Write the names of files as they are, of which trimesh knows no %20. ValueError where one of them is not there."""
     for entry in (e for kind in ("images", "buffers") for e in tree.get(kind, ()) if not e.get("uri", "data:").startswith("data:")):
         entry["uri"] = unquote(entry["uri"])
-        if not (file := folder / entry["uri"]).is_file() or not file.resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{entry['uri']}, which it names, is not beside it or in a folder there")
+        beside(folder, entry["uri"])
 
 
 def _check_read(tree: dict) -> None:

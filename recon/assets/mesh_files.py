@@ -11,6 +11,7 @@ from PIL import Image
 from recon.assets.gltf_mesh import SUFFIXES as GLTF
 from recon.assets.gltf_mesh import load_gltf
 from recon.assets.mesh_splats import areas, sampled
+from recon.assets.obj_mesh import load_obj
 from render.tracer import Mesh
 from scenes.axes import axis
 from scenes.pictures import rgb_of
@@ -32,7 +33,7 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist")
     try:
-        loaded = load_gltf(path) if path.suffix.lower() in GLTF else trimesh.load(path, process=False)
+        loaded = _loaded(path)
         found: list = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
     except Exception as problem:  # trimesh's readers raise whatever their formats' libraries do
         why = f"{type(problem).__name__}: {problem}"
@@ -63,6 +64,14 @@ def read_mesh(path: Path, up: str = "y", forward: str = "z", scale: float = 1.0)
     )
     _check_seen(mesh, path)
     return mesh
+
+
+def _loaded(path: Path):
+    """trimesh's scene, or mesh, of a file."""
+    import trimesh
+
+    suffix = path.suffix.lower()
+    return load_gltf(path) if suffix in GLTF else load_obj(path) if suffix == ".obj" else trimesh.load(path, process=False)
 
 
 def _check_seen(mesh: Mesh, path: Path) -> None:

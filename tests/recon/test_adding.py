@@ -91,7 +91,7 @@ def test_turning_splats_turns_their_axes_and_their_harmonics():
     [
         (1.0, "-y", "z", "a car has 2.5 x 1.3 x 1 to 6 x 2.6 x 2.3 m"),
         (1e6, "-y", "z", "the scale is not the file's; give --scale 1000"),
-        (1000.0, "-y", "x", "stand across; give another --forward"),
+        (1000.0, "-y", "x", "stand across, or to lie on its side; give another --forward or --up, or --force"),
         (1000.0, "z", "y", "lie on its side; give another --up"),
     ],
 )
@@ -108,6 +108,15 @@ def test_a_wrong_size_or_axis_is_refused_with_its_cause(tmp_path, scale, up, for
 @pytest.mark.parametrize("label", SIZES)
 def test_things_in_the_middle_of_their_class_are_not_odd(label):
     assert odd_size(label, [(a * b) ** 0.5 for a, b in SIZES[label]]) == ""
+
+
+def test_what_may_stand_across_or_lie_on_its_side_is_told_both_and_the_axes_of_cad_where_they_help():
+    """As a car with z up and x ahead is read by default; by another --forward alone it would be stored on its side."""
+    both = "stand across, or to lie on its side; give another --forward or --up"
+    assert odd_size("car", (1.6, 4.3, 1.85), axes=("y", "z")).endswith(f"{both}, as --up z --forward x, which CAD and robots use")
+    assert odd_size("car", (1.6, 4.3, 1.85), axes=("z", "y")).endswith(both) and odd_size("car", (1.6, 4.3, 1.85)).endswith(both)
+    assert odd_size("motorcycle", (0.9, 2.9, 2.2)).endswith("seems to stand across; give another --forward")
+    assert "on its side; give another --up, as --up z --forward x" in odd_size("pedestrian", (1.8, 0.3, 0.5), axes=("-y", "z"))
 
 
 @pytest.mark.parametrize("size", [(0.002, 0.75, 2.5), (0.75, 1e-3, 0.75)])

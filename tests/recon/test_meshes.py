@@ -265,6 +265,55 @@ def test_a_texture_of_an_obj_file_is_upright(tmp_path):
     assert ((red > blue) == (splats.means[:, 2] > 1))[within].all() and 80 < (red > blue).sum() < 120
 
 
+def board(folder: Path, libraries: str, picture: str) -> Path:
+    """An OBJ board with such lines of material libraries; car.mtl, which lies in the folder, has the picture."""
+    (folder / "car.mtl").write_text(f"newmtl paint\nKd 1 1 1\n{picture}\n")
+    corners = "v 0 0 0\nv 2 0 0\nv 2 2 0\nvt 0 0\nvt 1 0\nvt 1 1\n"
+    (folder / "board.obj").write_text(f"{libraries}\n{corners}usemtl paint\nf 1/1 2/2 3/3\n")
+    return folder / "board.obj"
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        "map_Kd red.png",
+        "\tMAP_KD -s 1 1 1 -clamp on red.png ",
+        r"map_Kd C:\me\red.png",
+        r"map_Kd in\blood red.png",
+        'map_Kd "red.png"',
+    ],
+    ids=["plain", "options", "other machine", "folder", "quoted"],
+)
+def test_a_picture_of_an_obj_file_is_found_however_it_is_named(tmp_path, picture):
+    from PIL import Image
+
+    (tmp_path / "in").mkdir()
+    for name in ("red.png", "in/blood red.png"):
+        Image.new("RGB", (4, 4), (200, 0, 0)).save(tmp_path / name)
+    (tmp_path / "first.mtl").write_text("newmtl other\n")
+    for libraries in ("mtllib car.mtl", "mtllib first.mtl\r\nmtllib car.mtl\r"):
+        assert (_textures(board(tmp_path, libraries, picture))[:, :3] == (200, 0, 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("libraries", "picture", "said"),
+    [
+        ("mtllib gone.mtl", "", "gone.mtl, which it names, is not beside it or in a folder there"),
+        ("mtllib car.mtl", "map_Kd -s 1 1 1 gone far.png", r"\(ValueError: gone far.png, which it names, is not beside it"),
+        ("mtllib car.mtl", r"map_Kd in\gone.png", r"in\\gone.png, which it names, is not beside it"),
+        ("mtllib car.mtl", "map_Kd -o 0 0 -s 2 2 1 car.mtl", "car.mtl moves or repeats car.mtl by -s 2 2 1, which is not read"),
+    ],
+    ids=["lost materials", "lost picture", "lost in a folder", "repeated"],
+)
+def test_an_obj_file_of_which_something_is_missing_is_refused_and_not_white(tmp_path, libraries, picture, said):
+    with pytest.raises(ValueError, match=said):
+        read_mesh(board(tmp_path, libraries, picture))
+
+
+def test_an_obj_file_that_names_no_materials_is_grey(tmp_path):
+    assert read_mesh(board(tmp_path, "", "")).faces.shape == (1, 3)
+
+
 @pytest.mark.parametrize("textured", [False, True], ids=["no coordinates", "coordinates"])
 def test_a_plain_colour_of_gltf_is_linear(tmp_path, textured):
     box = trimesh.creation.box((4, 1.8, 1.5))

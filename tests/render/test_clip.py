@@ -1,5 +1,6 @@
 import gc
 import weakref
+from dataclasses import replace
 
 import pytest
 import torch
@@ -82,13 +83,48 @@ def test_wrong_arguments_are_refused_before_the_first_frame(street):
         render_clip(street, "front_camera", times_us=[0])
     with pytest.raises(ValueError, match="times_us must be whole microseconds, got 0.5; seconds times 1e6"):
         render_clip(street, "front_camera", times_us=[0.5])
+    with pytest.raises(ValueError, match=r"times_us must be a list of times, as \[t\] of one, got 1000"):
+        render_clip(street, "front_camera", times_us=1000)
     with pytest.raises(ValueError, match="go together"):
         render_clip(street, "front_camera", width=64)
+    with pytest.raises(ValueError, match="whole numbers of at least 1x1 pixels, got 0x0"):
+        render_clip(street, "front_camera", width=0, height=0)
+    for shift, said in (("2m", "'2m'"), (float("nan"), "nan"), (-float("inf"), "-inf"), (None, "None")):
+        with pytest.raises(ValueError, match=f"shift must be a finite number of metres to the left, or a Trajectory, got {said}"):
+            render_clip(street, "front_camera", shift=shift)
 
 
 def test_a_clip_can_start_later_and_end_earlier(street):
     assert (clip_times(street, "front_camera", 200_000, 300_000) - START_US).tolist() == [200_000, 300_000, 400_000]
     assert len(clip_times(street, "front_camera")) == 8
+
+
+def shaken(street, *offsets_us):
+    """The street, with the stamps of its front camera off by so much."""
+    front = street.rig["front_camera"]
+    return replace(street, rig=street.rig | {"front_camera": replace(front, times_us=front.times_us + torch.tensor(offsets_us))})
+
+
+@pytest.mark.parametrize(
+    "offsets", [[0] * 8, [-30 * i for i in range(8)], [30 * i for i in range(8)], [0, 9000, -9000, 9000, -9000, 9000, -9000, 9000]]
+)
+def test_stamps_that_shake_neither_add_a_frame_nor_drop_one(street, offsets):
+    scene = shaken(street, *offsets)
+    stamps = scene.frame_times("front_camera")
+    for first, last in [(0, 1), (0, 5), (2, 3), (2, 6), (0, 8), (5, 8)]:
+        start, lasts = first * STEP_US, (last - first) * STEP_US
+        assert torch.equal(clip_times(scene, "front_camera", start, lasts), stamps[first:last])
+        assert cut_warning(scene, "front_camera", start, lasts) == []
+    assert torch.equal(clip_times(scene, "front_camera", 3 * STEP_US), stamps[3:])
+    assert len(cut_warning(scene, "front_camera", 0, 9 * STEP_US)) == 1
+
+
+def test_a_clip_of_a_moment_has_one_frame_and_one_of_none_none(street):
+    scene = shaken(street, 0, 0, -300, 300, 0, 0, 0, 0)
+    for i in (0, 2, 3):
+        assert len(clip_times(scene, "front_camera", i * STEP_US, 1000)) == 1
+        with pytest.raises(ValueError, match="leaves no frame"):
+            clip_times(scene, "front_camera", i * STEP_US, 0)
 
 
 def test_a_clip_can_run_at_another_rate(street):

@@ -98,6 +98,17 @@ def test_end_poses_that_scale_are_refused_as_poses_are():
         rasterize(Placed(ahead(), torch.eye(4, dtype=torch.float64), twice, instance=2), rows)
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_poses_that_mirror_are_refused_and_those_that_turn_two_axes_round_are_not(axis):
+    mirror = torch.eye(4, dtype=torch.float64)
+    mirror[axis, axis] = -1.0
+    with pytest.raises(ValueError, match="the pose of camera mirrors.*turn both y and z round, not one of them"):
+        rasterize(ahead(), replace(CAMERA, world_from_cam=mirror))
+    with pytest.raises(ValueError, match="the end pose of instance 2 mirrors"):
+        rasterize(Placed(ahead(), torch.eye(4, dtype=torch.float64), mirror, instance=2), replace(CAMERA, shutter="rows"))
+    rasterize(ahead(), replace(CAMERA, world_from_cam=-mirror @ torch.diag(torch.tensor([1.0, 1, 1, -1], dtype=torch.float64))))
+
+
 def test_a_recording_refuses_what_rasterize_refuses():
     splats, twice = ahead(), torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
     with pytest.raises(ValueError, match="instance ids must lie between"):

@@ -162,6 +162,13 @@ def test_times_that_are_no_seconds_of_a_drive_are_refused(street, tmp_path):
             insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))
 
 
+def test_places_that_are_no_metres_of_a_drive_are_refused(street, tmp_path):
+    for row, name in (("1,691000,3", "x_m"), ("1,20,-5.3e6", "y_m")):  # as UTM has them
+        (tmp_path / "t.csv").write_text(f"time_s,x_m,y_m\n0,10,0\n{row}\n")
+        with pytest.raises(ValueError, match=f"t.csv has the {name} .* more than 100 km .*; {name} counts metres from there"):
+            insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))
+
+
 def test_what_is_never_there_during_the_drive_is_said(street, tmp_path):
     (tmp_path / "t.csv").write_text("time_s,x_m,y_m\n-9,10,0\n-5,20,0\n")
     result = insert(street, car(), Placement("car", trajectory=tmp_path / "t.csv"))

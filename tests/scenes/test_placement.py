@@ -30,6 +30,9 @@ def test_a_placement_says_asset_place_heading_and_speed():
         ("car/0003@12m,3m,speed=5m", "a length, not a speed"),
         ("car/0003@1m,2m,trajectory=t.csv", "leave out the place"),
         ("car/0003@12m,3m,yaw=5deg,yaw=6deg", "says yaw twice; say it once"),
+        ("car/0003@1e30m,0m", "car/0003 at 1e+30m,0m is more than 100 km from the car at the clip's first frame"),
+        ("car/0003@0m,-101km", "a place counts metres from there, not coordinates of a map"),
+        ("car/0003@12m,3m,speed=1e9m/s", "car/0003 at 1e+09m/s is faster than 150m/s, as nothing on a road is; write km/h as 50km/h"),
     ],
 )
 def test_a_wrong_placement_names_the_fix(text, says):
@@ -59,7 +62,9 @@ def test_yaw_is_optional(tmp_path):
         ("time_s,x_m,y_m\n0,1,2\n1,2\n", "line 3: 2 values for 3 columns"),
         ("time_s,x_m,y_m\n0,1,2\n1,far,2\n", 'line 3: x_m is "far"'),
         ("time_s,x_m,y_m\n0,1,2\n1,nan,2\n", "line 3: x_m"),
+        ("time_s,x_m,y_m\n0,1,2\n1\n", "line 3: 1 value for 3 columns"),
         ("time_s,x_m,y_m\n1,1,2\n1,2,2\n", "line 3: time_s must rise"),
+        ("time_s,x_m,y_m\n0,1,2\n0.0000001,2,2\n", "line 3: time_s must rise by a microsecond or more, but 0.0000001 follows 0"),
     ],
 )
 def test_a_wrong_csv_names_line_and_fix(tmp_path, text, says):
