@@ -110,16 +110,18 @@ def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path
     assert camera.params.tolist() == pytest.approx([400 / math.tan(math.radians(30)), size[0] / 2, size[1] / 2, 0])
 
 
-def test_the_largest_of_several_models_is_taken(tmp_path):
-    small, large = (SimpleNamespace(num_reg_images=lambda n=n: n) for n in (3, 7))
+def test_the_largest_of_several_models_whose_lens_is_not_too_wide_is_taken(tmp_path):
+    cameras = [SimpleNamespace(mean_focal_length=lambda f=f: f, width=270, height=480) for f in (200, 200, 140)]
+    small, large, wide = (SimpleNamespace(num_reg_images=lambda n=n: n, cameras={1: c}) for n, c in zip((3, 7, 9), cameras, strict=True))
+    options = sfm._solving_options(pycolmap(), None, 4.0)
     told = []
 
     def mapping(*_, initial_image_pair_callback, next_image_callback):
         initial_image_pair_callback()
         next_image_callback()
-        return {0: small, 1: large}
+        return {0: small, 1: large, 2: wide}
 
-    found = sfm._largest(SimpleNamespace(incremental_mapping=mapping), tmp_path, tmp_path, tmp_path / "made", None, told.append)
+    found = sfm._largest(SimpleNamespace(incremental_mapping=mapping), tmp_path, tmp_path, tmp_path / "made", options, told.append)
     assert found == (large, 7) and told == [2, 3] and not (tmp_path / "made").exists()
     none = SimpleNamespace(incremental_mapping=lambda *_, **__: {})
     assert sfm._largest(none, tmp_path, tmp_path, tmp_path / "made", None, told.append) == (None, 0)
