@@ -174,8 +174,8 @@ def _solving_options(colmap, angle_of_view: float | None, within: float):
 def _largest(colmap, database: Path, pictures: Path, made: Path, options, tell: Callable[[int], None]) -> tuple[Any, int]:
     """The model with the most registered pictures, None for none, and how many it has; `tell` is called with that number as it grows.
 
-    COLMAP asks whether a lens is wider than the options let it be when it registers a picture, and not once all are adjusted together:
-    such a model is none."""
+    COLMAP asks for a lens's width when it registers a picture, and not once all are adjusted together: a model of one that is no lens is
+    none. Rays of what is bent a thousandfold all but meet, and pictures agree with any poses by those."""
     made.mkdir()
     placed = 0
 
@@ -189,14 +189,15 @@ def _largest(colmap, database: Path, pictures: Path, made: Path, options, tell: 
         initial_image_pair_callback=lambda: more(2), next_image_callback=lambda: more(placed + 1),
     )  # fmt: skip
     shutil.rmtree(made)
-    narrow = [m for m in models.values() if all(_focal(c) >= options.min_focal_length_ratio for c in m.cameras.values())]
-    best = max(narrow, key=lambda m: m.num_reg_images(), default=None)
+    likely = [m for m in models.values() if all(_is_lens(camera, options) for camera in m.cameras.values())]
+    best = max(likely, key=lambda m: m.num_reg_images(), default=None)
     return best, 0 if best is None else best.num_reg_images()
 
 
-def _focal(camera) -> float:
-    """A camera's focal length, as a part of its pictures' longer side."""
-    return camera.mean_focal_length() / max(camera.width, camera.height)
+def _is_lens(camera, options) -> bool:
+    """Whether a camera sees no wider than the options let it, and bends no more than `MOST_DISTORTION`."""
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
+    return focal >= options.min_focal_length_ratio and abs(camera.params[3]) < MOST_DISTORTION
 
 
 def _fix_lens(colmap, database: Path, options) -> float:

@@ -110,16 +110,20 @@ def test_a_usual_lens_is_that_wide_along_the_longer_side(size, degrees, tmp_path
     assert camera.params.tolist() == pytest.approx([400 / math.tan(math.radians(30)), size[0] / 2, size[1] / 2, 0])
 
 
-def test_the_largest_of_several_models_whose_lens_is_not_too_wide_is_taken(tmp_path):
-    cameras = [SimpleNamespace(mean_focal_length=lambda f=f: f, width=270, height=480) for f in (200, 200, 140)]
-    small, large, wide = (SimpleNamespace(num_reg_images=lambda n=n: n, cameras={1: c}) for n, c in zip((3, 7, 9), cameras, strict=True))
+def test_the_largest_of_several_models_whose_lens_is_one_is_taken(tmp_path):
+    """Of two that are larger, one is wider than any, and one bends a thousandfold."""
+    lenses = [pycolmap().Camera(model="SIMPLE_RADIAL", width=270, height=480, params=[f, 135, 240, k]) for f, k in
+              ((200, 0.0), (200, -0.3), (140, 0.0), (200, 1284.8))]  # fmt: skip
+    small, large, wide, bent = (
+        SimpleNamespace(num_reg_images=lambda n=n: n, cameras={1: lens}) for n, lens in zip((3, 7, 9, 8), lenses, strict=True)
+    )
     options = sfm._solving_options(pycolmap(), None, 4.0)
     told = []
 
     def mapping(*_, initial_image_pair_callback, next_image_callback):
         initial_image_pair_callback()
         next_image_callback()
-        return {0: small, 1: large, 2: wide}
+        return {0: small, 1: large, 2: wide, 3: bent}
 
     found = sfm._largest(SimpleNamespace(incremental_mapping=mapping), tmp_path, tmp_path, tmp_path / "made", options, told.append)
     assert found == (large, 7) and told == [2, 3] and not (tmp_path / "made").exists()
