@@ -58,7 +58,7 @@ class Recon:
     angle_of_view: AngleOrNone = None
     """For photos or a video: horizontal field of view of the camera, as 58deg; estimated by default, which fails on a straight road."""
     effort: Effort = 1.0
-    """Steps and splats, in multiples of what a drive of so many pictures gets by default: 0.3 for a quick look, 3 for a better scene."""
+    """Steps and splats, in multiples of what a drive of so many pictures gets by default: 0.3 for a quick look, 3 for sharper pictures."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     resume: Flag = False
