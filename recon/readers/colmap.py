@@ -92,7 +92,7 @@ def read_colmap(path: Path, camera_height: float | None = None, metres_per_unit:
         files = tuple(pictures / model.images[k].name for k in chosen)
         for file in files:
             if not file.is_file():
-                again = f", which knows nothing of photos that came since: delete {path} to begin again" * (path.suffix == WORKSPACE)
+                again = f"; where it was taken away, delete {path} to begin again" * (path.suffix == WORKSPACE)
                 raise FileNotFoundError(f"{file} is missing; the model in {where} registers it{again}.{_beside(file, files)}")
         _check_pictures(path, where, files, found := model.cameras[key])
         firsts.append(files[0])
