@@ -474,7 +474,7 @@ def test_photos_that_came_or_went_since_are_said(walk, solved, tmp_path, capsys)
     told = f"2 of its photos came since {photos}.sfm was made, and are left out: 900.png, 1000.png; delete {photos}.sfm"
     assert told in capsys.readouterr().err
     (photos / "003.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"003.png is missing; .* registers it; where it was taken away, delete .*walk.sfm to begin again\.$"):
+    with pytest.raises(FileNotFoundError, match=r"003.png is missing; .*; where it was taken away, delete .*walk.sfm to begin again\.$"):
         open_log(photos)
     (tmp_path / "walk.sfm/photos.json").unlink()  # as of an older version
     shutil.copy(photos / "000.png", photos / "003.png")
