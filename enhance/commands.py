@@ -82,8 +82,8 @@ class Pairs:
                 log = open_recording(data, scene)
                 out = self.output if len(self.scenes) == 1 else self.output / name
                 drives.append((name, scene, log, check_cameras(scene, log, self.cameras), out))
+            made_of = self._made_of()
             for name, scene, log, cameras, out in drives:
-                made_of = self._made_of()
                 claim_pairs(out, scene, log, self.seed, config, made_of)
                 relit = None if self.relit is None else self.relit if len(self.scenes) == 1 else self.relit / name
                 sources = prepare_sources(scene, log, out, self.kinds, self.skies, self.databank, self.device, self.seed, relit)

@@ -43,30 +43,21 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _rate(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
+    rate = units.number(text)
     if not 0 < rate < 1000:
         raise ValueError(f'"{text}" is not a frame rate; write frames a second, above 0 and below 1000, as 10')
     return rate
 
 
 def _ratio(text: str) -> float:
-    try:
-        ratio = float(text)
-    except ValueError:
-        ratio = 0.0
+    ratio = units.number(text)
     if not 0 < ratio < float("inf"):
         raise ValueError(f'"{text}" is not a ratio; write a positive number, as 0.5')
     return ratio
 
 
 def _effort(text: str) -> float:
-    try:
-        effort = float(text)
-    except ValueError:
-        effort = 0.0
+    effort = units.number(text)
     if not 0.1 <= effort <= 100:
         raise ValueError(f'"{text}" is not an effort; write a number from 0.1 to 100, where 1 is the default, as 2')
     return effort

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes.names import nearest
-from scenes.units import angle, length, speed
+from scenes.units import angle, length, number, speed
 
 KEYS = ("yaw", "speed", "path", "trajectory")
 PATHS = ("straight", "lane")
@@ -113,22 +113,19 @@ def read_waypoints(path: Path) -> list[Waypoint]:
             f'{path} must begin with the header time_s,x_m,y_m or time_s,x_m,y_m,yaw_deg, got "{",".join(header)}"{_other(header)}'
         )
     points: list[Waypoint] = []
-    for number, cells in rows[1:]:
+    for line, cells in rows[1:]:
         if len(cells) != len(header):
             count = f"{len(cells)} value{'s' * (len(cells) != 1)}"
-            raise ValueError(f"{path}, line {number}: {count} for {len(header)} columns ({','.join(header)})")
+            raise ValueError(f"{path}, line {line}: {count} for {len(header)} columns ({','.join(header)})")
         values = []
         for name, cell in zip(header, cells, strict=True):
-            try:
-                values.append(float(cell))
-            except ValueError:
-                values.append(math.nan)
+            values.append(number(cell))
             if not math.isfinite(values[-1]):
-                raise ValueError(f'{path}, line {number}: {name} is "{cell}", which is not a finite number')
+                raise ValueError(f'{path}, line {line}: {name} is "{cell}", which is not a finite number')
         point = Waypoint(round(values[0] * 1e6), values[1], values[2], math.radians(values[3]) if len(values) > 3 else None)
         if points and point.time_us <= points[-1].time_us:
             before = f"{points[-1].time_us / 1e6:g}"
-            raise ValueError(f"{path}, line {number}: time_s must rise by a microsecond or more, but {cells[0]} follows {before}")
+            raise ValueError(f"{path}, line {line}: time_s must rise by a microsecond or more, but {cells[0]} follows {before}")
         points.append(point)
     if len(points) < 2:
         fix = "what stands has its place in both"

@@ -1,7 +1,7 @@
 """Quantities as people write them: "2m", "-3.5m", "5deg", "36km/h", "100ms". Pure Python: the front door needs it at once.
 
 A quantity is a finite decimal number and a unit, with or without a space between. A bare number is refused, since nobody can
-know what it means. All functions raise ValueError with the fix in the message.
+know what it means. All functions but `number` raise ValueError with the fix in the message.
 """
 
 import math
@@ -44,6 +44,14 @@ def duration_us(text: str) -> int:
     if abs(value) >= 2**63:
         raise ValueError(f'"{text}" is more microseconds than an int64 holds')
     return round(value)
+
+
+def number(text: str) -> float:
+    """A number without a unit, as Python writes it; NaN where it is none, which no bound holds."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _parse(text: str, kind: str) -> float:
