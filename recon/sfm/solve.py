@@ -195,9 +195,10 @@ def _largest(colmap, database: Path, pictures: Path, made: Path, options, tell: 
 
 
 def _is_lens(camera, options) -> bool:
-    """Whether a camera sees no wider than the options let it, and bends no more than `MOST_DISTORTION`."""
+    """Whether a camera sees no wider than the options let it, and moves the border of its pictures by no more than `MOST_DISTORTION` of how
+    far that is from the middle: of a narrow lens a large k bends little."""
     focal = camera.mean_focal_length() / max(camera.width, camera.height)
-    return focal >= options.min_focal_length_ratio and abs(camera.params[3]) <= MOST_DISTORTION
+    return focal >= options.min_focal_length_ratio and abs(camera.params[3]) * (0.5 / focal) ** 2 <= MOST_DISTORTION
 
 
 def _fix_lens(colmap, database: Path, options) -> float:
